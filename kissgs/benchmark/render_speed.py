@@ -121,6 +121,7 @@ def _one_view(splats: Splats, model: GaussianModel, camera: Camera, threads: int
             width=camera.width,
             height=camera.height,
             dilation=camera.dilation,
+            antialiased=splats.antialiased,
             threads=threads,
             receive=received.append,
         )

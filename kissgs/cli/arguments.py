@@ -60,6 +60,13 @@ OriginOption = Annotated[
         "scenes far from the origin. Default: as in the file.",
     ),
 ]
+AntialiasedOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--antialiased/--classic",
+        help="Take the scene as trained with antialiasing, or as a classic one. Default: as the file is marked.",
+    ),
+]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
 ThreadsOption = Annotated[
     int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The output does not depend on it.")

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ForceOption,
     JsonOption,
     LevelOption,
@@ -80,6 +81,7 @@ def compact(
     max_gaussians: MaxGaussiansOption = None,
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
+    antialiased: AntialiasedOption = None,
     device: Annotated[
         str, typer.Option(help="Device of the training: cpu (reproducible) or cuda (results vary slightly).")
     ] = "cpu",
@@ -113,7 +115,7 @@ def compact(
     refuse_without_training(settings, checkpoint=checkpoint, device=device)
     if output is None:
         raise UnsupportedError("missing -o: by default the output would overwrite the input")
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased)
     capture, training_device = open_views(views), device_of(device)
 
     def work(scene: str, target: Path) -> dict[str, Any]:

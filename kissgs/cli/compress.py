@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ContainerOption,
     ForceOption,
     JsonOption,
@@ -102,6 +103,7 @@ def compress(
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
     origin: OriginOption = None,
+    antialiased: AntialiasedOption = None,
     device: Annotated[str, typer.Option(help="Device of --compact and --finetune: cpu or cuda.")] = "cpu",
     threads: ThreadsOption = 0,
     ray: RayOption = None,
@@ -118,7 +120,13 @@ def compress(
     named = None if output is None else Path(output)
     manifest = None if named is None else named_manifest(named)
     kind = named_container(container, None if manifest else named)
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, origin=origin_of(origin))
+    reading = ReadOptions(
+        max_gaussians=max_gaussians,
+        level=level,
+        raw_axes=raw_axes,
+        origin=origin_of(origin),
+        antialiased=antialiased,
+    )
     settings = chosen(
         preset,
         changes,

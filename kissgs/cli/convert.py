@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ForceOption,
     JsonOption,
     LevelOption,
@@ -44,6 +45,7 @@ def convert(
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
     origin: OriginOption = None,
+    antialiased: AntialiasedOption = None,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -61,7 +63,13 @@ def convert(
     if not inputs:
         raise OutputError("convert needs an input and an output: kissgs convert IN OUT")
     kind = _output_format(output, to)
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, origin=origin_of(origin))
+    reading = ReadOptions(
+        max_gaussians=max_gaussians,
+        level=level,
+        raw_axes=raw_axes,
+        origin=origin_of(origin),
+        antialiased=antialiased,
+    )
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"

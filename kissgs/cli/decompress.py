@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ForceOption,
     JsonOption,
     LevelOption,
@@ -37,6 +38,7 @@ def decompress(
     max_gaussians: MaxGaussiansOption = None,
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
+    antialiased: AntialiasedOption = None,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -54,6 +56,7 @@ def decompress(
                 max_gaussians=max_gaussians,
                 level=level,
                 raw_axes=raw_axes,
+                antialiased=antialiased,
                 overwrite=force,
                 threads=threads,
                 progress=progress,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated, cast
@@ -9,6 +10,7 @@ from typing import Annotated, cast
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ForceOption,
     ImagesOption,
     LevelOption,
@@ -54,6 +56,7 @@ def evaluate(
     max_gaussians: MaxGaussiansOption = None,
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
+    antialiased: AntialiasedOption = None,
     device: RenderDeviceOption = "cpu",
     threads: RenderThreadsOption = 0,
     force: ForceOption = False,
@@ -74,7 +77,9 @@ def evaluate(
         refuse_existing(html, overwrite=force)
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
     with progress_bar(quiet or as_json) as progress:
-        loaded = partial(load, max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, threads=threads)
+        loaded = partial(
+            load, threads=threads, max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased
+        )
         sides = [
             ReportScene(name=path.name, splats=loaded(path, progress=progress), bytes=stored_bytes(path))
             for path in (reference, candidate)
@@ -96,6 +101,12 @@ def evaluate(
             page = html_report(result, sides[0], sides[1], device=render_device, threads=threads, progress=progress)
             with atomic_file(html, overwrite=force) as file:
                 file.write(page.encode(errors="replace"))  # file names may be invalid UTF-8
+    if scenes[0].antialiased != scenes[1].antialiased and not quiet:
+        marked, other = sides if scenes[0].antialiased else sides[::-1]
+        sys.stderr.write(
+            f"kissgs: {marked.name} is marked as trained with antialiasing, and {other.name} is not; each is drawn so "
+            "(for both: --antialiased or --classic)\n"
+        )
     sizes = {"reference": sides[0].bytes, "candidate": sides[1].bytes}
     if as_json:
         print_json({**result.as_dict(), "bytes": sizes})

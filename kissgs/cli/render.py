@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ForceOption,
     ImagesOption,
     LevelOption,
@@ -112,6 +113,7 @@ def render(
     max_gaussians: MaxGaussiansOption = None,
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
+    antialiased: AntialiasedOption = None,
     device: RenderDeviceOption = "cpu",
     threads: RenderThreadsOption = 0,
     force: ForceOption = False,
@@ -156,6 +158,7 @@ def render(
                     max_gaussians=max_gaussians,
                     level=level,
                     raw_axes=raw_axes,
+                    antialiased=antialiased,
                     threads=threads,
                     progress=progress,
                 ),

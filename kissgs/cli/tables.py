@@ -243,11 +243,13 @@ def _kind(info: Info) -> str:
     elif info.kind in STREAMED_FORMATS:
         found = [f"level {details['level']} of 0 to {len(details['levels']) - 1}"]
     elif info.kind == "spz":
-        found = [f"version {details['version']}", "antialiased" if details["antialiased"] else ""]
+        found = [f"version {details['version']}"]
     elif info.kind == "ksplat":
         found = [f"compression level {details['compression_level']}"]
     elif info.kind == "gltf":
         found = ["GLB" if details["binary"] else "JSON", "compressed as SPZ" if details["spz"] else ""]
+    if details.get("antialiased") and info.kind != "sog":  # whose model says so
+        found.append("antialiased")
     facts = ", ".join(filter(None, found))
     return f"{name} ({facts})" if facts else name
 

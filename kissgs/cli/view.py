@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ForceOption,
     MaxGaussiansOption,
     QuietOption,
@@ -61,6 +62,7 @@ def view(
         ),
     ] = None,
     raw_axes: RawAxesOption = False,
+    antialiased: AntialiasedOption = None,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     quiet: QuietOption = False,
@@ -69,7 +71,7 @@ def view(
     from kissgs.pipeline.read_options import ReadOptions
     from kissgs.preview.page_files import fetch_viewer, page_files
 
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level or 0, raw_axes=raw_axes)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level or 0, raw_axes=raw_axes, antialiased=antialiased)
     check_input(scene, InvalidSceneError)
     if fetch:
         fetch_viewer()
@@ -135,6 +137,11 @@ def _prepare(
             raise UnsupportedError(
                 "--max-gaussians does not apply to a streamed scene that the page loads in parts; "
                 "add &gaussians=N to the page's address, or name a --level"
+            )
+        if reading.antialiased is not None:
+            raise UnsupportedError(
+                "--antialiased and --classic do not apply to a streamed scene that the page loads in parts; name a "
+                "--level"
             )
         folder = streamed_folder(content)
         if not quiet:

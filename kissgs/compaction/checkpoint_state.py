@@ -84,4 +84,5 @@ def work_key(
     for scene in scenes:
         for name in ATTRIBUTES:
             key.update(getattr(scene, name).tobytes())
+        key.update(b"antialiased" * scene.antialiased)
     return key.hexdigest()

@@ -108,7 +108,7 @@ class SceneTraining:
         from kissgs.training.model import GaussianModel
 
         self.index = index
-        self._model = GaussianModel.restored(state, self.device, self._position_extents(targets))
+        self._model = GaussianModel.restored(state, self.source, self.device, self._position_extents(targets))
 
     def state(self) -> State:
         """Return a copy of the state of the training, see :meth:`restore`."""

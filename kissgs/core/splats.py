@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -106,9 +107,8 @@ def concatenate(scenes: Sequence[Splats]) -> Splats:
 
     All else, such as their SH degrees and origins, is equal.
     """
-    return replace(
-        scenes[0], **{name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in ATTRIBUTES}
-    )
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in scenes]) for name in ATTRIBUTES}
+    return replace(scenes[0], **arrays)
 
 
 def float32_bytes(count: int, sh_degree: int) -> int:

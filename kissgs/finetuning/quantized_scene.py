@@ -125,6 +125,11 @@ class QuantizedScene:
         return decoded
 
     @property
+    def antialiased(self) -> bool:
+        """See :class:`kissgs.Splats`."""
+        return self._plan.scene.antialiased
+
+    @property
     def receive(self) -> None:
         """There is no receiver of gradients: autograd passes them on to the latents."""
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -290,6 +291,7 @@ class Tuner:
                     n,
                     ssim_weight=settings.used_ssim_weight,
                     mse_weight=0.0,
+                    antialiased=scene.antialiased,
                     threads=self.threads,
                 )
                 losses.append(float(loss))
@@ -299,7 +301,8 @@ class Tuner:
     def _measure_costs(self, scene: QuantizedScene) -> Costs:
         """Measure the costs of errors in the training views, for a plan without costs."""
         with torch.no_grad():
-            splats = clean(Splats(**{name: value.cpu().numpy() for name, value in scene.gaussians().items()}))[0]
+            arrays: dict[str, Any] = {name: value.cpu().numpy() for name, value in scene.gaussians().items()}
+            splats = clean(replace(self.original, **arrays))[0]
         targets = self.targets
         stride, others = max(1, len(targets) // SENSITIVITY_VIEWS), len(targets) - targets.synthetic
         weights = [1.0] * others + [targets.synthetic_per_epoch / max(targets.synthetic, 1)] * targets.synthetic
@@ -333,6 +336,7 @@ class Tuner:
             key.update(camera.viewmat.tobytes() + camera.K.tobytes() + image.tobytes() + level.tobytes())
         for name in ATTRIBUTES:
             key.update(getattr(self.original, name).tobytes())
+        key.update(b"antialiased" * self.original.antialiased)
         return key.hexdigest()
 
 

@@ -41,6 +41,12 @@ def split_largest(
     return index[:, 0], sign * np.take_along_axis(wide, _OTHERS[index[:, 0]], axis=1)
 
 
+def note_mark(notes: list[str], antialiased: bool) -> None:
+    """Append to ``notes`` that a format without a place for the mark of an antialiased scene leaves it out."""
+    if antialiased:
+        notes.append("the mark of antialiasing is left out, and viewers will draw small and thin Gaussians too opaque")
+
+
 def note_clamped(notes: list[str], what: str, values: np.ndarray, low: float, high: float, limits: str) -> None:
     """Append to ``notes`` how many Gaussians have a value below ``low`` or above ``high``, if there are any."""
     if values.size == 0 or (values.min() >= low and values.max() <= high):

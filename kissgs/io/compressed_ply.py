@@ -6,6 +6,8 @@ Element ``chunk`` holds the bounds of each 256 Gaussians, ``vertex`` four packed
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from kissgs.core.array_types import Float, Float32, Float64, Int64, Shaped, UInt32
@@ -16,7 +18,7 @@ from kissgs.io.activations import insert_largest, steps
 from kissgs.io.codes import colors_of, note_clamped, opacities_of, split_largest, to_codes
 from kissgs.io.morton import morton_order
 from kissgs.io.ply_body import BLOCK_ALIGNMENT, check_complete, rows
-from kissgs.io.ply_header import Element, Header, PlyFile, sh_degree
+from kissgs.io.ply_header import MIP_COMMENT, Element, Header, PlyFile, sh_degree
 from kissgs.io.scene_file import BinaryWriter
 
 _CHUNK = BLOCK_ALIGNMENT
@@ -87,7 +89,7 @@ def read_compressed(ply: PlyFile, degree: int, progress: Progress) -> Splats:
         if k:
             _decode_sh(ply, splats.shN)
             progress("read", 1.0)
-    return splats
+    return replace(splats, antialiased=ply.header.antialiased)
 
 
 def _decode_vertices(ply: PlyFile, splats: Splats) -> None:
@@ -184,7 +186,7 @@ def write_compressed(file: BinaryWriter, splats: Splats, *, progress: Progress =
         own = slice(part.start // _CHUNK, -(-part.stop // _CHUNK))
         _encode_vertices(splats.select(order[part]), chunks[own], words[part])
         progress("write", part.stop / n / (2 if k else 1))
-    file.write(_header(n, len(chunks), 3 * k))
+    file.write(_header(n, len(chunks), 3 * k, splats.antialiased))
     file.write(chunks.tobytes())
     file.write(words.data if n else b"")
     for part in steps(n if k else 0):
@@ -198,9 +200,9 @@ def write_compressed(file: BinaryWriter, splats: Splats, *, progress: Progress =
     return tuple(notes)
 
 
-def _header(count: int, chunks: int, rest: int) -> bytes:
+def _header(count: int, chunks: int, rest: int, antialiased: bool) -> bytes:
     bounds = [name for prefix, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb")) for name in _bounds(prefix, axes)]
-    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
+    lines = ["ply", "format binary_little_endian 1.0", *[MIP_COMMENT] * antialiased, f"element chunk {chunks}"]
     lines += [f"property float {name}" for name in bounds]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
     if rest:

@@ -22,7 +22,7 @@ from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.activations import log_scales, opacity_logits, steps
 from kissgs.io.frames import Signs, mirror, move
 from kissgs.io.gltf_document import GLB_MAGIC, Document, node_matrix
-from kissgs.io.scene_file import listed, open_scene_file, refuse_more_than
+from kissgs.io.scene_file import listed, marked, open_scene_file, refuse_more_than
 from kissgs.io.spz import largest_spz, read_spz, read_spz_info
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -66,6 +66,8 @@ class GltfInfo:
     """Whether it is GLB."""
     spz: bool
     """Whether attributes are compressed as ``.spz``."""
+    antialiased: bool = False
+    """Whether the ``.spz`` inside say that the scene was trained with antialiasing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,7 @@ class _Primitive:
     count: int
     degree: int
     spz: int | None
+    antialiased: bool = False
 
 
 def read_gltf_info(source: Path | bytes) -> GltfInfo:
@@ -96,6 +99,7 @@ def read_gltf_info(source: Path | bytes) -> GltfInfo:
         primitives=len(found),
         binary=binary,
         spz=any(primitive.spz is not None for primitive in found),
+        antialiased=all(primitive.antialiased for primitive in found),
     )
 
 
@@ -140,7 +144,8 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
     if left_out:
         notes[f"left out: {listed(list(left_out))}"] = None
     x, y, z = (float(sign * value) + 0.0 for sign, value in zip(TO_PLY, origin or WORLD, strict=True))
-    return replace(splats, origin=(x, y, z), notes=tuple(notes))
+    whole = replace(splats, origin=(x, y, z), notes=tuple(notes))
+    return marked(whole, [primitive.antialiased for primitive in found])
 
 
 @np.errstate(all="ignore")  # numbers that overflow are refused where they are used
@@ -280,7 +285,7 @@ def _primitive(
             header = read_spz_info(bytes(document.view(view, most=512)))
             if "POSITION" in attributes and document.count(attributes["POSITION"]) != header.count:
                 raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
-            return _Primitive(attributes, matrix, header.count, header.sh_degree, view)
+            return _Primitive(attributes, matrix, header.count, header.sh_degree, view, header.antialiased)
         raise UnsupportedError(f"{document.name} is compressed by {str(name)[:60]!r}; export it without or with .spz")
     if "POSITION" not in attributes:
         raise document.invalid("a primitive has no POSITION")

@@ -22,7 +22,7 @@ from kissgs.core.origin import WORLD, Origin
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.io.activations import steps
-from kissgs.io.codes import colors_of, opacities_of, to_bytes
+from kissgs.io.codes import colors_of, note_mark, opacities_of, to_bytes
 from kissgs.io.frames import sh_signs
 from kissgs.io.gltf import EXTENSION, SPZ_EXTENSIONS, TO_PLY
 from kissgs.io.gltf_document import GLB_MAGIC
@@ -54,7 +54,7 @@ class _Attribute:
 
 
 def write_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
-    """Write a clean scene in glTF's axes (x left, y up, z forward); return that nothing is lost: no phrases.
+    """Write a clean scene in glTF's axes (x left, y up, z forward); return what the format cannot hold.
 
     Args:
         file: The stream; it is not flushed or closed, and its OSErrors are not caught.
@@ -82,7 +82,9 @@ def write_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent
         for part in steps(count):
             file.write(attribute.values(part).astype(dtype).tobytes())
         progress("write", done / len(attributes))
-    return ()
+    notes: list[str] = []
+    note_mark(notes, splats.antialiased)
+    return tuple(notes)
 
 
 def write_spz_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:

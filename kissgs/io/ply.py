@@ -16,7 +16,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats
 from kissgs.io.compressed_ply import PACKED, check_compressed, is_compressed, read_compressed
 from kissgs.io.ply_body import check_complete, rows
-from kissgs.io.ply_header import Element, Encoding, Header, PlyFile, open_ply, sh_degree
+from kissgs.io.ply_header import MIP_COMMENT, Element, Encoding, Header, PlyFile, open_ply, sh_degree
 from kissgs.io.scene_file import BinaryWriter, listed, refuse_more_than
 
 _POSITION = ("x", "y", "z")
@@ -58,6 +58,8 @@ class PlyInfo:
     """Encoding of the body, as the header names it."""
     compressed: bool
     """Whether it is PlayCanvas' compressed ``.ply``."""
+    antialiased: bool = False
+    """Whether a comment of Brush or Postshot says that the scene was trained with antialiasing."""
 
 
 def read_ply_info(source: Path | bytes, *, size: int | None = None) -> PlyInfo:
@@ -99,7 +101,8 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
         refuse_more_than(max_gaussians, info.count, ply.name)
         progress("read", 0.0)
         read = read_compressed if info.compressed else _read_columns
-        return replace(read(ply, info.sh_degree, progress), notes=_notes(ply.header))
+        splats = read(ply, info.sh_degree, progress)
+        return replace(splats, antialiased=info.antialiased, notes=_notes(ply.header))
 
 
 def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Splats]:
@@ -119,7 +122,7 @@ def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Sp
             waiting.append(columns.splats(block))
             done += len(block)
             if sum(map(len, waiting)) >= BLOCK or done == info.count:
-                yield replace(concatenate(waiting), notes=_notes(ply.header))
+                yield replace(concatenate(waiting), antialiased=info.antialiased, notes=_notes(ply.header))
                 waiting = []
                 progress("read", done / info.count)
 
@@ -127,7 +130,8 @@ def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Sp
 def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> None:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
-    Positions are those of the world: float64 (``property double``) where float32 cannot hold them.
+    Positions are those of the world: float64 (``property double``) where float32 cannot hold them. An antialiased scene
+    is marked by a comment, :data:`kissgs.io.ply_header.MIP_COMMENT`.
 
     Args:
         file: The stream; it is not flushed or closed, and its OSErrors are not caught.
@@ -138,7 +142,7 @@ def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent
     wide = _POSITION if splats.origin != WORLD else ()
     n, k = len(splats), splats.shN.shape[1]
     names = (*_POSITION, *_NORMAL, *_COLOUR, *_rest(k), *_OPACITY, *_SCALE, *_ROTATION)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    header = ["ply", "format binary_little_endian 1.0", *[MIP_COMMENT] * splats.antialiased, f"element vertex {n}"]
     header += [f"property {'double' if name in wide else 'float'} {name}" for name in names]
     file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
     for start in range(0, n, _WRITE_ROWS):
@@ -169,7 +173,13 @@ def _check(ply: PlyFile) -> PlyInfo:
         _require_gaussians(ply.header, ply.name)
         degree = sh_degree(vertex, ply.name)
         check_complete(ply, vertex)
-    return PlyInfo(count=vertex.count, sh_degree=degree, encoding=ply.header.encoding, compressed=compressed)
+    return PlyInfo(
+        count=vertex.count,
+        sh_degree=degree,
+        encoding=ply.header.encoding,
+        compressed=compressed,
+        antialiased=ply.header.antialiased,
+    )
 
 
 def _require_gaussians(header: Header, name: str) -> None:

@@ -59,6 +59,12 @@ _LOOKALIKES = {
 }
 """Hints for other files that are often given as a scene, by their first bytes in lower case."""
 
+MIP_COMMENT = "comment SplatRenderMode: mip"
+"""Line that marks a scene as antialiased, as Brush and splat-transform write it."""
+
+_MARK = re.compile(r"(?:splatrendermode\s*[:=]?\s*(\w+)|antialiased\s*[:=]?\s*(\w+))\s*", re.IGNORECASE)
+"""Comments of trainers that say whether a scene is antialiased: Brush's, and Postshot's."""
+
 
 @dataclass(frozen=True, slots=True)
 class Property:
@@ -94,6 +100,8 @@ class Header:
     nbytes: int
     lines: int
     newline: bytes
+    antialiased: bool
+    """Whether a comment says that the scene was trained with antialiasing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,12 +157,15 @@ def _read_header(file: io.BufferedIOBase, name: str) -> Header:
     encoding: Encoding | None = None
     counts: dict[str, int] = {}
     properties: dict[str, dict[str, Property]] = {}
+    antialiased = False
     for number, words in _header_lines(file, newline, name):
         where = f"{name}, header line {number}"
         match words:
             case ["ply"] if number == 1:
                 continue
-            case [] | ["comment" | "obj_info", *_]:
+            case ["comment" | "obj_info", *text]:
+                antialiased = _marked(" ".join(text), antialiased)
+            case []:
                 continue
             case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as named, *_]:
                 if encoding not in (None, named):
@@ -177,10 +188,19 @@ def _read_header(file: io.BufferedIOBase, name: str) -> Header:
                 if encoding is None:
                     raise InvalidSceneError(f"{name} has no format line in its header; export the scene again")
                 elements = {key: Element(key, counts[key], tuple(properties[key].values())) for key in counts}
-                return Header(encoding, elements, file.tell(), number, newline)
+                return Header(encoding, elements, file.tell(), number, newline, antialiased)
             case _:
                 raise InvalidSceneError(f"{where}: {_quote(' '.join(words))} is not a line of a PLY header")
     raise InvalidSceneError(f"{name} has no end_header line; it is cut short or not a PLY file")
+
+
+def _marked(comment: str, before: bool) -> bool:
+    """Return whether a scene is antialiased after one more comment; the last one that says whether it is counts."""
+    found = _MARK.fullmatch(comment)
+    if found is None:
+        return before
+    mode, flag = (group and group.lower() for group in found.groups())
+    return mode == "mip" or flag in ("1", "true", "yes")
 
 
 def _recognise(head: bytes, name: str) -> None:

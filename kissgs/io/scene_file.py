@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from kissgs.core.array_types import UInt8
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.splats import Splats
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,3 +99,11 @@ def refuse_more_than(limit: int | None, count: int, name: str) -> None:
         raise UnsupportedError(
             f"{name} has {count:,} Gaussians; the limit is {limit:,}: raise it (--max-gaussians) if you trust the file"
         )
+
+
+def marked(splats: Splats, marks: Sequence[bool]) -> Splats:
+    """Return a scene of several parts as antialiased if all of them are; a note says if only some are."""
+    if any(marks) and not all(marks):
+        note = "some parts are marked as trained with antialiasing and others are not: all are drawn without"
+        return replace(splats, notes=(*splats.notes, note))
+    return replace(splats, antialiased=any(marks))

@@ -15,7 +15,7 @@ from kissgs.core.errors import InvalidSceneError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, empty_splats
 from kissgs.io.activations import OPACITY_OF_BYTE, SH0_OF_BYTE, byte_quats, log_scales
-from kissgs.io.codes import colors_of, note_clamped, opacities_of, to_bytes
+from kissgs.io.codes import colors_of, note_clamped, note_mark, opacities_of, to_bytes
 from kissgs.io.scene_file import BinaryWriter, SceneFile, open_scene_file, refuse_more_than
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -78,6 +78,7 @@ def write_splat(file: BinaryWriter, splats: Splats, *, progress: Progress = sile
     notes: list[str] = []
     if splats.sh_degree:
         notes.append(f"view-dependent colour (SH degree {splats.sh_degree}) is left out")
+    note_mark(notes, splats.antialiased)
     edge = 0.5 / 255
     note_clamped(notes, "colours", colors_of(splats.sh0), -edge, 1 + edge, "0 to 1")
     return tuple(notes)

@@ -86,9 +86,9 @@ class SpzInfo:
         }
 
 
-def header_bytes(count: int, sh_degree: int, fractional_bits: int) -> bytes:
+def header_bytes(count: int, sh_degree: int, fractional_bits: int, *, antialiased: bool) -> bytes:
     """Return the header of a version 3 file without extension records."""
-    return _HEADER.pack(MAGIC, 3, count, sh_degree, fractional_bits, 0, 0)
+    return _HEADER.pack(MAGIC, 3, count, sh_degree, fractional_bits, _ANTIALIASED * antialiased, 0)
 
 
 def is_spz(head: bytes) -> bool:
@@ -131,7 +131,7 @@ def read_spz(
         progress("read", 0.0)
         streams, extensions = _read_frames(opened, info) if info.version == 4 else _read_gzip(opened, info)
         progress("read", 0.5)
-        splats = _decode(streams, info)
+        splats = replace(_decode(streams, info), antialiased=info.antialiased)
         if not raw_axes:
             mirror(splats, axis_signs(_frame(extensions, opened.name)))
         progress("read", 1.0)

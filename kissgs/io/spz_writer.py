@@ -44,7 +44,7 @@ def write_spz(
     bits = spz_values.fractional_bits_for(reach)
     encoders = _encoders(splats, bits, axis_signs(PLY_FRAME if raw_axes else DEFAULT_FRAME))
     packer = zlib.compressobj(wbits=_GZIP)  # writes no time into the file
-    file.write(packer.compress(header_bytes(count, splats.sh_degree, bits)))
+    file.write(packer.compress(header_bytes(count, splats.sh_degree, bits, antialiased=splats.antialiased)))
     for done, encode in enumerate(encoders, 1):
         for part in steps(count):
             file.write(packer.compress(encode(part).tobytes()))

@@ -23,7 +23,7 @@ from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.core.threads import Workers
 from kissgs.io.json_files import parse_json
 from kissgs.io.packed_files import Source, is_file_name, open_source
-from kissgs.io.scene_file import refuse_more_than
+from kissgs.io.scene_file import marked, refuse_more_than
 
 MAX_TREE_BYTES = 1 << 25
 """Largest size of a manifest, bytes; one of a thousand leaves and five levels takes 330 kB."""
@@ -43,6 +43,10 @@ class Container(Protocol):
     @property
     def sh_degree(self) -> int:
         """Degree of the SH coefficients, 0 to 3."""
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the scene was trained with antialiasing."""
 
     def decode(self, out: Splats, pool: Workers) -> None:
         """Decode all Gaussians into ``out``, whose SH coefficients above the container's degree become zero."""
@@ -182,7 +186,7 @@ class StreamedFormat(Generic[C]):
                 progress("decode", start / max(count, 1))
                 start = part.decode(splats, start, pool)
             progress("decode", 1.0)
-            return replace(splats, origin=manifest.origin)
+            return marked(replace(splats, origin=manifest.origin), [part.container.antialiased for part in parts])
 
     def read_manifest(self, files: Source) -> Manifest:
         """Read and check the manifest.

@@ -19,6 +19,7 @@ def decompress(
     max_gaussians: int | None = None,
     level: int = 0,
     raw_axes: bool = False,
+    antialiased: bool | None = None,
     overwrite: bool = False,
     threads: int = 0,
     progress: Progress = silent,
@@ -32,6 +33,7 @@ def decompress(
         max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
         level: level of detail of a streamed scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
+        antialiased: see :func:`kissgs.load`.
         overwrite: replace ``destination`` if it exists.
         threads: number of threads; 0 means one per processor.
         progress: receives events.
@@ -50,7 +52,7 @@ def decompress(
         check_ply(Path(destination), overwrite=overwrite)
     splats = read_scene(
         source if isinstance(source, bytes | Mapping) else Path(source),
-        ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes),
+        ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased),
         threads=threads,
         progress=progress,
         only_containers=True,

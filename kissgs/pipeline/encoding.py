@@ -393,7 +393,7 @@ def _sensitivity(
         )
     key = hashlib.sha256(
         f"{SENSITIVITY_VERSION} {__version__} {view_uncertainty} {splats.sh_degree} "
-        f"{cameras.weights} {cameras.spread} {cameras.captured}".encode()
+        f"{cameras.weights} {cameras.spread} {cameras.captured}{' antialiased' * splats.antialiased}".encode()
     )
     for camera in cameras.cameras:
         key.update(camera.viewmat.tobytes() + camera.K.tobytes())
@@ -419,6 +419,7 @@ def _recolor(
 
     def recolor(decoded: Splats, order: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M 3"]:
         weights = sensitivity.color_weight[order], sensitivity.prior[order]
+        decoded = replace(decoded, antialiased=splats.antialiased)
         return refit_colors(decoded, splats, cameras, *weights, steps=steps, threads=threads, progress=progress)
 
     return recolor

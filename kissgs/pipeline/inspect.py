@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     Header = PlyInfo | SpzInfo | KsplatInfo | GltfInfo
 
 DETAILS: dict[SceneFormat, dict[str, str]] = {
-    "ply": {"encoding": "encoding", "compressed": "compressed"},
+    "ply": {"encoding": "encoding", "compressed": "compressed", "antialiased": "antialiased"},
     "spz": {"version": "version", "antialiased": "antialiased", "fractional_bits": "fractional_bits"},
     "ksplat": {"compression_level": "level", "sections": "sections"},
-    "gltf": {"binary": "binary", "primitives": "primitives", "spz": "spz"},
+    "gltf": {"binary": "binary", "primitives": "primitives", "spz": "spz", "antialiased": "antialiased"},
 }
 """Details that the headers of files state, and the fields of the headers that have them."""
 
@@ -47,10 +47,11 @@ class Info:
             highest level (containers; where channels share a step, few reach the highest).
         changed: Gaussians that cleaning would remove or correct, or that the encoder removed or corrected (SOG-XT), by
             reason; empty for SOG, whose images are not decoded for this.
-        details: encoding and whether it is PlayCanvas' compressed layout (``.ply``); side of grid and codebook, version
+        details: whether it is marked as antialiased, but for formats without such a mark; encoding and whether it is
+            PlayCanvas' compressed layout (``.ply``); side of grid and codebook, version
             and settings of the encoder (SOG-XT); version, variant of the renderer, generator and size of the codebook
             (SOG); the level that is described, and Gaussians per level and of the environment (streamed scenes);
-            version, antialiasing and precision of positions (``.spz``); compression level and sections (``.ksplat``);
+            version and precision of positions (``.spz``); compression level and sections (``.ksplat``);
             primitives and compression (glTF).
     """
 

@@ -30,7 +30,7 @@ def sog_facts(path: Path) -> Facts:
         ranges=sog_ranges([layout]),
         details={
             "version": layout.version,
-            "antialiased": layout.model == "antialiased",
+            "antialiased": layout.antialiased,
             "model": layout.model,
             "generator": layout.generator,
             "codebook_entries": layout.rest.entries if layout.rest else 0,

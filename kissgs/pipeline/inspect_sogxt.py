@@ -45,6 +45,7 @@ def sogxt_facts(path: Path) -> Facts:
             "codebook_side": layout.codebook_side,
             "version": made.version if made else None,
             "source_count": made.source_count if made else None,
+            "antialiased": layout.antialiased,
             "settings": made.settings if made else {},
         },
     )

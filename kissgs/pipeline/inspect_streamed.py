@@ -72,5 +72,6 @@ def _facts(
             "levels": [manifest.count(one) for one in range(manifest.levels)],
             "environment": parts[-1].count if manifest.environment is not None else 0,
             "files": len(manifest.filenames),
+            "antialiased": bool(parts) and all(part.container.antialiased for part in parts),
         },
     )

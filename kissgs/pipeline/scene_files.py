@@ -29,6 +29,7 @@ def load(
     level: int = 0,
     raw_axes: bool = False,
     origin: Literal["auto"] | None = None,
+    antialiased: bool | None = None,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Splats:
@@ -42,6 +43,7 @@ def load(
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
         origin: see :class:`kissgs.ReadOptions`. By default, positions are those of the world wherever float32 can hold
             them; else they are relative to ``origin`` of the scene.
+        antialiased: whether the scene was trained with antialiasing (:class:`kissgs.Splats`); None: as the file says.
         threads: number of threads; 0 means one per processor.
         progress: receives events.
 
@@ -50,7 +52,9 @@ def load(
         InvalidContainerError: the container is damaged.
         UnsupportedError: the file is valid, but uses a feature that kissgs does not read.
     """
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, origin=origin)
+    reading = ReadOptions(
+        max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, origin=origin, antialiased=antialiased
+    )
     splats = clean(read_scene(Path(path), reading, threads=threads, progress=progress))[0]
     return splats if origin == "auto" else in_world(splats)
 
@@ -135,7 +139,7 @@ def read_scene(
     Raises:
         KissgsError: the scene cannot be read.
     """
-    splats = _read(source, reading, threads, progress, only_containers)
+    splats = reading.marked(_read(source, reading, threads, progress, only_containers))
     return centred(splats) if reading.origin == "auto" else splats
 
 

@@ -23,12 +23,14 @@ class PlannedScene:
         visible: number of Gaussians that the plan could keep: those that a renderer draws, or all.
         sh_degree: 0 to 3.
         origin: see :class:`kissgs.Splats`.
+        antialiased: see :class:`kissgs.Splats`.
     """
 
     count: int
     visible: int
     sh_degree: int
     origin: Origin
+    antialiased: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)

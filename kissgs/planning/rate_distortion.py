@@ -53,10 +53,8 @@ def plan_rate_distortion(
 ) -> EncodingPlan:
     """Plan the Gaussians ``kept``, at least one of which a camera has seen, for a container."""
     progress("rate_distortion", 0.0)
-    scene, uncertainty = (
-        PlannedScene(len(splats), len(kept), splats.sh_degree, splats.origin),
-        sensitivity.view_uncertainty,
-    )
+    scene = PlannedScene(len(splats), len(kept), splats.sh_degree, splats.origin, splats.antialiased)
+    uncertainty = sensitivity.view_uncertainty
     costs = _costs_of(splats, kept, sensitivity, pool)
     sh_model = codebook_error_model(splats, kept, sensitivity, settings, pool)
     refits = settings.color_refit_iterations if recolor is not None else 0

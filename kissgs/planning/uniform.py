@@ -83,7 +83,7 @@ def plan_uniform(
         errors = {name: half_steps(field) for name, field in fields.items()}
         errors["means"] = half_steps(fields["means"], 1 << (16 - bits))
     return EncodingPlan(
-        scene=PlannedScene(len(splats), len(kept), splats.sh_degree, splats.origin),
+        scene=PlannedScene(len(splats), len(kept), splats.sh_degree, splats.origin, splats.antialiased),
         grid=grid,
         fields={**fields, "f_rest_centroids": codebook.centroids},
         codebook=codebook,

@@ -55,7 +55,7 @@ def page_scene(
         KissgsError: the scene cannot be read.
     """
     read = read_scene(source, reading, threads=threads, progress=progress)
-    container = _as_container(source)
+    container = _as_container(source, reading)
     if container is not None:
         return container
     splats = replace(clean(read)[0], origin=WORLD)  # viewers draw a scene better near the origin
@@ -71,7 +71,7 @@ def page_container(
 
     The parameters and errors are those of :func:`page_scene`.
     """
-    container = _as_container(source)
+    container = _as_container(source, reading)
     if container is not None:
         read_scene(
             source, reading, threads=threads, progress=progress
@@ -81,11 +81,14 @@ def page_container(
     return PageScene(f"{_stem(source)}.zip", result.to_zip(), converted=True)
 
 
-def _as_container(source: Path | bytes) -> PageScene | None:
-    """Return the zip of a container, None for other formats. The files of a folder are packed."""
+def _as_container(source: Path | bytes, reading: ReadOptions) -> PageScene | None:
+    """Return the zip of a container, None for other formats. The files of a folder are packed.
+
+    A container is not shown as it is if its mark of antialiasing does not count.
+    """
     found = recognise(source)
     kind = next((kind for kind in CONTAINERS if kind == found), None)
-    if kind is None:
+    if kind is None or reading.antialiased is not None:
         return None
     root = scene_root(source) if isinstance(source, Path) else source
     name = f"{_stem(source)}{ending_of(kind)}"

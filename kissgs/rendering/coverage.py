@@ -68,7 +68,7 @@ class Coverage:
         from kissgs.rendering.cpu.coverage import raise_coverage
 
         splats, camera = frame.splats, frame.camera
-        limits = np.array([NEAR, VISIBLE, RESOLVED / finer, camera.dilation / DILATION])
+        limits = np.array([NEAR, VISIBLE, RESOLVED / finer, camera.dilation / DILATION, splats.antialiased])
 
         def part(rows: tuple[int, int]) -> None:
             raise_coverage(

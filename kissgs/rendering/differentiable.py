@@ -33,6 +33,7 @@ def rasterize(
     *,
     backgrounds: Tensor | None = None,
     dilation: float = DILATION,
+    antialiased: bool = False,
     threads: int = 0,
     receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -57,6 +58,7 @@ def rasterize(
         height: of the images, pixels.
         backgrounds: ``(C, 3)`` RGB; black by default. No gradient.
         dilation: variance added to both axes of a footprint, pixels².
+        antialiased: whether opacities are compensated for the dilation (:attr:`kissgs.Splats.antialiased`).
         threads: number of CPU threads; 0 means one per processor. The result does not depend on it.
         receive: on the CPU, called in the backward pass with the gradients of each image, in place of autograd: most
             Gaussians have none, and arrays for all of them take longer to fill than to compute.
@@ -79,12 +81,12 @@ def rasterize(
     if device.type == "cuda":
         from kissgs.rendering.gsplat_backend import rasterize_on_cuda
 
-        return rasterize_on_cuda(parameters, viewmats, Ks, width, height, backgrounds, dilation)
+        return rasterize_on_cuda(parameters, viewmats, Ks, width, height, backgrounds, dilation, antialiased)
     if device.type != "cpu":
         raise UnsupportedError(f"the rasteriser runs on cpu and cuda, not on {device.type}; move the parameters")
     poses, pinholes, colours = (tensor.cpu().numpy() for tensor in (viewmats, Ks, backgrounds))
     cameras = [Camera(pose, K, width, height, dilation) for pose, K in zip(poses, pinholes, strict=True)]
-    images, alphas = _Rasterize.apply(*tensors, cameras, colours, threads, receive)  # type: ignore[no-untyped-call]
+    images, alphas = _Rasterize.apply(*tensors, cameras, colours, antialiased, threads, receive)  # type: ignore[no-untyped-call]
     return images, alphas
 
 
@@ -102,9 +104,12 @@ def _check_views(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor) -> None:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:  # noqa: ANN401
-        parameters, (cameras, backgrounds, threads, receive) = inputs[: len(ATTRIBUTES)], inputs[len(ATTRIBUTES) :]
-        arrays = [parameter.detach().contiguous().numpy() for parameter in parameters]
-        splats = Splats(**dict(zip(ATTRIBUTES, arrays, strict=True)))
+        parameters, others = inputs[: len(ATTRIBUTES)], inputs[len(ATTRIBUTES) :]
+        cameras, backgrounds, antialiased, threads, receive = others
+        means, quats, scales, opacities, sh0, shN = (each.detach().contiguous().numpy() for each in parameters)
+        splats = Splats(
+            means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN, antialiased=antialiased
+        )
         with Workers(threads) as pool:
             frames = [draw(splats, camera, colour, pool) for camera, colour in zip(cameras, backgrounds, strict=True)]
         ctx.frames, ctx.threads, ctx.receive = frames, threads, receive
@@ -131,8 +136,8 @@ class _Rasterize(torch.autograd.Function):
                 for name, total in zip(ATTRIBUTES, totals, strict=False):
                     found.add_to(name, total)
         if receive is not None:
-            return (None,) * (len(parameters) + 4)
-        return (*(torch.from_numpy(total) for total in totals), None, None, None, None)
+            return (None,) * (len(parameters) + 5)
+        return (*(torch.from_numpy(total) for total in totals), *(None,) * 5)
 
 
 def _stack(images: list[np.ndarray]) -> Tensor:

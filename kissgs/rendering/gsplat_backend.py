@@ -1,4 +1,4 @@
-"""The rasteriser on CUDA: gsplat in its classic mode, with :mod:`kissgs.rendering.constants`."""
+"""The rasteriser on CUDA: gsplat in its modes "classic" and "antialiased", with :mod:`kissgs.rendering.constants`."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ def rasterize_on_cuda(
     height: int,
     backgrounds: Tensor,
     dilation: float,
+    antialiased: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Render as :func:`kissgs.rendering.differentiable.rasterize`, for tensors on CUDA.
 
@@ -71,7 +72,7 @@ def rasterize_on_cuda(
         sh_degree=SH_REST_COUNTS.index(shN.shape[1]),
         tile_size=constants.TILE,
         backgrounds=backgrounds,
-        rasterize_mode="classic",
+        rasterize_mode="antialiased" if antialiased else "classic",
     )
     return images, alphas[..., 0]
 
@@ -127,6 +128,7 @@ def image_renderer(splats: Splats) -> ImageRenderer:
                 height=camera.height,
                 backgrounds=torch.tensor([list(background)]),
                 dilation=camera.dilation,
+                antialiased=splats.antialiased,
             )
         return images[0].cpu().numpy(), alphas[0].cpu().numpy()
 

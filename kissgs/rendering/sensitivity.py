@@ -74,7 +74,8 @@ def measure_sensitivity(
     """Measure the sensitivity of a scene: the Gauss-Newton Hessian of the squared image error, a block per Gaussian.
 
     The Hessian is J ᵀ J with J the derivative of the images, without sampling. Of a change of position, J omits the
-    small effects on the footprint's shape, on the view-dependent colour and on the depth order. A Gaussian behind a
+    small effects on the footprint's shape (and so on the opacity's compensation in an antialiased scene), on the
+    view-dependent colour and on the depth order. A Gaussian behind a
     transmittance of :data:`HIDDEN` counts as unseen in that pixel.
 
     Args:

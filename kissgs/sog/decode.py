@@ -55,7 +55,7 @@ def decode(
         splats = empty_splats(layout.count, layout.rest.coefficients if layout.rest else 0)
         decode_files(files, layout, splats, pool)
         progress("decode", 1.0)
-        return replace(splats, origin=layout.origin)
+        return replace(splats, origin=layout.origin, antialiased=layout.antialiased)
 
 
 def decode_files(files: Source, layout: SogLayout, out: Splats, pool: Workers, folder: str = "") -> None:

@@ -99,6 +99,7 @@ def metadata(plan: EncodingPlan, sh_degree: int) -> bytes:
     fields = plan.fields
     document: dict[str, Any] = {
         "version": 2,
+        **({"model": "antialiased"} if plan.scene.antialiased else {}),
         "asset": {"generator": f"kissgs {__version__}"},
         "count": int(plan.grid.mask.sum()),
         "means": {

@@ -85,6 +85,11 @@ class SogLayout:
     origin: Origin
 
     @property
+    def antialiased(self) -> bool:
+        """Whether the scene was trained with antialiasing."""
+        return self.model is not None and self.model.lower() == "antialiased"
+
+    @property
     def sh_degree(self) -> int:
         """SH degree, 0 to 3."""
         return SH_REST_COUNTS.index(self.rest.coefficients) if self.rest else 0

@@ -41,6 +41,11 @@ class SogContainer:
         """See :class:`kissgs.io.streamed.Container`."""
         return self.layout.sh_degree
 
+    @property
+    def antialiased(self) -> bool:
+        """See :class:`kissgs.io.streamed.Container`."""
+        return self.layout.antialiased
+
     def decode(self, out: Splats, pool: Workers) -> None:
         """See :class:`kissgs.io.streamed.Container`."""
         decode_files(self.files, self.layout, out, pool, self.folder)

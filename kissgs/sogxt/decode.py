@@ -61,7 +61,7 @@ def decode(
         progress("decode", 0.5)
         splats = planes.look_up(pool)
         progress("decode", 1.0)
-        return replace(splats, origin=planes.layout.origin)
+        return replace(splats, origin=planes.layout.origin, antialiased=planes.layout.antialiased)
 
 
 def decode_files(files: Source, layout: Layout, out: Splats, pool: Workers) -> None:

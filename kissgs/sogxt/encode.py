@@ -94,6 +94,7 @@ def write_files(
         count=count,
         ranges=_ranges(plan.fields),
         origin=scene.origin,
+        model="antialiased" if scene.antialiased else None,
         provenance=metadata.Provenance(
             version=__version__,
             sh_degree=scene.sh_degree,

@@ -96,6 +96,9 @@ class ContainerMeta(BaseModel):
 
     meta: Sides
     ops: list[Op]
+    model: Literal["antialiased"] | None = Field(
+        None, description="Variant of the renderer that the scene was trained with; missing for the classic one."
+    )
     kissgs: Provenance | None = None
     kissgs_crc32: int | None = Field(None, ge=0, lt=1 << 32, description="CRC-32 of all numbers that decoding needs.")
 
@@ -111,8 +114,15 @@ class Layout(BaseModel):
     count: int | None = Field(None, ge=0)
     provenance: Provenance | None = None
     origin: Origin = WORLD
+    model: str | None = None
+    """Variant of the renderer that the scene was made for, as in SOG: "antialiased", or None."""
     crc32: dict[str, Annotated[int, Field(ge=0, lt=1 << 32)]] = Field(default_factory=dict)
     """CRC-32 of each image's pixels (:func:`kissgs.io.webp.pixels_crc32`); in ``meta.json`` only."""
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the scene was trained with antialiasing."""
+        return self.model is not None and self.model.lower() == "antialiased"
 
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
         """Return ``low`` and ``high`` of a field, one number per channel: float32 numbers, as float64."""
@@ -151,6 +161,8 @@ class Layout(BaseModel):
                 for field in CHANNELS
             ],
         }
+        if self.model is not None:
+            document["model"] = self.model
         if self.provenance:
             document["kissgs"] = {**self.provenance.model_dump(), **recorded(self.origin)}
             document[CHECKSUM] = self.checksum
@@ -188,6 +200,8 @@ class Layout(BaseModel):
                 **observed,
             },
         }
+        if self.model is not None:
+            document["model"] = self.model
         if self.provenance:
             own = self.provenance.model_dump(include={"version", "sh_degree"})
             document["kissgs"] = {**own, **recorded(self.origin), "crc32": self.crc32}

@@ -98,6 +98,7 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
         "ranges": ranges,
         "provenance": recorded,
         "origin": read_origin(document, YAML_NAME),
+        "model": _text(document.get("model")),
         CHECKSUM: document.get(CHECKSUM, MISSING),
     }
 
@@ -152,6 +153,7 @@ def _from_json(data: bytes) -> dict[str, Any]:
             "codebook_side": _whole(rest["centroidSide"]),
             "ranges": ranges,
             "origin": read_origin(document, JSON_NAME),
+            "model": _text(document.get("model")),
             CHECKSUM: document.get(CHECKSUM, MISSING),
         }
         if "kissgs" in document:
@@ -196,6 +198,10 @@ def _check_dialect(document: Mapping[str, Any]) -> None:
 def _require_webp(codec: object) -> None:
     if codec != "webp":
         raise UnsupportedError(f"the container's images are {codec!r} files; only 'webp' is read")
+
+
+def _text(value: object) -> str | None:
+    return value[:100] if isinstance(value, str) else None
 
 
 def _flat(values: Any) -> list[Any]:  # noqa: ANN401

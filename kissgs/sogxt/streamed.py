@@ -47,6 +47,11 @@ class SogxtContainer:
         """See :class:`kissgs.io.streamed.Container`."""
         return self.layout.sh_degree
 
+    @property
+    def antialiased(self) -> bool:
+        """See :class:`kissgs.io.streamed.Container`."""
+        return self.layout.antialiased
+
     def decode(self, out: Splats, pool: Workers) -> None:
         """See :class:`kissgs.io.streamed.Container`."""
         decode_files(_zip(self.files, self.name), self.layout, out, pool)

@@ -18,7 +18,7 @@ import numpy as np
 from kissgs.core.array_types import Float32, UInt16
 from kissgs.core.origin import WORLD, visible_sizes
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import SH_REST_COUNTS, Splats, clean, concatenate, empty_splats
+from kissgs.core.splats import Splats, clean, concatenate
 from kissgs.io.atomic import atomic_file
 from kissgs.io.container_names import ContainerName
 from kissgs.pipeline.containers import MODELS, write_files
@@ -44,7 +44,7 @@ from kissgs.streaming.layout import (
 from kissgs.streaming.levels import chunk_levels, level_count
 from kissgs.streaming.manifest import Leaf, manifest
 from kissgs.streaming.partition import Cuts, chunk_depth, cuts_without_coarse, sampled_rows
-from kissgs.streaming.rows import append_rows, from_rows, read_rows, sync, to_rows, write_rows
+from kissgs.streaming.rows import append_rows, from_rows, read_rows, row_bytes, sync, to_rows, write_rows
 from kissgs.streaming.sensitivities import cameras_json, cameras_of, choose_cameras, measure_file
 
 Blocks = Callable[[], Iterable[Splats]]
@@ -108,11 +108,12 @@ def partition(
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in range(cuts.chunks))):
         path.unlink(missing_ok=True)
     far_count, counts, sh_degree, changed = 0, np.zeros(cuts.chunks, np.int64), 0, Counter[str]()
+    antialiased = False
     for block in counted():
         splats, cleaned = clean(block)
         visible = visible_gaussians(splats, settings)
         changed.update({**cleaned.as_dict(), "invisible": len(splats) - len(visible)})
-        splats, sh_degree = splats.select(visible), splats.sh_degree
+        splats, sh_degree, antialiased = splats.select(visible), splats.sh_degree, splats.antialiased
         far = environment.contains(splats.means)
         append_rows(environment_file(work), to_rows(splats.select(far)))
         far_count, splats, origin = far_count + int(far.sum()), splats.select(~far), splats.origin
@@ -135,6 +136,7 @@ def partition(
         environment=far_count,
         changed=dict(changed),
         origin=origin,
+        antialiased=antialiased,
     )
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in layout.filled)):
         sync(path)
@@ -155,7 +157,7 @@ def has_levels(work: Path, chunk: int) -> bool:
 def make_levels(work: Path, layout: Layout, chunk: int, threads: int, progress: Progress = silent) -> None:
     """Merge a chunk into its levels, one file of rows each; ``progress`` receives "merge"."""
     rows = read_rows(chunk_file(work, chunk), layout.sh_degree, layout.counts[chunk])
-    made = chunk_levels(from_rows(rows), layout.levels, layout.leaf, threads, progress)
+    made = chunk_levels(from_rows(rows, antialiased=layout.antialiased), layout.levels, layout.leaf, threads, progress)
     for level, splats in enumerate(made.levels):
         write_rows(level_file(work, chunk, level), to_rows(splats))
     write_json(leaves_file(work, chunk), {"counts": made.counts, "bounds": made.bounds.tolist(), "errors": made.errors})
@@ -286,7 +288,8 @@ def environment_count(work: Path) -> int:
 
 def read_environment(work: Path, layout: Layout) -> Splats:
     """Return the Gaussians of the environment."""
-    return from_rows(read_rows(environment_file(work), layout.sh_degree, layout.environment))
+    rows = read_rows(environment_file(work), layout.sh_degree, layout.environment)
+    return from_rows(rows, antialiased=layout.antialiased)
 
 
 def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -> Splats:
@@ -295,7 +298,8 @@ def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -
         read_rows(level_file(work, chunk, level), layout.sh_degree, sum(read_leaves(work, chunk)["counts"][level]))
         for chunk in chunks
     ]
-    return from_rows(np.concatenate(rows)) if rows else empty_splats(0, SH_REST_COUNTS[layout.sh_degree])
+    together = np.concatenate(rows) if rows else np.empty((0, row_bytes(layout.sh_degree) // 4), np.float32)
+    return from_rows(together, antialiased=layout.antialiased)
 
 
 def make_manifest(work: Path, layout: Layout) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from kissgs._version import __version__
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.origin import middle_of, with_origin
 from kissgs.core.progress import Progress, as_stage, silent
-from kissgs.core.splats import BLOCK
+from kissgs.core.splats import BLOCK, Splats
 from kissgs.io.atomic import atomic_file, reason_of
 from kissgs.io.container_names import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
 from kissgs.io.ply import read_ply_blocks, read_ply_info
@@ -193,7 +193,11 @@ def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, i
         info = read_ply_info(source)
         if not info.compressed:
             origin = middle_of(read_ply_blocks(source)) if reading.origin == "auto" else None
-            return lambda: map(partial(with_origin, origin=origin), read_ply_blocks(source)), info.count, info.sh_degree
+
+            def blocks() -> Iterator[Splats]:
+                return (with_origin(reading.marked(block), origin) for block in read_ply_blocks(source))
+
+            return blocks, info.count, info.sh_degree
     scene = read_scene(source, reading, threads=threads)
     starts = range(0, len(scene), BLOCK)
     return lambda: (scene.select(slice(start, start + BLOCK)) for start in starts), len(scene), scene.sh_degree

@@ -34,6 +34,7 @@ class Layout:
         environment: number of Gaussians in the environment; 0 without one.
         changed: number of Gaussians that cleaning removed or changed, by kind, and of those that are invisible.
         origin: see :class:`kissgs.Splats`.
+        antialiased: see :class:`kissgs.Splats`.
     """
 
     container: ContainerName
@@ -46,6 +47,7 @@ class Layout:
     environment: int
     changed: dict[str, int]
     origin: Origin
+    antialiased: bool = False
 
     @property
     def filled(self) -> list[int]:

@@ -26,12 +26,20 @@ def to_rows(splats: Splats) -> Float32[np.ndarray, "N F"]:
     )
 
 
-def from_rows(rows: Float32[np.ndarray, "N F"]) -> Splats:
-    """Return the Gaussians of rows."""
+def from_rows(rows: Float32[np.ndarray, "N F"], *, antialiased: bool) -> Splats:
+    """Return the Gaussians of rows, of a scene that is ``antialiased`` or not."""
     parts = (np.ascontiguousarray(part) for part in np.split(rows, (3, 7, 10, 11, 14), axis=1))
     means, quats, scales, opacities, sh0, rest = parts
     shN = rest.reshape(len(rows), rest.shape[1] // 3, 3)
-    return Splats(means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh0=sh0, shN=shN)
+    return Splats(
+        means=means,
+        quats=quats,
+        scales=scales,
+        opacities=opacities[:, 0],
+        sh0=sh0,
+        shN=shN,
+        antialiased=antialiased,
+    )
 
 
 def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:

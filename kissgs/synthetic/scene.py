@@ -14,7 +14,15 @@ import numpy as np
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.spherical_harmonics import sh_basis
-from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_C0, SH_REST_COUNTS, Splats
+from kissgs.core.splats import (
+    ATTRIBUTES,
+    OPACITY_LOGIT_MAX,
+    OPACITY_LOGIT_MIN,
+    SH_C0,
+    SH_REST_COUNTS,
+    Splats,
+    empty_splats,
+)
 from kissgs.synthetic.surfaces import SHADOW_CASTERS, SURFACES, Column, Rows, Surface, f32, unit_sphere
 
 
@@ -39,9 +47,7 @@ def sample_scene(count: int = 60_000, *, sh_degree: int = 3, seed: int = 0) -> S
     if sh_degree not in range(len(SH_REST_COUNTS)):
         raise UnsupportedError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
     rng = np.random.Generator(np.random.PCG64(seed))
-    k = SH_REST_COUNTS[sh_degree]
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (3,), "shN": (k, 3)}
-    scene = Splats(**{name: np.empty((count, *shape), np.float32) for name, shape in shapes.items()})
+    scene = empty_splats(count, SH_REST_COUNTS[sh_degree])
     rows = rng.permutation(count)
     start = 0
     for part in _parts(count, sh_degree, rng):

@@ -44,6 +44,10 @@ class TrainableScene(Protocol):
         """Return the current :data:`Parameters`, differentiable."""
 
     @property
+    def antialiased(self) -> bool:
+        """See :class:`kissgs.Splats`."""
+
+    @property
     def receive(self) -> Callable[[Gradients], None] | None:
         """Receiver of the gradients of images, see :func:`kissgs.rendering.differentiable.rasterize`."""
 
@@ -129,6 +133,7 @@ def train(
                     n,
                     ssim_weight=plan.ssim_weight,
                     mse_weight=plan.mse_weight,
+                    antialiased=scene.antialiased,
                     threads=threads,
                     receive=scene.receive,
                 )
@@ -156,12 +161,13 @@ def image_loss(
     *,
     ssim_weight: float,
     mse_weight: float,
+    antialiased: bool,
     threads: int,
     receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, float]:
     """Render target ``n``; return the photometric loss, differentiable, and the mean squared error.
 
-    ``receive`` is as in :func:`kissgs.rendering.differentiable.rasterize`.
+    ``antialiased`` and ``receive`` are as in :func:`kissgs.rendering.differentiable.rasterize`.
     """
     camera = targets.cameras[n]
     target = targets.image(n)
@@ -173,6 +179,7 @@ def image_loss(
         height=camera.height,
         backgrounds=torch.from_numpy(targets.backgrounds[n])[None],
         dilation=camera.dilation,
+        antialiased=antialiased,
         threads=threads,
         receive=receive,
     )

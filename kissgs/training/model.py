@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -54,6 +56,7 @@ class GaussianModel:
         """
         extents = np.ones(len(splats), np.float32) if extents is None else extents
         self._adam = PrunableAdam(tensors_of(splats, device), BOUNDS, {"means": torch.from_numpy(extents)})
+        self._rest = splats.select(slice(0))
         self._received: list[Gradients] = []
         self._on_cpu = device == "cpu"
 
@@ -66,6 +69,11 @@ class GaussianModel:
     def receive(self) -> Callable[[Gradients], None] | None:
         """Receiver of gradients of images, for :meth:`step`, on the CPU; elsewhere autograd provides them."""
         return self.add_gradients if self._on_cpu else None
+
+    @property
+    def antialiased(self) -> bool:
+        """See :class:`kissgs.Splats`."""
+        return self._rest.antialiased
 
     def add_gradients(self, gradients: Gradients) -> None:
         """Add gradients of an image to those of the next :meth:`step`, on the CPU."""
@@ -97,8 +105,10 @@ class GaussianModel:
 
     def splats(self) -> Splats:
         """Return a clean copy of the current scene."""
-        arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.parameters.items()}
-        return clean(Splats(**arrays))[0]
+        arrays: dict[str, Any] = {
+            name: tensor.detach().cpu().numpy().copy() for name, tensor in self.parameters.items()
+        }
+        return clean(replace(self._rest, **arrays))[0]
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the full state as arrays, see :meth:`restored`."""
@@ -106,9 +116,21 @@ class GaussianModel:
 
     @classmethod
     def restored(
-        cls, state: Mapping[str, np.ndarray], device: Device = "cpu", extents: Float32[np.ndarray, " N"] | None = None
+        cls,
+        state: Mapping[str, np.ndarray],
+        scene: Splats,
+        device: Device = "cpu",
+        extents: Float32[np.ndarray, " N"] | None = None,
     ) -> GaussianModel:
-        """Return a model that continues exactly from a :meth:`state`; ``extents`` must be those of its model."""
-        model = cls(Splats(**{name: state[name] for name in ATTRIBUTES}), device, extents)
+        """Return a model that continues exactly from a :meth:`state`.
+
+        Args:
+            state: the state.
+            scene: a scene that is like the trained one in all but its Gaussians.
+            device: device of the tensors.
+            extents: those of the model whose state it is.
+        """
+        arrays: dict[str, Any] = {name: state[name] for name in ATTRIBUTES}
+        model = cls(replace(scene, **arrays), device, extents)
         model._adam.restore(state)
         return model

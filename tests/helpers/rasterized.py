@@ -21,6 +21,7 @@ def render_tensors(splats, cameras, device="cpu", backgrounds=None, **parameters
         backgrounds=None
         if backgrounds is None
         else torch.tensor(np.array(backgrounds), dtype=torch.float32, device=device),
+        antialiased=splats.antialiased,
         **parameters,
     )
     return images, alphas, tensors

@@ -73,7 +73,10 @@ def rotations(quats):
 
 
 def exponents(params, camera, W, t):
-    """Return ``(N, H W)`` half squared Mahalanobis distances, as sums of squares, which are accurate for needles."""
+    """Return ``(N, H W)`` half squared Mahalanobis distances, as sums of squares, which are accurate for needles.
+
+    And ``(N,)`` the ratio of the determinants of the covariance before and after dilation.
+    """
     K, width, height = camera.K, camera.width, camera.height
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = (params["means"] @ W.T + t).T
@@ -83,14 +86,15 @@ def exponents(params, camera, W, t):
     q = fy / z[:, None] * (W[1] - near_y[:, None] * W[2])
     R, s = rotations(params["quats"]), params["scales"].exp()
     p, q = ((row[:, None] @ R)[:, 0] * s for row in (p, q))
-    det = 0.3 * ((p * p).sum(1) + (q * q).sum(1) + 0.3) + torch.linalg.cross(p, q).square().sum(1)
+    before = torch.linalg.cross(p, q).square().sum(1)
+    det = 0.3 * ((p * p).sum(1) + (q * q).sum(1) + 0.3) + before
     ys, xs = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     dx = xs.reshape(-1).double() - (fx * x / z + cx)[:, None]
     dy = ys.reshape(-1).double() - (fy * y / z + cy)[:, None]
     squares = 0.3 * (dx * dx + dy * dy)
     for k in range(3):
         squares = squares + (p[:, k, None] * dy - q[:, k, None] * dx).square()
-    return squares / (2 * det[:, None])
+    return squares / (2 * det[:, None]), before / det
 
 
 def decisions(raw):
@@ -110,14 +114,16 @@ def decisions(raw):
     return drawn, raw > 0.99, ~doubtful, ended
 
 
-def draw(params, camera, background):
+def draw(params, camera, background, antialiased=False):
     """Render an image from float64 tensors."""
     W, t = torch.from_numpy(camera.viewmat[:3, :3]), torch.from_numpy(camera.viewmat[:3, 3])
     depth = (params["means"].detach() @ W.T + t)[:, 2].numpy()
     order = np.argsort(depth.astype(np.float32), kind="stable")
     order = order[(depth[order] >= 0.01) & (depth[order] <= 1e10)]
     params = {name: values[torch.from_numpy(order)] for name, values in params.items()}
-    raw = torch.sigmoid(params["opacities"])[:, None] * torch.exp(-exponents(params, camera, W, t))
+    exponent, ratio = exponents(params, camera, W, t)
+    opacities = torch.sigmoid(params["opacities"]) * (ratio.sqrt() if antialiased else 1)
+    raw = opacities[:, None] * torch.exp(-exponent)
     drawn, clamped, sure, ended = decisions(raw)
     alphas = torch.where(torch.from_numpy(drawn), torch.where(torch.from_numpy(clamped), 0.99, raw), 0.0)
     sight = params["means"] + W.T @ t

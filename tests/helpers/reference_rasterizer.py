@@ -1,4 +1,4 @@
-"""Oracle of rendering: gsplat's classic mode in float64, pixel by pixel, with full covariance matrices.
+"""Oracle of rendering: gsplat's modes in float64, pixel by pixel, with full covariance matrices.
 
 It shares no code with the renderer under test.
 """
@@ -32,9 +32,13 @@ def rotation(quat):
 
 
 def inverse(covariance, transform, R, scales):
-    """Return the determinant of a footprint's covariance; with 120 digits where float64 is not exact enough."""
+    """Return the inverse of a footprint's covariance, and the ratio of its determinants before and after dilation.
+
+    With 120 digits where float64 is not exact enough.
+    """
     if scales.max() - scales.min() < 7 and scales.max() < 7:
-        return np.linalg.inv(covariance)
+        before = np.linalg.det(covariance - 0.3 * np.eye(2))
+        return np.linalg.inv(covariance), max(before / np.linalg.det(covariance), 0)
     with localcontext() as context:
         context.prec = 120
         exact = np.vectorize(lambda value: Decimal(float(value)), otypes=[object])
@@ -43,7 +47,8 @@ def inverse(covariance, transform, R, scales):
         dilation = Decimal("0.3")
         a, b, d = ((turned[i] * turned[j] * squares).sum() + dilation * (i == j) for i, j in ((0, 0), (0, 1), (1, 1)))
         det = a * d - b * b
-        return np.array([[d / det, -b / det], [-b / det, a / det]], np.float64)
+        before = (a - dilation) * (d - dilation) - b * b
+        return np.array([[d / det, -b / det], [-b / det, a / det]], np.float64), float(max(before / det, 0))
 
 
 def harmonics(x, y, z):
@@ -72,7 +77,7 @@ def sh_values(direction, count):
     return np.array(harmonics(*direction)[:count])
 
 
-def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
+def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99, antialiased=False):
     """Render an image.
 
     Args:
@@ -82,6 +87,7 @@ def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
         frozen: decisions of an earlier image to keep.
         removed: a Gaussian to leave out.
         alpha_max: largest alpha, which differs between releases of gsplat.
+        antialiased: whether opacities are compensated for the dilation.
     """
     means, quats, scales, opacities, sh0, shN = (
         params[name] for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -113,7 +119,8 @@ def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
         R = rotation(quats[n])
         covariance = R @ np.diag(np.exp(2 * scales[n])) @ R.T
         flat = J @ W @ covariance @ W.T @ J.T + 0.3 * np.eye(2)
-        conic = inverse(flat, J @ W, R, scales[n])
+        conic, ratio = inverse(flat, J @ W, R, scales[n])
+        opacity *= np.sqrt(ratio) if antialiased else 1
         dx, dy = xs - (fx * x / z + cx), ys - (fy * y / z + cy)
         exponent = 0.5 * (conic[0, 0] * dx * dx + conic[1, 1] * dy * dy) + conic[0, 1] * dx * dy
         raw = opacity * np.exp(-exponent)
@@ -141,12 +148,12 @@ def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
     return Drawn(image + left[:, :, None] * background, 1 - left, decisions, doubtful, layers)
 
 
-def gradient_by_differences(params, camera, background, v_image, v_alpha, step=1e-5, alpha_max=0.99):
+def gradient_by_differences(params, camera, background, v_image, v_alpha, step=1e-5, alpha_max=0.99, antialiased=False):
     """Return central differences of sum(image * v_image) + sum(alpha * v_alpha), with frozen decisions."""
-    frozen = draw(params, camera, background, alpha_max=alpha_max).decisions
+    frozen = draw(params, camera, background, alpha_max=alpha_max, antialiased=antialiased).decisions
 
     def loss(changed):
-        drawn = draw(changed, camera, background, frozen=frozen, alpha_max=alpha_max)
+        drawn = draw(changed, camera, background, frozen=frozen, alpha_max=alpha_max, antialiased=antialiased)
         return (drawn.image * v_image).sum() + (drawn.alpha * v_alpha).sum()
 
     gradients = {}

@@ -118,7 +118,9 @@ def test_levels_of_a_streamed_scene(kind, tmp_path):
     ending = "/" if kind == "streamed-sog" else ".zip"
     assert [len(kissgs.load(folder, level=level)) for level in (0, 1)] == [32, 7]
     found = describe(folder)
-    assert found.details == {"level": 0, "levels": [30, 5], "environment": 2, "files": 2}
+    assert found.details == {
+        "level": 0, "levels": [30, 5], "environment": 2, "files": 2, "antialiased": False,
+    }  # fmt: skip
     assert set(found.parts) == {manifest, f"0_0{ending}", f"env{ending}"}
     coarse = describe(folder, ReadOptions(level=1))
     assert (coarse.count, set(coarse.parts)) == (7, {manifest, f"1_0{ending}", f"env{ending}"})
@@ -154,7 +156,7 @@ def test_details(tmp_path):
     wanted = {
         "a4.spz": {"version": 4, "antialiased": True, "fractional_bits": 12},
         "a.ksplat": {"compression_level": 1, "sections": 1},
-        "a.glb": {"binary": True, "primitives": 1, "spz": False},
+        "a.glb": {"binary": True, "primitives": 1, "spz": False, "antialiased": False},
         "a.splat": {},
         "a.sog": {
             "version": 2, "antialiased": False, "model": None, "generator": "by hand", "codebook_entries": 30,

@@ -9,6 +9,7 @@ import pytest
 from helpers.whole_scenes import joined, moved
 
 from kissgs import Splats, sample_scene
+from kissgs.core.splats import concatenate
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.coverage import Coverage
@@ -114,7 +115,7 @@ def camera(position: tuple[float, float, float], target: tuple[float, float, flo
 
 def test_gaussians_behind_an_opaque_plate_are_not_covered():
     front, behind = plate(0.0), plate(1.0)
-    both = Splats(**{name: np.concatenate([getattr(front, name), getattr(behind, name)]) for name in front.__slots__})
+    both = concatenate([front, behind])
     share = coverage_of(both, camera((0, 0, -2.2), (0, 0, 0)))
     inner = (np.abs(both.means[:, :2]) < 0.7).all(axis=1)
     assert (share[inner & (both.means[:, 2] == 0)] > 0.5).all()
@@ -148,3 +149,13 @@ def test_samples_of_an_image_see_hidden_points_as_well_as_the_whole_image_on_ave
     samples = [coverage_of(hidden, camera.sampled(3, (x, y)))[behind] for x in range(3) for y in range(3)]
     assert 0 < np.max(samples) < 1
     assert np.mean(samples) == pytest.approx(coverage_of(hidden, camera)[behind].mean(), rel=0.02)
+
+
+def test_points_are_covered_alike_whether_their_opacities_are_compensated_or_not():
+    """Compensation takes most of a point's alpha away, however open it lies."""
+    points = replace(plate(0.0, opacity=9.0, n=225), scales=np.full((225, 3), -5.2, np.float32))
+    classic, antialiased = (
+        coverage_of(replace(points, antialiased=mark), camera((0, 0, -2.2), (0, 0, 0))) for mark in (False, True)
+    )
+    assert np.median(classic) > 0.3
+    assert antialiased == pytest.approx(classic, rel=0.2)

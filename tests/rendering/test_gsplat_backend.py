@@ -16,14 +16,28 @@ from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.gsplat_backend import rasterize_on_cuda
 from kissgs.rendering.tensors import tensors_of
 
-CLASSIC = {"near_plane": 0.01, "far_plane": 1e10, "tile_size": 16, "rasterize_mode": "classic"}
+CONSTANTS = {"near_plane": 0.01, "far_plane": 1e10, "tile_size": 16}
 
 
 def fake_rasterization(
-    means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, backgrounds, eps2d, **rest
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmats,
+    Ks,
+    width,
+    height,
+    sh_degree,
+    backgrounds,
+    eps2d,
+    rasterize_mode,
+    **rest,
 ):
     """Render like gsplat.rasterization: scales and opacities are activated, colours are all SH coefficients."""
-    assert rest == CLASSIC
+    assert rest == CONSTANTS
+    assert rasterize_mode in ("classic", "antialiased")
     assert colors.shape[1] == (sh_degree + 1) ** 2
     images, alphas = rasterize(
         {
@@ -40,6 +54,7 @@ def fake_rasterization(
         height,
         backgrounds=backgrounds,
         dilation=eps2d,
+        antialiased=rasterize_mode == "antialiased",
     )
     return images, alphas[..., None], {}
 
@@ -64,9 +79,10 @@ def arguments(count, degree, dilation=0.3):
     }
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(("degree", "dilation"), [(0, 0.3), (1, 0.03), (2, 1.0), (3, 0.3)])
-def test_gsplat_gets_the_arguments_of_the_same_image(gsplat, degree, dilation):
-    given = arguments(30, degree, dilation)
+def test_gsplat_gets_the_arguments_of_the_same_image(gsplat, degree, dilation, antialiased):
+    given = {**arguments(30, degree, dilation), "antialiased": antialiased}
     images, alphas = rasterize_on_cuda(**given)
     expected_images, expected_alphas = rasterize(**given)
     torch.testing.assert_close(images, expected_images, atol=2e-5, rtol=0)

@@ -1,5 +1,7 @@
 """Reference: reference_rasterizer, a float64 renderer that shares no code with the tested one. On all devices."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -39,7 +41,8 @@ def clamp_of(device):
 
 def check_image(splats, view, background, device="cpu", tolerance=1e-4):
     images, alphas, _ = render_tensors(splats, [view], device, [background])
-    expected = reference_rasterizer.draw(in_float64(splats), view, np.array(background), alpha_max=clamp_of(device))
+    more = {"alpha_max": clamp_of(device), "antialiased": splats.antialiased}
+    expected = reference_rasterizer.draw(in_float64(splats), view, np.array(background), **more)
     certain = ~expected.doubtful
     np.testing.assert_allclose(
         images[0].detach().cpu().numpy()[certain], expected.image[certain], atol=tolerance, rtol=0
@@ -75,6 +78,30 @@ def test_needles_lose_no_digits():
         *(one(mean=(0, 0, 0.1 * i), quat=(1, 0.1 * i, 0.2, 0.5 * i), scale=(4, -6, -6)) for i in range(5))
     )
     check_image(needles, camera(64, 64), BLACK)
+
+
+SMALL = {
+    "small": (blobs(60, 1, seed=3, log_scale=-4), camera(seed=1)),
+    "of all sizes": (blobs(30, 2, seed=4, log_scale=-2), camera(40, 30, seed=2)),
+    "clipped at the frustum's edge": (blobs(20, 1, spread=2.5, log_scale=-2), camera(21, 17, distance=2)),
+    "needles": (
+        together(*(one(mean=(0, 0, 0.1 * i), quat=(1, 0.1 * i, 0.2, 0.5 * i), scale=(4, -4, -5)) for i in range(5))),
+        camera(32, 32),
+    ),
+    "discs": (together(*(one(quat=(1, 0.3 * i, -0.2, 0), scale=(-2, -2, -12)) for i in range(-2, 3))), camera(30, 20)),
+    "of no size": (together(one(scale=(-30, -30, -30)), one(scale=(0, -30, -30)), one(scale=(0, 0, -30))), camera()),
+}
+"""Scenes whose opacities antialiasing changes much."""
+
+
+@devices
+@pytest.mark.parametrize("name", SMALL)
+def test_images_and_gradients_of_antialiased_scenes_agree_with_the_reference(name, device):
+    splats, view = SMALL[name]
+    splats = replace(splats, antialiased=True)
+    check_image(splats, view, (0.2, 0.5, 0.9), device)
+    check_gradients(splats.select(slice(8)), view, device, seed=2)
+    assert np.abs(render(splats, view)[0] - render(replace(splats, antialiased=False), view)[0]).max() > 0.02
 
 
 def test_pixels_behind_opaque_gaussians_end_where_those_of_the_reference_do():
@@ -137,11 +164,11 @@ def check_gradients(splats, view, device, seed, tolerance=1e-3):
     rng = np.random.default_rng(seed)
     background = rng.random(3)
     params = in_float64(splats)
-    clamp = clamp_of(device)
-    certain = ~reference_rasterizer.draw(params, view, background, alpha_max=clamp).doubtful
+    more = {"alpha_max": clamp_of(device), "antialiased": splats.antialiased}
+    certain = ~reference_rasterizer.draw(params, view, background, **more).doubtful
     v_image = rng.normal(0, 1, (view.height, view.width, 3)) * certain[:, :, None]
     v_alpha = rng.normal(0, 1, (view.height, view.width)) * certain
-    expected = reference_rasterizer.gradient_by_differences(params, view, background, v_image, v_alpha, alpha_max=clamp)
+    expected = reference_rasterizer.gradient_by_differences(params, view, background, v_image, v_alpha, **more)
     images, alphas, tensors = render_tensors(splats, [view], device, [background])
     loss = (images[0].cpu() * torch.from_numpy(v_image)).sum() + (alphas[0].cpu() * torch.from_numpy(v_alpha)).sum()
     loss.backward()

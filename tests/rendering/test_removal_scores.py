@@ -1,5 +1,7 @@
 """Reference: the scene is rendered without the Gaussian, by reference_rasterizer and by the renderer."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import reference_rasterizer
@@ -17,9 +19,10 @@ from kissgs.rendering.rasterizer import removal_scores, render
 def brute_force(splats, view, background):
     """Return the scores by removal of each Gaussian, and the rendering of the whole scene."""
     params = in_float64(splats)
-    whole = reference_rasterizer.draw(params, view, np.array(background))
+    common = (params, view, np.array(background))
+    whole = reference_rasterizer.draw(*common, antialiased=splats.antialiased)
     without = [
-        reference_rasterizer.draw(params, view, np.array(background), removed=n).image for n in range(len(splats))
+        reference_rasterizer.draw(*common, removed=n, antialiased=splats.antialiased).image for n in range(len(splats))
     ]
     return np.array([((image - whole.image) ** 2).sum() for image in without]), whole
 
@@ -27,6 +30,7 @@ def brute_force(splats, view, background):
 @pytest.mark.parametrize("seed", range(6))
 def test_scores_agree_with_removal(seed):
     splats, view = blobs(25, seed % 4, seed=seed, log_scale=-2), camera(seed=seed)
+    splats = replace(splats, antialiased=seed > 3)
     expected, whole = brute_force(splats, view, (0.3, 0.6, 0.1))
     assert (whole.alpha < 0.9999).all(), "no pixel may end early here"
     scores = removal_scores(splats, [view], background=(0.3, 0.6, 0.1))

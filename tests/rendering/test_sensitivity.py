@@ -51,7 +51,8 @@ def differences(splats, view, n):
     def image(name, change):
         moved = {key: value.copy() for key, value in params.items()}
         moved[name][n] = change(moved[name][n])
-        return reference_rasterizer.draw(moved, view, BACKGROUND.astype(np.float64)).image
+        background = BACKGROUND.astype(np.float64)
+        return reference_rasterizer.draw(moved, view, background, antialiased=splats.antialiased).image
 
     def difference_quotient(name, change, step):
         up, down = (image(name, lambda value, s=s: change(value, s)) for s in (step, -step))
@@ -91,6 +92,20 @@ def test_shape_hessians_of_needles_lose_no_digits(scale):
         shape, _ = differences(splats, view, n)
         expected = packed_hessian(shape @ shape.T / (3 * 25 * 19))
         np.testing.assert_allclose(found.shape_hessian[n], expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("log_scale", [-5, -3.5, -2])
+def test_shape_hessians_of_antialiased_scenes_agree_with_derivatives_of_the_image(log_scale):
+    """The opacity's compensation changes with scale and rotation; for points it changes alone."""
+    splats, view = clean(blobs(6, 1, seed=2, log_scale=log_scale))[0], camera(seed=2)
+    splats.opacities[:] += 3  # else nothing is left of them
+    splats = replace(splats, antialiased=True)
+    found = measure_sensitivity(splats, weighted(view))
+    assert (found.color_weight > 0).sum() > 2
+    for n in range(len(splats)):
+        shape, _ = differences(splats, view, n)
+        expected = packed_hessian(shape @ shape.T / (3 * view.width * view.height))
+        np.testing.assert_allclose(found.shape_hessian[n], expected, rtol=3e-3, atol=3e-3 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -89,7 +89,7 @@ def test_an_interrupted_training_resumes_exactly():
     with pytest.raises(kissgs.Cancelled):
         train(first, targets, plan(23), after=steps.append, progress=stop)
     assert steps == list(range(1, 10))
-    second = GaussianModel.restored(first.state())
+    second = GaussianModel.restored(first.state(), scene)
     train(second, targets, plan(23), first=9)
     assert same(whole.splats(), second.splats())
 
@@ -122,10 +122,13 @@ def test_every_image_has_its_own_background():
     targets = targets_of(scene, tuple(views))
     parameters = tensors_of(scene)
     for n in range(3):
-        error = image_loss(parameters, targets, n, ssim_weight=0.2, mse_weight=0.0, threads=1)[1]
+        error = image_loss(parameters, targets, n, ssim_weight=0.2, mse_weight=0.0, antialiased=False, threads=1)[1]
         assert error < 1e-4
         wrong = replace(targets, backgrounds=targets.backgrounds[1:] + targets.backgrounds[:1])
-        assert image_loss(parameters, wrong, n, ssim_weight=0.2, mse_weight=0.0, threads=1)[1] > 100 * error
+        assert (
+            image_loss(parameters, wrong, n, ssim_weight=0.2, mse_weight=0.0, antialiased=False, threads=1)[1]
+            > 100 * error
+        )
 
 
 def test_the_squared_error_counts_in_the_loss():
@@ -199,3 +202,19 @@ def test_targets_of_several_sizes_and_one_gaussian():
     model = GaussianModel(scene)
     train(model, targets_of(scene, (*around(2, 40), *around(3, 24))), plan(6))
     assert len(model) == 1
+
+
+def test_antialiased_scenes_are_trained_with_the_opacities_that_their_images_show():
+    """Small Gaussians of a classic scene would be too opaque by far."""
+    scene = cloud(40)
+    scene = replace(scene, scales=scene.scales - np.float32(1.5), antialiased=True)
+    targets, wanted = targets_of(scene), GaussianModel(scene)
+    for mark in (True, False):
+        options = {"ssim_weight": 0.2, "mse_weight": 0.0, "antialiased": mark, "threads": 1}
+        off = image_loss(wanted.parameters, targets, 0, **options)[1]
+        assert (off < 1e-6) == mark
+    model = GaussianModel(replace(dimmed(scene), antialiased=True))
+    before = error(model.splats(), targets)
+    train(model, targets, plan(40))
+    assert model.splats().antialiased
+    assert error(model.splats(), targets) < 0.2 * before

@@ -59,10 +59,11 @@ def test_steps_are_those_of_adam_and_moments_survive_pruning():
 
 @pytest.mark.parametrize("steps", [0, 1, 5])
 def test_a_restored_model_continues_exactly(steps):
-    one, rng = GaussianModel(cloud(30)), np.random.default_rng(2)
+    scene = cloud(30)
+    one, rng = GaussianModel(scene), np.random.default_rng(2)
     for _ in range(steps):
         push(one, rng)
-    other = GaussianModel.restored(one.state())
+    other = GaussianModel.restored(one.state(), scene)
     for seed in range(4):
         push(one, np.random.default_rng(seed))
         push(other, np.random.default_rng(seed))

@@ -49,9 +49,9 @@ const textOf = (bytes) => {
 const newViewer = () => new Viewer(document.body.appendChild(document.createElement("canvas")));
 const [one, other] = [newViewer(), newViewer()];
 
-function sceneOf({ count, degree, labels, ...fields }) {
+function sceneOf({ count, degree, labels, meta, ...fields }) {
   const arrays = Object.fromEntries(Object.entries(fields).map(([name, text]) => [name, floats(text)]));
-  return { count, degree, labels: new Uint16Array(bytesOf(labels).buffer), ...arrays };
+  return { count, degree, meta, labels: new Uint16Array(bytesOf(labels).buffer), ...arrays };
 }
 
 async function imagesOf(viewer, cameras) {
@@ -106,6 +106,7 @@ def scene_of(splats):
     order = rng.permutation(len(splats)).astype(np.uint16)
     return {
         "count": len(splats),
+        "meta": {"model": "antialiased"} if splats.antialiased else {},
         "degree": SH_REST_COUNTS.index(splats.shN.shape[1]),
         "centroids": encoded(splats.shN[order]),
         "labels": encoded(np.argsort(order).astype(np.uint16)),
@@ -206,6 +207,23 @@ def test_a_file_read_by_spark_and_a_decoded_scene_agree(page, ending, beside, tm
         log.info("read from a .%s: %.1f dB, and %.1f dB to the decoded scene", ending, to_reference, to_decoded)
         assert to_decoded > (45 if beside and ending != "spz" else 38)
         assert to_reference > 38
+
+
+@pytest.mark.parametrize("ending", ["ply", "spz"])
+def test_an_antialiased_scene_is_drawn_with_compensated_opacities(page, ending, tmp_path):
+    """Decoded, and read from a marked file beside it; a classic scene after it is drawn as such."""
+    scene = kissgs.sample_scene(5000, sh_degree=1)
+    small = replace(scene, scales=scene.scales - np.float32(1.5), antialiased=True)
+    kissgs.save(small, tmp_path / f"scene.{ending}")
+    splats = kissgs.load(tmp_path / f"scene.{ending}")
+    file = {"type": ending, "bytes": encoded(np.fromfile(tmp_path / f"scene.{ending}", np.uint8)), "beside": True}
+    (drawn,), (read,), _ = draw(page, splats, [FRONT], file=file)
+    classic = replace(splats, antialiased=False)
+    assert psnr(drawn, expected(splats, FRONT)) > 40
+    assert psnr(read, expected(splats, FRONT)) > 38
+    assert psnr(expected(splats, FRONT), expected(classic, FRONT)) < 30
+    (again,) = draw(page, classic, [FRONT])
+    assert psnr(again, expected(classic, FRONT)) > 40
 
 
 def spherical_harmonic(degree, order, direction):

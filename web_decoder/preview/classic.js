@@ -1,4 +1,4 @@
-/** Settings with which Spark renders like the original 3DGS rasteriser. */
+/** Settings with which Spark renders like the original 3DGS rasteriser, and like Mip-Splatting's. */
 
 /** Ranges for unknown scenes: base colours of trained scenes exceed 0 to 1, and Spark would clip them. */
 export const WIDE_RANGES = {
@@ -13,12 +13,16 @@ export const WIDE_RANGES = {
 };
 
 /**
- * Options of the original rasteriser: Gaussians are dilated by 0.3 square pixels and keep their opacity (`blurAmount`
- * would reduce it), are sorted by depth, and are drawn down to an alpha of 1/255.
+ * Options of the dilation by 0.3 square pixels: Gaussians keep their opacity, or it is compensated as in scenes trained
+ * with antialiasing.
+ * @param {boolean} antialiased
  */
+export const dilation = (antialiased) =>
+  antialiased ? { preBlurAmount: 0, blurAmount: 0.3 } : { preBlurAmount: 0.3, blurAmount: 0 };
+
+/** Options of the original rasteriser: Gaussians are sorted by depth, and are drawn down to an alpha of 1/255. */
 export const CLASSIC = {
-  preBlurAmount: 0.3,
-  blurAmount: 0,
+  ...dilation(false),
   sortRadial: false,
   minAlpha: 1 / 255,
   maxStdDev: Math.sqrt(2 * Math.log(255)),

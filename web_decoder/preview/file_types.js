@@ -14,5 +14,40 @@ export const fileTypeOf = (name) => FILE_TYPES.find((type) => name.toLowerCase()
 /** Return the type of a format by the service's name of it; of a container, none. @param {string} format */
 export const fileTypeOfFormat = (format) => FILE_TYPES.find((type) => type === format);
 
+/** Comments of trainers in a `.ply` that say whether the scene is antialiased: Brush's, and Postshot's. */
+const MARK = /^(?:comment|obj_info)\s+(?:splatrendermode\s*[:=]?\s*(\w+)|antialiased\s*[:=]?\s*(\w+))\s*$/i;
+/** Largest header that is searched for a mark. */
+const MAX_HEADER_BYTES = 1 << 20;
+/** Byte of a `.spz` header with flags, of which the first is that of antialiased scenes. */
+const SPZ_FLAGS = 14;
+
+/**
+ * Whether a file says that its scene was trained with antialiasing.
+ * @param {FileType} type
+ * @param {Uint8Array} bytes
+ */
+export async function isMarked(type, bytes) {
+  if (type === "ply") return isMarkedPly(new TextDecoder("latin1").decode(bytes.subarray(0, MAX_HEADER_BYTES)));
+  return type === "spz" && ((await startOf(bytes))[SPZ_FLAGS] & 1) === 1;
+}
+
+/** Whether the last comment that says whether the scene is antialiased says so. @param {string} text */
+function isMarkedPly(text) {
+  const end = text.search(/^end_header/m);
+  const comments = text.slice(0, Math.max(end, 0)).split(/\r?\n/);
+  const [, mode, flag] = comments.map((line) => line.match(MARK)).findLast((found) => found !== null) ?? [];
+  return mode?.toLowerCase() === "mip" || ["1", "true", "yes"].includes(flag?.toLowerCase());
+}
+
+/** Return the first bytes of a `.spz`, which is gzip up to version 3. @param {Uint8Array} bytes */
+async function startOf(bytes) {
+  if (bytes[0] !== 0x1f) return bytes;
+  const packed = new Blob([/** @type {Uint8Array<ArrayBuffer>} */ (bytes.subarray(0, 1 << 16))]);
+  const reader = packed.stream().pipeThrough(new DecompressionStream("gzip")).getReader();
+  const { value } = await reader.read().catch(() => ({ value: undefined })); // Spark names the damage
+  reader.cancel().catch(() => {}); // the rest is cut off
+  return value ?? new Uint8Array();
+}
+
 /** Whether y points up and z back in files of this type, as in three.js, not down and ahead. @param {FileType} type */
 export const pointsUp = (type) => type === "spz";

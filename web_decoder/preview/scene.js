@@ -11,6 +11,9 @@ export const sigmoid = (logit) => 1 / (1 + Math.exp(-logit));
 /** @param {number} sh0 */
 export const baseColour = (sh0) => 0.5 + SH_CONSTANT * sh0;
 
+/** Whether a container says that its scene was trained with antialiasing. @param {Scene} scene */
+export const isAntialiased = ({ meta }) => String(meta?.model ?? meta?.asset?.model).toLowerCase() === "antialiased";
+
 /** Stages of decoding, each of which is worth a new rendering. */
 export const STAGES = /** @type {const} */ ({ nothing: 0, coarse: 1, base: 2, whole: 3 });
 

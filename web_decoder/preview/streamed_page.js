@@ -5,6 +5,7 @@ import { byId } from "./dom.js";
 import { extentOfBoxes, extentOfCoarsest } from "./extent.js";
 import { parseTree } from "./lod_tree.js";
 import { UserError, sentenceOf, showProblem, withdrawProblem } from "./problem.js";
+import { isAntialiased } from "./scene.js";
 import { StreamedFiles } from "./streamed_files.js";
 import { streamedStatisticsView } from "./statistics.js";
 import { Streaming } from "./streaming.js";
@@ -41,6 +42,7 @@ export async function openStreamed(address, load, view) {
   let announced = null;
   /** Files of the coarsest level until the camera has been placed by them. @type {Map<number, Scene> | null} */
   let coarsest = new Map();
+  let antialiased = true;
   let timer = 0;
   let closed = false;
   /** @type {(error?: unknown) => void} */
@@ -65,6 +67,7 @@ export async function openStreamed(address, load, view) {
     budget,
     load: (file, signal) => files.load(file, tree.files[file], signal),
     prepare: (file, scene, signal) => {
+      viewer.antialiased = antialiased &&= isAntialiased(scene); // if all files are
       if (file !== tree.environment && streaming.base.includes(file)) coarsest?.set(file, scene);
       return contentOf(scene, signal);
     },

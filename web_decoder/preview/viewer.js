@@ -3,12 +3,13 @@
 import * as THREE from "three";
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 import { lookAtAll, setPinhole, sightOf } from "./camera.js";
-import { CLASSIC, WIDE_RANGES, drawFromOutside } from "./classic.js";
-import { pointsUp } from "./file_types.js";
+import { CLASSIC, WIDE_RANGES, dilation, drawFromOutside } from "./classic.js";
+import { isMarked, pointsUp } from "./file_types.js";
 import { extentOfMesh, extentOfScene } from "./extent.js";
 import { marker } from "./marker.js";
 import { pack } from "./pack.js";
 import { readPixels } from "./pixels.js";
+import { isAntialiased } from "./scene.js";
 import { meshOf } from "./streamed_meshes.js";
 
 /**
@@ -62,6 +63,12 @@ export class Viewer {
     return this.#extent;
   }
 
+  /** Whether opacities are compensated for the dilation, as in scenes trained with antialiasing. @param {boolean} value */
+  set antialiased(value) {
+    Object.assign(this.#spark, dilation(value));
+    this.invalidate();
+  }
+
   /** The ranges of Spark's quantisation, so that another viewer can use the same. */
   get encoding() {
     return this.#encoding;
@@ -82,6 +89,7 @@ export class Viewer {
     const spacing = this.#extent.radius / Math.cbrt(scene.count);
     const { splats, encoding } = pack(scene, this.#extent.centre, { size: sized ? null : spacing / 2, spherical });
     this.#encoding = encoding;
+    this.antialiased = isAntialiased(scene);
     this.#replace(new SplatMesh({ packedSplats: splats, splatEncoding: encoding })); // or the mesh would reset it
   }
 
@@ -95,9 +103,11 @@ export class Viewer {
   async setFile(type, bytes, beside) {
     const splatEncoding = beside?.encoding ?? WIDE_RANGES;
     const fileType = /** @type {SplatFileType} */ (type); // its values are these names
+    const marked = await isMarked(type, bytes); // the mesh may take the bytes away
     const mesh = new SplatMesh({ fileBytes: bytes, fileType, splatEncoding });
     await mesh.initialized;
     this.#shown = null;
+    this.antialiased = marked;
     this.#extent = beside?.extent ?? extentOfMesh(mesh, pointsUp(type));
     const [x, y, z] = this.#extent.centre;
     mesh.position.set(-x, y, z);

@@ -40,7 +40,7 @@ def raise_coverage(
         pixels: number of pixels of the image.
         limits: smallest depth; share of the squared alpha from which a Gaussian counts as seen; length in the image of
             the local scale from which it counts as resolved, pixels; area of a squared Gaussian that is a dilated
-            point, pixels.
+            point, pixels; 1 for an antialiased scene, else 0.
         share: ``(N,)`` coverage; modified.
     """
     near, seen_share, resolved_length, dilated_area = limits[0], limits[1], limits[2], limits[3]
@@ -52,6 +52,8 @@ def raise_coverage(
         across = a + b + c - min(a, b, c)  # of the two largest
         area = np.pi * np.exp(across) * per_unit * per_unit + dilated_area  # of a squared Gaussian
         opacity = 1.0 / (1.0 + np.exp(-np.float64(opacities[n])))
+        if limits[4] != 0.0:
+            opacity *= (area - dilated_area) / area
         shown = max(opacity * opacity * min(area, pixels), 1e-300)
         visibility = min(seen[row] / (seen_share * shown), 1.0)
         resolution = min(np.float64(local_scale[n]) * per_unit / resolved_length, 1.0)

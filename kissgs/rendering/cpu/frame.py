@@ -221,7 +221,7 @@ def add_sensitivities(
                 camera.K,
                 camera.width,
                 camera.height,
-                projection_constants(camera),
+                projection_constants(splats, camera),
                 weight,
                 into.position_hessian,
                 into.shape_hessian,

@@ -98,7 +98,7 @@ def differentiate(
             camera.K,
             camera.width,
             camera.height,
-            projection_constants(camera),
+            projection_constants(splats, camera),
             found.gaussians,
             found.means,
             found.quats,

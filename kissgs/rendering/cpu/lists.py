@@ -90,10 +90,11 @@ class Slots:
     first: Int32[np.ndarray, " N_1"]
 
 
-def projection_constants(camera: Camera) -> Float64[np.ndarray, "5"]:
+def projection_constants(splats: Splats, camera: Camera) -> Float64[np.ndarray, "6"]:
     """Return the constants of projection, as kernels take them."""
     margin, alpha_min = constants.FRUSTUM_MARGIN, constants.ALPHA_MIN
-    return np.array([constants.NEAR, constants.FAR, camera.dilation, margin, alpha_min], np.float64)
+    antialiased = float(splats.antialiased)
+    return np.array([constants.NEAR, constants.FAR, camera.dilation, margin, alpha_min, antialiased], np.float64)
 
 
 def find_footprints(splats: Splats, camera: Camera, pool: Workers) -> Footprints:
@@ -114,7 +115,7 @@ def find_footprints(splats: Splats, camera: Camera, pool: Workers) -> Footprints
             camera.K,
             camera.width,
             camera.height,
-            projection_constants(camera),
+            projection_constants(splats, camera),
             visible,
             depths,
             records,

@@ -133,6 +133,31 @@ def _cholesky(w: Vector, v: Vector, dilation: float) -> tuple[float, float, floa
 
 
 @_helper
+def _compensation(w: Vector, v: Vector, dilation: float) -> float:
+    """Return the factor on the opacity of an antialiased scene: the root of det W Wᵀ / det (W Wᵀ + dilation)."""
+    c = _cross(w, v)
+    det = _dot(c, c)
+    return np.sqrt(det / (det + dilation * (_dot(w, w) + _dot(v, v) + dilation)))
+
+
+@_helper
+def _strain(axis: Vector, u: Vector, v: Vector, i: int, j: int) -> float:
+    """Return entry i, j of the derivative of the logarithm of :func:`_compensation` by a strain E of W, to W (1 + E).
+
+    It is Wᵀ ((W Wᵀ)⁻¹ - (W Wᵀ + dilation)⁻¹) W: the projection onto the rows of W, whose cross product has the
+    direction ``axis``, minus twice that of the rows u, v of L W.
+    """
+    return (1.0 if i == j else 0.0) - axis[i] * axis[j] - 2 * (u[i] * u[j] + v[i] * v[j])
+
+
+@_helper
+def _unit(a: Vector) -> Vector:
+    """Return a vector over its length."""
+    inverse = 1.0 / np.sqrt(_dot(a, a))
+    return a[0] * inverse, a[1] * inverse, a[2] * inverse
+
+
+@_helper
 def _whitened(w: Vector, v: Vector, dilation: float) -> tuple[Vector, Vector]:
     """Return the rows of L W, whose entries are at most 1/√2: l0 w + l1 v, and l2 v.
 
@@ -199,12 +224,13 @@ def project(
         K: ``(3, 3)`` intrinsics.
         width: of the image, pixels.
         height: of the image, pixels.
-        constants: NEAR, FAR, the camera's dilation, FRUSTUM_MARGIN, ALPHA_MIN.
+        constants: NEAR, FAR, the camera's dilation, FRUSTUM_MARGIN, ALPHA_MIN, and 1 for an antialiased scene, else 0.
         visible: out, from row ``first``, ``(N,)``: the Gaussian of each footprint.
         depths: out, from row ``first``, ``(N,)``: z in the camera.
         records: out, from row ``first``, ``(N, 11)``: centre x, y; l0, l1, l2 of :mod:`kissgs.rendering.cpu.blending`;
-            opacity; R, G, B (written by :func:`kissgs.rendering.cpu.shading.shade`); the largest exponent whose alpha
-            reaches ALPHA_MIN; half height in pixels.
+            opacity, compensated in an antialiased scene; R, G, B (written by
+            :func:`kissgs.rendering.cpu.shading.shade`); the largest exponent whose alpha reaches ALPHA_MIN; half height
+            in pixels.
 
     Returns:
         Number of footprints.
@@ -235,6 +261,10 @@ def project(
         p = _mix(fx / z, rotation[0], -fx / z * clamped_x, rotation[2])
         q = _mix(fy / z, rotation[1], -fy / z * clamped_y, rotation[2])
         w, v = _image_axes(p, q, quats, scales, n)
+        if constants[5] != 0.0:
+            opacity *= _compensation(w, v, dilation)
+            if not opacity >= alpha_min:
+                continue
         tau = np.log(opacity / alpha_min)
         half_width, half_height = np.sqrt(2 * tau * (_dot(w, w) + dilation)), np.sqrt(2 * tau * (_dot(v, v) + dilation))
         if not (_overlaps(centre_x, half_width, width) and _overlaps(centre_y, half_height, height)):

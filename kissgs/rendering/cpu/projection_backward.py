@@ -12,6 +12,7 @@ from kissgs.rendering.cpu.projection import (
     _applied,
     _by_quat,
     _cholesky,
+    _cross,
     _deviations,
     _dot,
     _frustum,
@@ -20,7 +21,9 @@ from kissgs.rendering.cpu.projection import (
     _pose,
     _rotation,
     _scaled,
+    _strain,
     _times,
+    _unit,
     _unit_quat,
     _whitened,
 )
@@ -108,6 +111,16 @@ def project_backward(
         for c in range(3):
             v_scales[i, c] = -4 * (spread_u[c] * u_rows[c] + spread_v[c] * v_rows[c])
         by_w, by_v = _mix(-4 * l0, spread_u, 0.0, spread_v), _mix(-4 * l1, spread_u, -4 * l2, spread_v)
+        if constants[5] != 0.0:
+            # By the logarithm of the compensation, -Σ 1; by W it is ((W Wᵀ)⁻¹ - 2 Lᵀ L) W, and the first term has the
+            # rows v × n and n × w over n², n being w × v.
+            by_log, normal = -sums[0], _cross(w, v)
+            axis, more = _unit(normal), by_log / _dot(normal, normal)
+            for k in range(3):
+                v_scales[i, k] += by_log * _strain(axis, u_rows, v_rows, k, k)
+            by_w = _mix(1.0, by_w, -2 * by_log * l0, u_rows)
+            by_v = _mix(1.0, _mix(1.0, by_v, -2 * by_log * l1, u_rows), -2 * by_log * l2, v_rows)
+            by_w, by_v = _mix(1.0, by_w, more, _cross(v, normal)), _mix(1.0, by_v, more, _cross(normal, w))
         by_w, by_v = _scaled(by_w, s), _scaled(by_v, s)
         by_p, by_q = _applied(R, by_w), _applied(R, by_v)
 

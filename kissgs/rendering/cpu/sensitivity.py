@@ -22,6 +22,7 @@ from kissgs.rendering.cpu.projection import (
     Vector,
     _applied,
     _cholesky,
+    _cross,
     _deviations,
     _dot,
     _frustum,
@@ -30,7 +31,9 @@ from kissgs.rendering.cpu.projection import (
     _pose,
     _rotation,
     _scaled,
+    _strain,
     _times,
+    _unit,
     _unit_quat,
     _whitened,
 )
@@ -195,6 +198,8 @@ def add_to_parameters(
     :func:`_thickened`. The derivative of ln alpha by a strain of the Gaussian is quadratic in g whatever the camera, so
     images are added as moments of g, and the Hessian by log-scales and rotation follows once
     (:func:`moments_to_hessians`).
+    In antialiased scenes the derivative by a strain has a constant term as well (:func:`_strain`): g g becomes
+    g g + strain / 4. Pixels at which alpha is clamped have it too, where it is at most 2 %.
 
     Args:
         means, quats, scales, visible, rows, slots_from, first, last, viewmat, K, width, height, constants: as for
@@ -204,7 +209,7 @@ def add_to_parameters(
         weight: weight of the image.
         position_hessian: ``(N, 3)`` diagonal of the Hessian by position.
         shape_moments: ``(N, 10)`` sums over pixels of |w|² times 1; times g0², g1², g2²; times their squares; and times
-            (g1 g2)², (g2 g0)², (g0 g1)².
+            (g1 g2)², (g2 g0)², (g0 g1)²; with constant terms in antialiased scenes.
         color_weight: ``(N,)`` sum of (alpha T)².
         harmonics_sum: ``(N, K)`` sum of (alpha T)² times the spherical harmonics without the constant one.
         higher_sum: ``(N, H)`` the same of higher degrees.
@@ -251,6 +256,8 @@ def add_to_parameters(
         l0, l1, l2 = _cholesky(w, v, dilation)
         u_row, v_row = _whitened(w, v, dilation)
         thickened = _thickened(s)
+        axis = _unit(_cross(w, v)) if constants[5] != 0.0 else w
+        plain_u, plain_v = u_row, v_row
         u_row, v_row = _scaled(u_row, thickened), _scaled(v_row, thickened)
 
         # Derivative of ln alpha by position: 2 (u, v) L dc, c being the centre.
@@ -274,6 +281,17 @@ def add_to_parameters(
         out[7] += _dot(by_1, g2)
         out[8] += _dot(by_2, g0)
         out[9] += _dot(by_0, g1)
+        if constants[5] != 0.0:
+            for c in range(3):
+                d, e = (c + 1) % 3, (c + 2) % 3
+                square = 0.25 * thickened[c] * thickened[c] * _strain(axis, plain_u, plain_v, c, c)
+                product = 0.25 * thickened[d] * thickened[e] * _strain(axis, plain_u, plain_v, d, e)
+                of_square = _dot(second, _square(u_row, v_row, c))
+                crossed = u_row[d] * v_row[e] + u_row[e] * v_row[d]
+                of_product = m20 * u_row[d] * u_row[e] + m11 * crossed + m02 * v_row[d] * v_row[e]
+                out[1 + c] += square * m0
+                out[4 + c] += square * (2 * of_square + square * m0)
+                out[7 + c] += product * (2 * of_product + product * m0)
 
         color_weight[n] += squared_weight
         if own > 0:
@@ -297,7 +315,8 @@ def moments_to_hessians(
     """Replace the moments of Gaussians ``first`` to ``last`` (exclusive) by Hessians.
 
     With g as in :func:`add_to_parameters`, the derivative of ln alpha by the opacity logit is 1 - opacity, by a
-    log-scale 4 g[c]², and by a rotation about axis c 4 (s[d] / s[e] - s[e] / s[d]) g[d] g[e].
+    log-scale 4 g[c]², and by a rotation about axis c 4 (s[d] / s[e] - s[e] / s[d]) g[d] g[e], with the constant terms
+    of antialiased scenes.
 
     Args:
         scales, opacities: stored parameters, see :class:`kissgs.Splats`.
