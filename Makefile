@@ -2,8 +2,8 @@
 # make demo SCENE=x.ply   the same with your own
 # make serve              the service, with its page, on http://127.0.0.1:8000 (KISSGS_PORT=… and others: docs/guide/service.md)
 # make bench              bytes, time, memory and errors of all presets (SCENE=x.ply for your own)
-# make test               tests of everything, some minutes
-# make test-all           the same with all examples, parameters, trainings and faults; half an hour
+# make test               tests of everything, about ten minutes (SIXTH=COMMIT: a sixth of the others too)
+# make test-all           the same with all examples, parameters, trainings and faults; three quarters of an hour
 # make lint               format, lint, types, import contract; of the JavaScript, format and types
 # make docs               what is generated in docs/
 # make setup              .venv alone, which the others make too (PYTHON=… for another Python than python3)
@@ -28,7 +28,7 @@ serve: setup
 	@.venv/bin/kissgs-serve
 
 test: setup-dev
-	@.venv/bin/pytest -q -n auto -m "not exhaustive"
+	@.venv/bin/pytest -q -n auto $(if $(SIXTH),--sixth=$(SIXTH),-m "not exhaustive")
 
 test-all: setup-dev
 	@.venv/bin/pytest -q -n auto --hypothesis-profile=thorough

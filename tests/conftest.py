@@ -1,6 +1,7 @@
 """Fixtures and shape checks for all tests, and which tests ``make test`` runs."""
 
 import os
+import zlib
 from collections import defaultdict
 from importlib.util import find_spec
 from pathlib import Path
@@ -76,9 +77,17 @@ def shared_data() -> Path:
     return folder
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option of continuous integration."""
+    parser.addoption("--sixth", metavar="COMMIT", help="run a sixth of the exhaustive tests, chosen by the commit")
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m selects
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark as exhaustive what ``@pytest.mark.quick(n)`` leaves out: all but n parameter sets of a test."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark as exhaustive what ``make test`` leaves out, and with ``--sixth`` leave five of six of those out.
+
+    It leaves out all but n parameter sets of a test with ``@pytest.mark.quick(n)``, and what needs PostgreSQL or S3.
+    """
     sets = defaultdict[str, list[pytest.Item]](list)
     for item in items:
         if item.get_closest_marker("quick"):
@@ -89,3 +98,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for n, item in enumerate(group):
             if n not in kept:
                 item.add_marker("exhaustive")
+    for item in items:
+        if not {"postgresql_server", "s3_server"}.isdisjoint(getattr(item, "fixturenames", ())):
+            item.add_marker("exhaustive")
+    if commit := config.getoption("sixth"):
+        exhaustive = (item for item in items if item.get_closest_marker("exhaustive"))
+        left = {item for item in exhaustive if zlib.crc32(f"{item.nodeid} {commit}".encode()) % 6}
+        items[:] = [item for item in items if item not in left]
+        config.hook.pytest_deselected(items=list(left))

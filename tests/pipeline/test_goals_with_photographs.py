@@ -159,6 +159,7 @@ def test_a_search_that_is_stopped_while_its_first_container_is_evaluated_keeps_i
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8])
+@pytest.mark.quick(1)
 def test_few_gaussians_with_photographs(tmp_path, count):
     scene = cloud(8).select(range(count))
     found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=1), views=photographs(scene, tmp_path, 4, 1))
@@ -166,6 +167,7 @@ def test_few_gaussians_with_photographs(tmp_path, count):
 
 
 @pytest.mark.parametrize("stage", ["score", "sparsify", "finetune"])
+@pytest.mark.quick(1)
 def test_a_stopped_search_for_a_count_encodes_what_it_has(tmp_path, stage):
     stopped = []
 

@@ -67,6 +67,7 @@ def test_a_size_is_better_used_with_training():
 
 
 @pytest.mark.parametrize(("units", "trained"), [(1e6, True), (10, False)])
+@pytest.mark.quick(1)
 def test_a_limited_time_trains_if_it_is_long(monkeypatch, units, trained):
     monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1e5 / units)
     chosen = settings(steps=20, max_psnr_drop=0.5).model_copy(update={"time_limit": 1e5})
@@ -105,6 +106,7 @@ def test_ctrl_c_keeps_the_container_of_the_encoder():
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 @pytest.mark.parametrize("goal", [{"max_psnr_drop": 1.0}, {"max_ssim_drop": 0.05}, {"target_size": "6kB"}])
+@pytest.mark.quick(3)
 def test_few_gaussians(count, goal):
     few = SMALL.select(np.arange(count))
     found = kissgs.compress(few, settings=settings(steps=3, **goal))

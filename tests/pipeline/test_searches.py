@@ -144,6 +144,7 @@ def test_unreachable_goals_are_refused_and_nothing_is_written(tmp_path, goal, me
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])
+@pytest.mark.quick(1)
 def test_goals_of_scenes_of_few_gaussians(count):
     few = SCENE.select(range(count))
     for goal in ({"psnr": 20}, {"target_size": "9kB"}):

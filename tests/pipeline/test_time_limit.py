@@ -123,6 +123,7 @@ def test_fine_tuning_leaves_the_time_that_an_evaluation_took(goal, expected):
     assert scenes.scene(3, math.inf).deadline.seconds == pytest.approx(expected, abs=1)
 
 
+@pytest.mark.quick(0)
 def test_a_search_evaluates_in_at_most_16_held_out_photographs(tmp_path, monkeypatch):
     seen, compare = [], SearchEvaluation._compare
 
@@ -191,7 +192,7 @@ def test_time_alone_trains_and_keeps_the_closest_container(tmp_path, monkeypatch
     assert kept == min(trial.drop for trial in found.report.trials)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 @pytest.mark.parametrize(("units", "fewer"), [(12.0, False), (1e6, True)])
 def test_a_scene_that_training_does_not_recover_is_encoded_whole(tmp_path, monkeypatch, units, fewer):
     """Photographs that are the scene's own renderings lose without limit; with much time, fewer Gaussians follow."""

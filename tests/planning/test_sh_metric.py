@@ -131,6 +131,7 @@ def test_clustering_under_the_metric_errs_less_where_cameras_are_and_does_not_de
     assert np.square(found["metric"]).sum() > np.square(found["plain"]).sum()
 
 
+@pytest.mark.quick(0)
 def test_a_capture_makes_the_codebook_better_from_where_it_looks(monkeypatch):
     scene = kissgs.sample_scene(8000, sh_degree=3)
     views = cameras(test=4, train=16, size=(120, 80))

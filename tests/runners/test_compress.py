@@ -54,6 +54,7 @@ def comparable(report):
     return {name: value for name, value in report.items() if name not in TIMES}
 
 
+@pytest.mark.quick(0)
 def test_files_and_reports_are_those_without_a_cluster(cluster, scenes, tmp_path):
     (tmp_path / "broken.ply").write_bytes(b"ply\nnonsense\n")
     inputs = [scenes / "a.ply", tmp_path / "broken.ply", scenes / "b.ply"]

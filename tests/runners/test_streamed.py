@@ -25,6 +25,7 @@ def scene(tmp_path_factory):
 @pytest.mark.parametrize(
     ("preset", "name"), [("fast", "lod-meta.json"), ("balanced", "lod-meta.json"), ("fast", "levels.json")]
 )
+@pytest.mark.quick(1)
 def test_a_runner_makes_the_same_bytes(runner, scene, tmp_path, preset, name):
     settings, stages = Settings.from_preset(preset), set()
 
@@ -71,6 +72,7 @@ def test_an_item_that_fails_ends_the_work(local_runner, scene, tmp_path):
     assert local_runner.stats().running == 0
 
 
+@pytest.mark.quick(0)
 def test_the_command_on_a_cluster(ray_cluster, ray_runner, scene, tmp_path):
     wait_until(lambda: ray_runner.stats().cpus == 2)
     words = ("compress", scene, "-p", "fast", "--json", "-o")

@@ -17,22 +17,18 @@ from service.http.app import build
 from service.storage.replicas import Replica, ReplicaBase
 
 CONFORMANCE = {
-    **dict.fromkeys(("test_jobs", "test_job_results", "test_job_states", "test_synchronous"), True),
-    **dict.fromkeys(("test_refusals", "test_keys", "test_format_option"), False),
+    *("test_jobs", "test_job_results", "test_job_states", "test_synchronous"),
+    *("test_refusals", "test_keys", "test_format_option"),
 }
-"""Modules whose tests run for each deployment; whether ``make test`` runs them with two replicas."""
+"""Modules whose tests run for each deployment, but in ``make test`` for the first alone."""
 
 DEPLOYMENTS = {"folder": 0, "bucket": 1, "replicas": 2, "ray": 2}
 """Number of replicas of each deployment; without one, a data folder and SQLite. Jobs of the last run on a cluster."""
 
 
 def pytest_generate_tests(metafunc):
-    quick = CONFORMANCE.get(metafunc.module.__name__.rpartition(".")[2])
-    if quick is not None and "deployment" in metafunc.fixturenames:
-        chosen = [
-            pytest.param(name, marks=() if name == "folder" or (quick and name == "replicas") else _EXHAUSTIVE)
-            for name in DEPLOYMENTS
-        ]
+    if metafunc.module.__name__.rpartition(".")[2] in CONFORMANCE and "deployment" in metafunc.fixturenames:
+        chosen = [pytest.param(name, marks=() if name == "folder" else _EXHAUSTIVE) for name in DEPLOYMENTS]
         metafunc.parametrize("deployment", chosen, indirect=True, scope="package")
 
 

@@ -29,6 +29,7 @@ FILES = {
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("form", [False, True])
+@pytest.mark.quick(4)
 def test_uploads_of_every_format(service, name, form, tmp_path):
     kind, data = FILES[name]
     if form:

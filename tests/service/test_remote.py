@@ -319,6 +319,7 @@ def test_interrupting_the_command_cancels_the_job(start, tmp_path):
     assert list(tmp_path.glob("*.zip")) == []
 
 
+@pytest.mark.quick(0)
 def test_the_ending_chooses_the_container(service, scene, tmp_path):
     expected = kissgs.compress(scene, settings=FAST, container="sog").to_zip()
     done = kissgs_command("compress", scene, "-p", "fast", "-o", tmp_path / "a.sog", KISSGS_SERVER=service.url)

@@ -91,7 +91,7 @@ def kill_the_job(service, training):
 @pytest.mark.parametrize(
     ("stage", "interrupt"), [("sparsify", kill_the_service), ("refine", stop_the_service), ("refine", kill_the_job)]
 )
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_training_continues_after_an_interruption(start_held, expected, stage, interrupt):
     service, training = start_held(stage, KISSGS_DRAIN_SECONDS=0)
     job = service.submit(options=json.dumps(BRIEF))

@@ -220,6 +220,7 @@ def test_images_far_larger_than_the_scene_take_no_memory():
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [1, 65])
 @pytest.mark.parametrize("name", ["a.sog", "folder/meta.json"])
+@pytest.mark.quick(2)
 def test_splat_transform_writes_what_we_read(name, degree, count, tmp_path):
     with (tmp_path / "a.ply").open("wb") as file:
         write_ply(file, made_scene(count, degree))

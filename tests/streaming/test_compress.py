@@ -57,6 +57,7 @@ def test_every_level_is_read_and_every_leaf_has_every_level(scene, target):
 
 
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
+@pytest.mark.quick(1)
 def test_rows_of_a_leaf_are_those_of_its_part_of_space(scene, target, preset):
     """Leaves are cells between cuts, so that no Gaussian of a leaf, merged or not, is between those of another."""
     report = compress_streamed(scene, target, settings=Settings.from_preset(preset))
@@ -83,6 +84,7 @@ def test_rows_of_a_leaf_are_those_of_its_part_of_space(scene, target, preset):
         assert (overlap.min(axis=1) < 0.05 * np.minimum(sides[one], sides[other])).all()
 
 
+@pytest.mark.quick(1)
 def test_the_finest_level_has_every_gaussian_in_its_leaf(scene, target):
     compress_streamed(scene, target, settings=FAST)
     found, source = kissgs.load(target).means, kissgs.load(scene).means
@@ -95,6 +97,7 @@ class Stop(Exception):
     pass
 
 
+@pytest.mark.quick(1)
 def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(scene, target, tmp_path):
     compress_streamed(scene, tmp_path / "whole" / target.name, settings=FAST)
     expected = files_of(tmp_path / "whole")
@@ -241,6 +244,7 @@ def test_what_a_manifest_names_beside_its_containers_is_never_replaced(scene, ta
     assert (target.parent / "mine.txt").read_text() == "mine"
 
 
+@pytest.mark.quick(1)
 def test_a_streamed_scene_is_replaced_only_if_allowed(scene, target, tmp_path):
     """A scene of the other kind in the same folder is one too."""
     compress_streamed(scene, target, settings=FAST)
@@ -317,6 +321,7 @@ def test_what_is_no_folder_of_its_own_is_not_replaced(scene, tmp_path, monkeypat
 
 @pytest.mark.parametrize(("stage", "then"), [("partition", "begins anew"), ("images", "goes on where it was")])
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EDQUOT])
+@pytest.mark.quick(1)
 def test_a_disk_that_fills_up_does_not_end_the_work_for_good(scene, target, tmp_path, monkeypatch, stage, then, reason):
     with monkeypatch.context() as patch:
 
@@ -348,6 +353,7 @@ def test_settings_that_do_not_fit_are_refused(scene, tmp_path, changes):
 
 
 @pytest.mark.parametrize("name", ["lod-meta.json", "levels.json"])
+@pytest.mark.quick(1)
 def test_the_number_of_threads_does_not_matter(scene, tmp_path, name):
     for threads in (1, 3):
         compress_streamed(scene, tmp_path / str(threads) / name, settings=FAST, threads=threads)
@@ -355,6 +361,7 @@ def test_the_number_of_threads_does_not_matter(scene, tmp_path, name):
 
 
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
+@pytest.mark.quick(1)
 def test_items_report_within(scene, tmp_path, preset):
     """Every chunk and file, of which there are four and more, reports more than its beginning, and never goes back."""
     found = {}

@@ -92,7 +92,7 @@ def sky_of(splats):
 
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
 @pytest.mark.parametrize("name", TARGETS)
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_every_level_has_the_whole_sky(scene, tmp_path, name, preset):
     settings = Settings.from_preset(preset)
     report = compress_streamed(scene, tmp_path / name, settings=settings)

@@ -54,6 +54,7 @@ def test_all_levels_of_an_extreme_scene_can_be_read(name, manifest, tmp_path):
 @pytest.mark.parametrize("manifest", TARGETS)
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 9])
 @pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.quick(6)
 def test_few_gaussians(count, degree, manifest, tmp_path):
     kissgs.save(kissgs.sample_scene(count, sh_degree=degree), tmp_path / "scene.ply")
     target = tmp_path / manifest

@@ -51,6 +51,7 @@ def killed_at(step, monkeypatch):
 
 
 @pytest.mark.parametrize(("name", "force"), [("lod-meta.json", False), ("lod-meta.json", True), ("levels.json", True)])
+@pytest.mark.quick(0)
 def test_it_may_be_killed_before_every_change_of_the_disk(scene, tmp_path, monkeypatch, name, force):
     target = tmp_path / "city" / name
     compress_streamed(scene, tmp_path / "whole" / name, settings=FAST)

@@ -36,6 +36,7 @@ def psnr(a, b):
     return -10 * np.log10(max(np.mean((a - b) ** 2), 1e-10))
 
 
+@pytest.mark.quick(0)
 def test_each_level_is_drawn_whole(playcanvas, tmp_path, monkeypatch):
     small_sizes(monkeypatch, chunk=400, leaf=80, coarsest=200)
     viewer, site = playcanvas

@@ -232,6 +232,7 @@ def test_groups_of_codes_and_copies_in_an_image_of_many_tiles(tmp_path):
     assert len({bits for fact in facts for bits in fact.tile_bits}) > 1
 
 
+@pytest.mark.quick(0)
 def test_the_images_use_all_features_of_the_format():
     """Features that no encoder uses are tested in test_webp_by_hand.py."""
     facts = [

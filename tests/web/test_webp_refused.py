@@ -226,6 +226,7 @@ def with_large_codes(choice):
     return wrapped(np.packbits(bits.astype(np.uint8), bitorder="little").tobytes())
 
 
+@pytest.mark.quick(0)
 def test_tables_for_codes_are_bounded(tmp_path):
     """A file could declare gigabytes of them; tables of unused groups are not built."""
     all_used = with_large_codes(np.arange(6561).reshape(81, 81))
