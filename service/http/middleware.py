@@ -23,6 +23,14 @@ PAGE_POLICY = (
 )
 """Content-Security-Policy of the main page: no external resources, no embedding in frames."""
 
+SECURITY_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""Headers of every answer. The last keeps pages of other sites from embedding images and files of jobs; it does not
+concern the requests of scripts, which CORS permits or not."""
+
 METHODS = ("GET", "HEAD", "POST", "DELETE", "OPTIONS", "PUT", "PATCH")
 
 
@@ -104,8 +112,7 @@ def _site(origin: str) -> str | None:
 
 def _mark(headers: MutableHeaders, request_id: str, path: str) -> None:
     headers["X-Request-ID"] = request_id
-    headers["X-Content-Type-Options"] = "nosniff"
-    headers["Referrer-Policy"] = "no-referrer"
+    headers.update(SECURITY_HEADERS)
     if not path.startswith("/docs"):
         headers.setdefault("Content-Security-Policy", PAGE_POLICY)  # the preview page has its own
 
