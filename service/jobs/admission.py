@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import threading
 from collections.abc import Iterator
@@ -17,6 +18,10 @@ from .status import QueueEstimator
 BUSY_SECONDS = 5.0
 """``Retry-After`` of refusals because of simultaneous uploads, seconds."""
 
+PARSES_AT_ONCE = 2
+"""Uploads whose headers are read at a time, which takes up to 30 MB and half a second each: with one, a hostile upload would
+delay all others; with all, their memory would add up."""
+
 FULL_SECONDS = 600.0
 """``Retry-After`` of refusals because of a full disk, seconds."""
 
@@ -29,6 +34,7 @@ class Admission:
     store: Store
     storage: JobStorage
     uploads: int = 0
+    parsing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(PARSES_AT_ONCE))
     _reserved: int = 0
     _written: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)

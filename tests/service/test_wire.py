@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import threading
+import time
 
 import pytest
 from helpers.service import FAST, SMALL, problem, read_response
@@ -10,6 +12,7 @@ from service.core.problems import ProblemError
 from service.core.settings import ServiceSettings
 from service.http.multipart import MAX_PREAMBLE_BYTES, PartBegin, PartData, parts
 from service.http.uploads import Spool, scene_name
+from service.jobs.admission import Admission
 
 HEAD = SMALL.index(b"end_header\n") + 11
 BOUNDARY = "multipart/form-data; boundary=b"
@@ -50,6 +53,8 @@ def test_an_id_with_a_zero_byte(service):
 
 class UnlimitedAdmission:
     """Admission without limits."""
+
+    parsing = contextlib.nullcontext()
 
     def check_space(self, size):
         pass
@@ -266,3 +271,36 @@ def test_extended_file_names(given):
 def test_extended_file_names_are_harmless(escaped, name):
     (found,) = file_names(f"filename*=UTF-8''{escaped}")
     assert scene_name(found) == name
+
+
+def test_two_uploads_at_a_time_are_parsed(tmp_path, monkeypatch):
+    """The headers of sixteen simultaneous uploads once took memory all at once."""
+    running, most, lock = 0, 0, threading.Lock()
+    read = Spool._read_info
+
+    def watched(spool):
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        time.sleep(0.02)
+        try:
+            return read(spool)
+        finally:
+            with lock:
+                running -= 1
+
+    monkeypatch.setattr(Spool, "_read_info", watched)
+
+    async def receive():
+        admission = UnlimitedAdmission()
+        admission.parsing = Admission(ServiceSettings(), None, None).parsing
+        await asyncio.gather(*(one(admission, tmp_path / f"{i}.part") for i in range(8)))
+
+    async def one(admission, path):
+        async with Spool(ServiceSettings(), admission, path) as spool:
+            await spool.write(SMALL)
+            assert (await spool.finish()).info.count == 300
+
+    asyncio.run(receive())
+    assert most == 2
