@@ -9,8 +9,8 @@ from typing import Any, NoReturn
 from kissgs.core.errors import InvalidContainerError, KissgsError
 
 MAX_VALUES = 1 << 18
-"""Largest number of values in a document. A value takes up to 240 bytes of memory, so 4 MB of JSON would take a hundred;
-a primitive of glTF has some 400 values, the metadata of a container a thousand."""
+"""Largest number of values in a document: each takes up to 240 bytes of memory. A primitive of glTF has some 400, the
+metadata of a container a thousand."""
 
 
 def parse_json(

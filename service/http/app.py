@@ -33,6 +33,7 @@ from ..jobs.expiry import ExpiryTask
 from ..jobs.recovery import recover
 from ..jobs.replica_watch import ReplicaWatch
 from ..jobs.runner import JobRunner
+from ..jobs.status import QueueEstimator
 from ..jobs.worker import Worker
 from ..storage.database_health import error_text
 from ..storage.folder_binding import open_store
@@ -131,11 +132,12 @@ def build(settings: ServiceSettings) -> ServiceContainer:
     metrics.queue_limit.set(settings.max_queue)
     completion = JobCompletion(settings, store, storage, metrics, clock)
     worker = Worker(settings, store, storage, notifier, metrics, completion, runner)
-    admission = Admission(settings, store, storage)
+    queue = QueueEstimator(store, settings.workers)
+    admission = Admission(settings, store, storage, queue)
     decoder = Decoder(settings, store, storage, admission, runner)
-    event_stream = EventStream(store, notifier, settings.workers)
+    event_stream = EventStream(store, notifier, queue)
     return ServiceContainer(
-        settings, store, storage, notifier, metrics, clock, worker, admission, decoder, event_stream
+        settings, store, storage, notifier, metrics, clock, worker, queue, admission, decoder, event_stream
     )
 
 

@@ -1,4 +1,4 @@
-"""Headers that describe far more than they hold; oracle: the memory that reading them takes, as tracemalloc counts it."""
+"""Headers that describe far more than they hold; oracle: the memory that reading takes, as tracemalloc counts it."""
 
 import io
 import struct

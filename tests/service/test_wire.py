@@ -294,7 +294,7 @@ def test_two_uploads_at_a_time_are_parsed(tmp_path, monkeypatch):
 
     async def receive():
         admission = UnlimitedAdmission()
-        admission.parsing = Admission(ServiceSettings(), None, None).parsing
+        admission.parsing = Admission(ServiceSettings(), None, None, None).parsing
         await asyncio.gather(*(one(admission, tmp_path / f"{i}.part") for i in range(8)))
 
     async def one(admission, path):
