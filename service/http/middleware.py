@@ -21,7 +21,7 @@ PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
-"""Content-Security-Policy of the main page: no external resources, no embedding in frames."""
+"""Content-Security-Policy of the pages: no external resources, no embedding in frames."""
 
 SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -62,7 +62,7 @@ class RequestMiddleware:
             if message["type"] == "http.response.start":
                 status = message["status"]
                 self._metrics.latency.labels(_route(scope)).observe(time.perf_counter() - begun)
-                _mark(MutableHeaders(scope=message), request_id, scope["path"])
+                _mark(MutableHeaders(scope=message), request_id)
             await send(message)
 
         try:
@@ -110,11 +110,10 @@ def _site(origin: str) -> str | None:
         return None
 
 
-def _mark(headers: MutableHeaders, request_id: str, path: str) -> None:
+def _mark(headers: MutableHeaders, request_id: str) -> None:
     headers["X-Request-ID"] = request_id
     headers.update(SECURITY_HEADERS)
-    if not path.startswith("/docs"):
-        headers.setdefault("Content-Security-Policy", PAGE_POLICY)  # the preview page has its own
+    headers.setdefault("Content-Security-Policy", PAGE_POLICY)  # the preview page has its own
 
 
 def _route(scope: Scope) -> str:

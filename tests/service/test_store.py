@@ -76,7 +76,12 @@ def test_the_queue_is_read_once_for_each_change_of_it(store, monkeypatch):
     read, readings = store.active, []
     monkeypatch.setattr(store, "active", lambda: readings.append(1) or read())
     estimator = QueueEstimator(store, 1)
-    for change in (lambda: None, store.claim, lambda: store.move(jobs[20].number, State.CANCELLED), lambda: add(store, max_queue=99)):
+    for change in (
+        lambda: None,
+        store.claim,
+        lambda: store.move(jobs[20].number, State.CANCELLED),
+        lambda: add(store, max_queue=99),
+    ):
         change()
         readings.clear()
         for job in jobs * 3:
