@@ -110,7 +110,7 @@ def _result(
     seconds: float,
     cpu_seconds: float,
 ) -> Text:
-    """Format what every compression is told by: sizes and counts, of the scene and of the container, and its time."""
+    """Format the result of a compression: sizes and counts of the scene and of the container, and its time."""
     (before, after), (all_of_them, kept) = bytes_of, counts
     return Text.assemble(
         (target, "bold"),

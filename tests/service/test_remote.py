@@ -222,8 +222,8 @@ def test_the_command(service, scene, tmp_path):
     expected = kissgs.compress(scene, settings=kissgs.Settings.from_preset("fast", seed=3)).to_zip()
     assert (tmp_path / "Schloß 1.zip").read_bytes() == expected
     local = kissgs_command("compress", scene, "-fp", "fast", "--set", "seed=3", group=())
-    told = [re.sub(r"; [0-9.]+ s .*", "", text) for text in (done.stdout, local.stdout)]  # but for the time
-    assert told[0] == told[1]
+    printed = [re.sub(r"; [0-9.]+ s .*", "", text) for text in (done.stdout, local.stdout)]  # but for the time
+    assert printed[0] == printed[1]
     again = kissgs_command("compress", scene, "-p", "fast", KISSGS_SERVER=service.url)
     assert (again.returncode, "exists already" in again.stderr) == (2, True)
     as_json = kissgs_command("compress", scene, "-p", "fast", "--json", "-f", KISSGS_SERVER=service.url)

@@ -55,16 +55,16 @@ def test_state_transitions(store, before, after):
 
 
 def test_owners_take_turns(store):
-    """One key with many jobs once let all others wait. Oracle: the order written out; positions must tell the same."""
+    """One key with many jobs once let all others wait. Oracle: the order written out; positions must agree."""
     jobs = [add(store, owner, max_owner=9) for owner in "aaaaabbc"]
     estimator = QueueEstimator(store, 1)
-    told = sorted(jobs, key=lambda job: estimator.current().position(job))
+    positions = sorted(jobs, key=lambda job: estimator.current().position(job))
     started = [store.claim().number]
     after_one = sorted(jobs[1:], key=lambda job: estimator.current().position(job))
     started += [store.claim().number for _ in jobs[1:]]
     order = [1, 6, 8, 2, 7, 3, 4, 5]
     assert [jobs.index(next(job for job in jobs if job.number == number)) + 1 for number in started] == order
-    assert [job.number for job in told] == started
+    assert [job.number for job in positions] == started
     assert [job.number for job in after_one] == started[1:]
     late = [add(store, owner, max_owner=9) for owner in "abd"]
     assert [store.claim().number for _ in late] == [late[2].number, late[1].number, late[0].number]

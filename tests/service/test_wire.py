@@ -192,7 +192,7 @@ def all_received(connection):
 
 @pytest.mark.parametrize("kind", FRAMINGS)
 def test_requests_of_ambiguous_length_are_refused(service, kind):
-    """Their rest was once answered as another request. Oracle: RFC 9112, sections 2.2, 5.1, 6.1 and 6.3."""
+    """The rest was once answered as another request. Oracle: RFC 9112, sections 2.2, 5.1, 6.1 and 6.3."""
     version, headers = FRAMINGS[kind]
     rest = b"0\r\n\r\nGET /version HTTP/1.1\r\nHost: localhost\r\n\r\n"
     with service.raw(b"POST /v1/jobs %s\r\nHost: localhost\r\n%s\r\n%s" % (version, headers, rest)) as connection:
