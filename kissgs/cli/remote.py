@@ -85,6 +85,7 @@ def compress(
     """Compress scenes on a server. Ctrl-C cancels the job."""
     from kissgs.cli.console import progress_bar
     from kissgs.cli.options import budget_of, chosen, origin_of
+    from kissgs.cli.tables import status_table
     from kissgs.client.remote import Remote
     from kissgs.core.errors import UnsupportedError
     from kissgs.io.container_names import ending_of, named_container
@@ -117,7 +118,7 @@ def compress(
                     progress=_announcing(progress, server, quiet),
                 )
             if not (quiet or as_json):
-                show(_summary(status, target))
+                show(status_table(status, str(target)))
             return status
 
         for_each_input(scenes, output, ending_of(kind), as_json, work)
@@ -155,6 +156,7 @@ def get(
 ) -> None:
     """Wait for a job to finish, and download its container."""
     from kissgs.cli.console import progress_bar
+    from kissgs.cli.tables import status_table
     from kissgs.client.remote import Remote
     from kissgs.core.errors import OutputError
     from kissgs.io.atomic import refuse_existing
@@ -170,7 +172,7 @@ def get(
         refuse_existing(target, overwrite=force)
         status = remote.follow(job, progress)
         remote.download(status, target, overwrite=force, progress=progress)
-    show(_summary(status, target))
+    show(status_table(status, str(target)))
 
 
 @app.command()
@@ -200,15 +202,3 @@ def _announcing(progress: Progress, server: str, quiet: bool) -> Progress:
         progress(stage, fraction, "" if stage == WAIT else note)
 
     return receive
-
-
-def _summary(status: dict[str, Any], target: Path) -> str:
-    sizes, evaluation = status["sizes"], status.get("evaluation")
-    text = (
-        f"{target}  {status['upload_bytes']:,} → {sizes['container']:,} bytes, {sizes['ratio']:.1f} times smaller, "
-        f"{sizes['bytes_per_gaussian']:.2f} per Gaussian, {status['timings']['run_seconds']:.1f} s"
-    )
-    if evaluation is None:
-        return text
-    psnr = "∞" if evaluation.get("psnr") is None else f"{evaluation['psnr']:.2f}"
-    return f"{text}, PSNR {psnr}, SSIM {evaluation['ssim']:.4f}"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
 from kissgs.evaluation.metric_text import format_metric
+from kissgs.evaluation.results import ImageMetrics
 from kissgs.pipeline.scene_formats import CONTAINER_FORMATS, STREAMED_FORMATS
 
 if TYPE_CHECKING:
@@ -58,15 +59,15 @@ def changes(counts: Mapping[str, int]) -> list[str]:
 
 def report_table(report: Report, target: str) -> RenderableType:
     """Format the report of one compression."""
-    head = Text.assemble(
-        (f"{target}", "bold"),
-        f"  {size(report.source_bytes)} -> {size(report.container_bytes)}, ",
-        (f"{report.ratio:.1f}x smaller", "bold green"),
-        f", {report.bytes_per_gaussian:.2f} bytes per Gaussian",
+    head = _result(
+        target,
+        bytes_of=(report.source_bytes, report.container_bytes),
+        counts=(report.source_count, report.count),
+        sh_degree=report.sh_degree,
+        seconds=sum(report.seconds.values()),
+        cpu_seconds=report.cpu_seconds,
     )
-    time = f"{sum(report.seconds.values()):.1f} s ({report.cpu_seconds:.1f} CPU s)"
-    cost = f"{time}, peak memory {size(report.peak_memory)}"
-    body = f"{report.count:,} of {gaussians(report.source_count)}, SH degree {report.sh_degree}; {cost}"
+    head.append(f", peak memory {size(report.peak_memory)}")
     changed = {
         "invisible": report.invisible,
         "pruned_by_rd": report.pruned_by_rd,
@@ -79,7 +80,49 @@ def report_table(report: Report, target: str) -> RenderableType:
     finetuning = [] if report.finetuning is None else _finetuning(report.finetuning)
     note = [Text(report.note, style="yellow")] if report.note else []
     details = [*compaction, *search, *finetuning, *note, *evaluation]
-    return Group(head, Text(body), *details, parts_table(report.file_bytes, report.count), *_changes(changed))
+    return Group(head, *details, parts_table(dict(sorted(report.file_bytes.items())), report.count), *_changes(changed))
+
+
+def status_table(status: Mapping[str, Any], target: str) -> RenderableType:
+    """Format the status of a job of a service that has succeeded, as :func:`report_table` does it for a report."""
+    timings, sizes, evaluation = status["timings"], status["sizes"], status.get("evaluation")
+    head = _result(
+        target,
+        bytes_of=(status["upload_bytes"], sizes["container"]),
+        counts=(status["gaussians"], status["kept"]),
+        sh_degree=status["sh_degree"],
+        seconds=sum(timings["stages"].values()),
+        cpu_seconds=timings["cpu_seconds"],
+    )
+    details = [Text(status["note"], style="yellow")] if status.get("note") else []
+    if evaluation is not None:
+        psnr = evaluation.get("psnr")  # null: infinite
+        mean = ImageMetrics(
+            psnr=float("inf" if psnr is None else psnr), ssim=evaluation["ssim"], ms_ssim=evaluation["ms_ssim"]
+        )
+        details.append(Text(f"{_metrics(mean)} to the scene's own renderings"))
+    changed = {"invisible": status.get("invisible") or 0, **(status.get("cleaned") or {})}
+    return Group(head, *details, parts_table(dict(sorted(sizes["files"].items())), status["kept"]), *_changes(changed))
+
+
+def _result(
+    target: str,
+    *,
+    bytes_of: tuple[int, int],
+    counts: tuple[int, int],
+    sh_degree: int,
+    seconds: float,
+    cpu_seconds: float,
+) -> Text:
+    """Format the result of a compression: sizes and counts of the scene and of the container, and its time."""
+    (before, after), (all_of_them, kept) = bytes_of, counts
+    return Text.assemble(
+        (target, "bold"),
+        f"  {size(before)} -> {size(after)}, ",
+        (f"{before / after:.1f}x smaller", "bold green"),
+        f", {after / max(all_of_them, 1):.2f} bytes per Gaussian\n",
+        f"{kept:,} of {gaussians(all_of_them)}, SH degree {sh_degree}; {seconds:.1f} s ({cpu_seconds:.1f} CPU s)",
+    )
 
 
 def compaction_table(report: CompactionReport, target: str) -> RenderableType:
@@ -163,7 +206,7 @@ def _search_table(report: Report) -> Table:
 
 def _evaluation(evaluation: Evaluation) -> Text:
     mean = evaluation.mean
-    metrics = "PSNR {PSNR} dB, SSIM {SSIM}, MS-SSIM {MS-SSIM}".format_map(mean.candidate.texts())
+    metrics = _metrics(mean.candidate)
     if mean.reference is None:
         against = f"to the scene's own renderings from {evaluation.views_used}"
     else:
@@ -173,6 +216,10 @@ def _evaluation(evaluation: Evaluation) -> Text:
     rest = "" if surroundings is None else f"\nbeyond the capture: {surroundings_summary(surroundings)}"
     note = f"; {evaluation.note}" if evaluation.note else ""
     return Text.assemble(f"{metrics} {against}; {evaluation.extremes}", (note, "yellow"), rest)
+
+
+def _metrics(metrics: ImageMetrics) -> str:
+    return "PSNR {PSNR} dB, SSIM {SSIM}, MS-SSIM {MS-SSIM}".format_map(metrics.texts())
 
 
 def surroundings_summary(surroundings: Evaluation) -> str:

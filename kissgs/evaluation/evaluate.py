@@ -27,9 +27,7 @@ from kissgs.rendering.lpips import Lpips
 from kissgs.rendering.metrics import ms_ssim, psnr, ssim
 from kissgs.rendering.rasterizer import Device, load_kernels, render
 
-NOTHING_VISIBLE = (
-    "no rendering shows any of the reference, so these values mean nothing; choose other cameras (--views)"
-)
+NOTHING_VISIBLE = "no rendering shows any of the reference, so these values mean nothing; choose other views"
 """Note of an evaluation whose views all miss the reference."""
 
 Rendering = Float32[np.ndarray, "H W 3"]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 import struct
 import urllib.parse
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
 from kissgs.core.array_types import Float64, Shaped
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.io.json_files import parse_json
 from kissgs.io.packed_files import is_below
 from kissgs.io.scene_file import SceneFile, open_scene_file
 
@@ -45,12 +45,7 @@ class Document:
         self.name, self._folder = opened.name, folder
         text, self._binary = _split(opened)
         self._opened = opened
-        try:
-            self.root = json.loads(text.decode("utf-8-sig"), parse_constant=_refuse_constant)
-        except (ValueError, RecursionError) as error:
-            raise InvalidSceneError(
-                f"{self.name} is not readable glTF: its JSON is damaged; export it again"
-            ) from error
+        self.root = parse_json(text, f"{self.name}, read as glTF,", error=InvalidSceneError)
         if not isinstance(self.root, dict):
             raise self.invalid("its JSON is no object")
         self._buffers: dict[int, bytes] = {}
@@ -193,10 +188,6 @@ def _split(opened: SceneFile) -> tuple[bytes, tuple[int, int] | None]:
     if text is None:
         raise opened.cut_short(offset + _CHUNK_HEADER.size)
     return text, None
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not JSON")
 
 
 def node_matrix(document: Document, node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:

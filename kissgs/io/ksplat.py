@@ -21,6 +21,9 @@ from kissgs.io.scene_file import SceneFile, open_scene_file, refuse_more_than
 
 MAIN_BYTES, SECTION_BYTES = 4096, 1024
 
+MAX_SECTIONS = 1 << 14
+"""Largest number of sections, whose headers are read at once; a scene has one for each level or part of it."""
+
 _MAIN = struct.Struct("<BBxxIIIIHxx3f2f")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH")
 
@@ -138,6 +141,8 @@ def _read_headers(opened: SceneFile) -> _Headers:
         raise UnsupportedError(f"{opened.name} has compression level {level}; levels 0 to 2 are read")
     if sections > most:
         raise InvalidSceneError(f"{opened.name} declares {sections} sections with room for {most}; export it again")
+    if sections > MAX_SECTIONS:
+        raise UnsupportedError(f"{opened.name} has {sections:,} sections; at most {MAX_SECTIONS:,} are read")
     offset = MAIN_BYTES + most * SECTION_BYTES
     if offset > opened.size:
         raise opened.cut_short(offset)

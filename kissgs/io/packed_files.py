@@ -21,7 +21,7 @@ MAX_TREE_ENTRIES = 20_000
 MAX_DIRECTORY_BYTES = 1 << 21
 """Largest list of entries in a zip, which is read whole."""
 
-_END, _END64 = b"PK\x05\x06", b"PK\x06\x07"
+_ENTRY, _END, _END64 = b"PK\x01\x02", b"PK\x05\x06", b"PK\x06\x07"
 
 ZIP_MAGICS = (b"PK\x03\x04", _END)
 """First bytes of a zip file, and of an empty one."""
@@ -144,36 +144,40 @@ class ZipSource:
 def _open_zip(file: io.BufferedIOBase, label: str, most: int) -> tuple[zipfile.ZipFile, list[zipfile.ZipInfo]]:
     """Open a zip; return it and its files."""
     try:
-        _check_directory(file, label)
+        _check_directory(file, label, most)
         archive = zipfile.ZipFile(file)
         entries = archive.infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
         raise InvalidContainerError(f"{label} is not a readable zip file; export or download it again") from error
-    if len(entries) > most:
-        raise InvalidContainerError(f"{label} has {len(entries)} entries; a container has 12 files")
     return archive, [entry for entry in entries if entry.filename and not entry.is_dir()]
 
 
-def _check_directory(file: io.BufferedIOBase, label: str) -> None:
-    """Refuse zips whose list of entries is too large to be read whole, or of a kind that no reader of SOG knows."""
-    end = file.seek(0, io.SEEK_END)
-    file.seek(max(0, end - (1 << 16) - 42))
+def _check_directory(file: io.BufferedIOBase, label: str, most: int) -> None:
+    """Refuse zips of more than ``most`` entries before any is read, and those of a kind that no reader of SOG knows."""
+    begin = max(0, file.seek(0, io.SEEK_END) - (1 << 16) - 42)
+    file.seek(begin)
     tail = file.read()
-    file.seek(0)
-    at = tail.rfind(_END)
+    at = len(tail) - 22
+    if not (at >= 0 and tail[at:].startswith(_END) and tail.endswith(b"\0\0")):  # with a comment, as zipfile finds it
+        at = tail.rfind(_END)
     if at >= 0 and len(tail) >= at + 22:
-        if int.from_bytes(tail[at + 12 : at + 16], "little") > MAX_DIRECTORY_BYTES:
+        size = int.from_bytes(tail[at + 12 : at + 16], "little")
+        if size > MAX_DIRECTORY_BYTES:
             raise InvalidContainerError(
                 f"{label} has a list of entries above {MAX_DIRECTORY_BYTES} bytes; pack it again"
             )
         if tail[max(0, at - 20) : at].startswith(_END64):
             raise InvalidContainerError(f"{label} is a zip64 file; pack it as an ordinary zip")
+        file.seek(max(0, begin + at - size))
+        if (count := file.read(size).count(_ENTRY)) > most:
+            raise InvalidContainerError(f"{label} has {count} entries; a container has 12 files")
+    file.seek(0)
 
 
 def zip_names(file: io.BufferedIOBase) -> list[str]:
     """Return the names of all entries of a zip, folders included; none if it cannot be read."""
     try:
-        _check_directory(file, "the file")
+        _check_directory(file, "the file", MAX_TREE_ENTRIES)
         return zipfile.ZipFile(file).namelist()
     except (InvalidContainerError, zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError):
         return []

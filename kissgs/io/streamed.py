@@ -28,6 +28,9 @@ from kissgs.io.scene_file import marked, refuse_more_than
 MAX_TREE_BYTES = 1 << 25
 """Largest size of a manifest, bytes; one of a thousand leaves and five levels takes 330 kB."""
 
+MAX_TREE_VALUES = 1 << 22
+"""Largest number of values in a manifest; one of a thousand leaves and five levels has 30,000."""
+
 MAX_LEVELS = 64
 """Largest number of levels; each has a fraction of the Gaussians of the one before."""
 
@@ -196,7 +199,7 @@ class StreamedFormat(Generic[C]):
             UnsupportedError: another version or format, or files elsewhere on the web.
         """
         name = self.manifest
-        document = parse_json(files.read(name, MAX_TREE_BYTES), name)
+        document = parse_json(files.read(name, MAX_TREE_BYTES), name, most=MAX_TREE_VALUES)
         if not isinstance(document, dict):
             raise _invalid(name, "it is no JSON object")
         for key, known in (("version", 1), ("format", self.containers)):

@@ -184,7 +184,7 @@ class Goal:
             return (
                 f"target_size {target:,} byte{'' if target == 1 else 's'} cannot be met: the smallest container found "
                 f"has {smallest:,}; ask for at least that"
-                + (", or for fewer Gaussians: --compact auto" * suggest_compaction)
+                + (", or for fewer Gaussians: compact with auto_count" * suggest_compaction)
             )
         finest = max(trials, key=self.margin)
         missed = {limit: limit.figure(finest) for limit in self.limits if limit.room(finest) < 0}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Literal
 
 from kissgs.core.errors import InvalidContainerError
 from kissgs.io.container_names import ENDINGS, LEVELS_NAME, LOD_NAME, SCENE_ENDINGS
+from kissgs.io.json_files import parse_json
 from kissgs.io.packed_files import ZIP_MAGICS, MemorySource, Source, open_source, sniff_format, zip_names
 from kissgs.io.scene_file import listed
 from kissgs.sog.names import MAX_METADATA_BYTES, META_NAME
@@ -187,8 +187,8 @@ def _container_format(files: Source, unknown: SceneFormat = "sogxt") -> SceneFor
     if YAML_NAME in names or META_NAME not in names:
         return "sogxt" if YAML_NAME in names else unknown
     try:
-        document = json.loads(files.read(META_NAME, MAX_METADATA_BYTES).decode("utf-8-sig"))
-    except (ValueError, RecursionError, InvalidContainerError):
+        document = parse_json(files.read(META_NAME, MAX_METADATA_BYTES), META_NAME)
+    except InvalidContainerError:
         return unknown
     plain = isinstance(document, dict) and "means" in document and document.keys().isdisjoint({"mask", "gridSide"})
     return "sog" if plain else unknown

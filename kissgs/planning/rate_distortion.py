@@ -209,5 +209,5 @@ def _pruning_note(pruned_by_rd: Bool[np.ndarray, " M"], costs: Costs) -> str:
     seen = float((costs.coverage[pruned_by_rd] >= SEEN).mean())
     return (
         f"{count:,} of {len(pruned_by_rd):,} Gaussians were pruned because removing each costs less than its bits; "
-        f"cameras saw {seen:.0%} of them from nearby (--set prune_threshold_bits=0 keeps all)"
+        f"cameras saw {seen:.0%} of them from nearby (prune_threshold_bits of 0 keeps all)"
     )

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import yaml
@@ -13,6 +12,7 @@ from pydantic import ValidationError
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.origin import read_origin
 from kissgs.io.container_names import LEVELS_NAME, LOD_NAME
+from kissgs.io.json_files import parse_json
 from kissgs.io.packed_files import Source
 from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout
 from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME, YAML_NAME
@@ -130,11 +130,7 @@ def _ranges_of(op: Mapping[str, Any]) -> Iterator[tuple[str, tuple[list[Any], li
 
 def _from_json(data: bytes) -> dict[str, Any]:
     """Return the fields of :class:`Layout` from ``meta.json``; accept what ``web_decoder/scene.js`` accepts."""
-    try:
-        # Every number becomes a float64, as in browsers; NaN and Infinity are not JSON.
-        document = json.loads(data.decode("utf-8-sig"), parse_int=float, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise InvalidContainerError(f"{JSON_NAME} is not readable JSON") from error
+    document = parse_json(data, JSON_NAME, parse_int=float)  # every number becomes a float64, as in browsers
     try:
         _check_dialect(document)
         keys = {"opacities": "opacities", "means": "means", "scales": "scales", "quats": "quaternions", "sh0": "f_dc"}
@@ -165,10 +161,6 @@ def _from_json(data: bytes) -> dict[str, Any]:
         return raw
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise InvalidContainerError(f"{JSON_NAME} lacks something that a SOG-XT container has: {error}") from error
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not JSON")
 
 
 def _whole(value: Any) -> Any:  # noqa: ANN401

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import re
 from collections.abc import Iterable
@@ -73,10 +74,14 @@ class ServiceSettings(BaseSettings):
         ByteSize(64 << 10), ge=1024, le=1 << 20, description="Maximum bytes of a .ply header."
     )
     max_gaussians: int = Field(5_000_000, gt=0, le=20_000_000, description="Maximum number of Gaussians of one scene.")
-    max_uploads: int = Field(16, gt=0, description="Maximum number of simultaneous uploads.")
+    max_uploads: int = Field(
+        16,
+        gt=0,
+        description="Maximum number of simultaneous uploads. One key (without keys, one address) has a quarter.",
+    )
     upload_idle_seconds: Seconds = Field(30, description="Seconds without data after which an upload is aborted.")
     upload_min_rate: ByteSize = Field(
-        ByteSize(8 << 10), description="Average bytes per second below which an upload is aborted."
+        ByteSize(32 << 10), description="Average bytes per second below which an upload is aborted."
     )
     max_queue: int = Field(100, gt=0, description="Maximum number of waiting jobs.")
     max_jobs_per_key: int = Field(20, gt=0, description="Maximum number of waiting and running jobs of one key owner.")
@@ -162,6 +167,11 @@ class ServiceSettings(BaseSettings):
             if not re.fullmatch(r"\*|https?://[^/\s]+", origin):
                 raise ValueError(f"{origin!r} is not an origin such as https://example.org")
         return [origin.lower() for origin in origins]  # as browsers send them
+
+    @property
+    def max_uploads_of_one(self) -> int:
+        """Maximum number of simultaneous uploads of one key's owner, or without keys of one address."""
+        return math.ceil(self.max_uploads / 4)
 
     @property
     def is_private(self) -> bool:

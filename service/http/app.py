@@ -33,8 +33,9 @@ from ..jobs.expiry import ExpiryTask
 from ..jobs.recovery import recover
 from ..jobs.replica_watch import ReplicaWatch
 from ..jobs.runner import JobRunner
+from ..jobs.status import QueueEstimator
 from ..jobs.worker import Worker
-from ..storage.database_health import error_text
+from ..storage.database_health import error_text, is_full
 from ..storage.folder_binding import open_store
 from ..storage.job_files import FolderStorage
 from ..storage.s3_storage import S3Storage
@@ -58,6 +59,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         title="kissgs",
         version=facts.API_VERSION,
         lifespan=_lifespan,
+        docs_url=None,
         redoc_url=None,
         openapi_url="/openapi.json",
         redirect_slashes=False,
@@ -127,15 +129,17 @@ def build(settings: ServiceSettings) -> ServiceContainer:
         raise
     storage.remove_unfinished(store.ids())
     clock.start_after(store.latest_time())
+    storage.keep_reserve()
     notifier, metrics = JobNotifier(), Metrics()
     metrics.queue_limit.set(settings.max_queue)
     completion = JobCompletion(settings, store, storage, metrics, clock)
     worker = Worker(settings, store, storage, notifier, metrics, completion, runner)
-    admission = Admission(settings, store, storage)
+    queue = QueueEstimator(store, settings.workers)
+    admission = Admission(settings, store, storage, queue)
     decoder = Decoder(settings, store, storage, admission, runner)
-    event_stream = EventStream(store, notifier, settings.workers)
+    event_stream = EventStream(store, notifier, queue)
     return ServiceContainer(
-        settings, store, storage, notifier, metrics, clock, worker, admission, decoder, event_stream
+        settings, store, storage, notifier, metrics, clock, worker, queue, admission, decoder, event_stream
     )
 
 
@@ -194,8 +198,7 @@ def _answer_errors(app: FastAPI) -> None:
     @app.exception_handler(SQLAlchemyError)
     async def database(request: Request, error: SQLAlchemyError) -> JSONResponse:
         log.error("the job database failed: %s", error)
-        reason = str(getattr(error, "orig", "")).lower()
-        if "is full" in reason or "no space left" in reason:
+        if is_full(error):
             return answer(ProblemError("disk-full", "the server's disk is full; try again later", retry_after=600))
         return answer(unusable_database())
 

@@ -21,7 +21,15 @@ PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
-"""Content-Security-Policy of the main page: no external resources, no embedding in frames."""
+"""Content-Security-Policy of the pages: no external resources, no embedding in frames."""
+
+SECURITY_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""Headers of every answer. The last keeps pages of other sites from embedding images and files of jobs; it does not
+concern the requests of scripts, which CORS permits or not."""
 
 METHODS = ("GET", "HEAD", "POST", "DELETE", "OPTIONS", "PUT", "PATCH")
 
@@ -54,7 +62,7 @@ class RequestMiddleware:
             if message["type"] == "http.response.start":
                 status = message["status"]
                 self._metrics.latency.labels(_route(scope)).observe(time.perf_counter() - begun)
-                _mark(MutableHeaders(scope=message), request_id, scope["path"])
+                _mark(MutableHeaders(scope=message), request_id)
             await send(message)
 
         try:
@@ -102,12 +110,10 @@ def _site(origin: str) -> str | None:
         return None
 
 
-def _mark(headers: MutableHeaders, request_id: str, path: str) -> None:
+def _mark(headers: MutableHeaders, request_id: str) -> None:
     headers["X-Request-ID"] = request_id
-    headers["X-Content-Type-Options"] = "nosniff"
-    headers["Referrer-Policy"] = "no-referrer"
-    if not path.startswith("/docs"):
-        headers.setdefault("Content-Security-Policy", PAGE_POLICY)  # the preview page has its own
+    headers.update(SECURITY_HEADERS)
+    headers.setdefault("Content-Security-Policy", PAGE_POLICY)  # the preview page has its own
 
 
 def _route(scope: Scope) -> str:

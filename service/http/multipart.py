@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import urllib.parse
 from collections.abc import AsyncIterable, AsyncIterator
 from dataclasses import dataclass
 
@@ -15,6 +16,13 @@ MAX_PART_HEADER_BYTES = 8192
 
 MAX_PREAMBLE_BYTES = 8192
 """Maximum bytes before the first boundary, where RFC 2046 allows text, which is ignored."""
+
+
+_PARAMETER = re.compile(rb';[ \t]*([^\s;="]+)[ \t]*=[ \t]*("(?:[^"\\]|\\.)*"|[^;"]*)')
+"""Name and value of a parameter of a header."""
+
+_EXTENDED = re.compile(rb"(utf-8|iso-8859-1)'[A-Za-z0-9-]*'((?:[!#$&+.^_`|~A-Za-z0-9-]|%[0-9A-F]{2})+)", re.IGNORECASE)
+"""Value of a parameter with an encoding and percent-escapes, as RFC 8187 permits it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,18 +86,16 @@ class _Parser:
         self._name, self._value = b"", b""
 
     def _headers_finished(self) -> None:
-        _, options = parse_options_header(self._headers.get(b"content-disposition", b""))
+        disposition = self._headers.get(b"content-disposition", b"")
+        _, options = parse_options_header(disposition)
         if b"name" not in options:
             raise ProblemError(
                 "invalid-request", "a part of the form has no field name; send the fields 'file' and 'options'"
             )
-        filename = options.get(b"filename")
-        self.found.append(
-            PartBegin(
-                options[b"name"].decode("utf-8", "replace"),
-                None if filename is None else filename.decode("utf-8", "replace"),
-            )
-        )
+        filename = _extended_name(disposition)
+        if filename is None and b"filename" in options:
+            filename = options[b"filename"].decode("utf-8", "replace")
+        self.found.append(PartBegin(options[b"name"].decode("utf-8", "replace"), filename))
 
     def _data(self, data: bytes, start: int, end: int) -> None:
         if end > start:
@@ -97,6 +103,18 @@ class _Parser:
 
     def _end(self) -> None:
         self.complete = True
+
+
+def _extended_name(disposition: bytes) -> str | None:
+    """Return the file name in ``filename*`` (RFC 8187), which the library ignores; None without a valid one."""
+    for name, value in _PARAMETER.findall(disposition):
+        found = _EXTENDED.fullmatch(value.strip(b' \t"'))  # some clients quote it
+        if name.lower() == b"filename*" and found:
+            try:
+                return urllib.parse.unquote_to_bytes(found[2]).decode(found[1].decode("ascii"))
+            except UnicodeDecodeError:
+                return None
+    return None
 
 
 class _Preamble:

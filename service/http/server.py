@@ -19,6 +19,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from ..core.problems import MEDIA_TYPE, problem
 from ..core.settings import ServiceSettings, SettingsError
 from ..jobs.container import ServiceContainer
+from .middleware import SECURITY_HEADERS
 
 log = logging.getLogger("kissgs.service")
 
@@ -28,6 +29,9 @@ receive the response."""
 
 READ_SECONDS = 60.0
 """Timeout for a client to receive any bytes of a pending response."""
+
+MAX_HEADER_BYTES = 64 << 10
+"""Maximum bytes of the headers of a request."""
 
 READ_BYTES = 32 << 10
 """Maximum bytes per read from a connection."""
@@ -44,6 +48,24 @@ OTHER_DESCRIPTORS = 256
 """File descriptors reserved for other uses than connections: uploads, downloads, the database, jobs."""
 
 
+class StrictConnection(h11.Connection):
+    """h11 that refuses requests whose end other programs may see elsewhere, and take the rest for a request."""
+
+    def next_event(self) -> h11.Event | type[h11.NEED_DATA] | type[h11.PAUSED]:
+        """Return the next event.
+
+        Raises:
+            h11.RemoteProtocolError: the request is invalid, or has Transfer-Encoding and either a Content-Length or
+                HTTP/1.0, which has no chunks.
+        """
+        event = super().next_event()
+        if isinstance(event, h11.Request):
+            names = {name for name, _ in event.headers}
+            if b"transfer-encoding" in names and (b"content-length" in names or event.http_version < b"1.1"):
+                raise h11.RemoteProtocolError("Transfer-Encoding with Content-Length or HTTP/1.0")
+        return event
+
+
 class TimeoutProtocol(H11Protocol):
     """HTTP protocol that closes connections that send no complete request, do not receive the response, or need too
     much CPU time to parse."""
@@ -57,6 +79,7 @@ class TimeoutProtocol(H11Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Start the timers of the connection, or abort it if there are too many."""
+        self.conn = StrictConnection(h11.SERVER, MAX_HEADER_BYTES)
         super().connection_made(transport)  # type: ignore[arg-type]
         if len(self.connections) > self.most_connections:
             self.transport.abort()
@@ -101,13 +124,14 @@ class TimeoutProtocol(H11Protocol):
         """Answer invalid HTTP and headers of more than 64 KiB with a problem document, like all other errors."""
         found = problem(
             "bad-http",
-            "the request is not valid HTTP, or its headers exceed 64 KiB; send a valid request with shorter headers",
+            "the request is not valid HTTP, has an ambiguous length, or has headers above 64 KiB; send a valid request",
         )
         body = found.model_dump_json(exclude_none=True).encode()
         headers = [
             (b"content-type", MEDIA_TYPE.encode()),
             (b"content-length", str(len(body)).encode()),
             (b"connection", b"close"),
+            *((name.encode(), value.encode()) for name, value in SECURITY_HEADERS.items()),
         ]
         events = (h11.Response(status_code=found.status, headers=headers), h11.Data(data=body), h11.EndOfMessage())
         for event in events:

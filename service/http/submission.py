@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import ipaddress
 import json
 import logging
 import uuid
@@ -80,7 +81,7 @@ async def submit(
     if known is None:
         await run_sync(context.admission.check, owner)
     parsed = parse_options(options) if options is not None else None
-    with context.admission.slot():
+    with context.admission.slot(owner or _address(request)):
         path = context.storage.new_upload()
         kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         _check_headers(request, kind)
@@ -131,6 +132,15 @@ def parse_options(text: str | bytes) -> JobOptions:
             "compact with method merge, or ask the operator to install the extra train",
         )
     return options
+
+
+def _address(request: Request) -> str:
+    """Return the address of a client; of IPv6 the network, of which a client has all addresses."""
+    host = request.client.host if request.client else ""
+    try:
+        return str(ipaddress.ip_network(f"{host.partition('%')[0]}/64", strict=False)) if ":" in host else host
+    except ValueError:
+        return host
 
 
 def _check_headers(request: Request, kind: str) -> None:

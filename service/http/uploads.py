@@ -117,18 +117,19 @@ class Spool:
         Raises:
             ProblemError: as :meth:`write`.
         """
-        return await run_sync(self._finish)
+        await run_sync(self._close)
+        async with self._admission.parsing:
+            info = await run_sync(self._read_info)
+        self._refuse_count(info)
+        self._kept = True
+        return Received(self._path, self._size, self._hash.hexdigest(), info)
 
-    def _finish(self) -> Received:
+    def _close(self) -> None:
         self._flush()
         with self._writing() as file:
             file.flush()
             os.fsync(file.fileno())
             file.close()
-        info = self._read_info()
-        self._refuse_count(info)
-        self._kept = True
-        return Received(self._path, self._size, self._hash.hexdigest(), info)
 
     def _leave(self) -> None:
         if self._file is not None:

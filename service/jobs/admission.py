@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import NoReturn
 
 from ..core.models import Job
 from ..core.problems import ProblemError
@@ -16,6 +19,10 @@ from .status import QueueEstimator
 
 BUSY_SECONDS = 5.0
 """``Retry-After`` of refusals because of simultaneous uploads, seconds."""
+
+PARSES_AT_ONCE = 2
+"""Uploads whose headers are read at a time, which takes up to 30 MB and half a second each. One hostile upload does not
+delay all others, and the memory of many does not add up."""
 
 FULL_SECONDS = 600.0
 """``Retry-After`` of refusals because of a full disk, seconds."""
@@ -28,7 +35,9 @@ class Admission:
     settings: ServiceSettings
     store: Store
     storage: JobStorage
-    uploads: int = 0
+    queue: QueueEstimator
+    _uploads: Counter[str] = field(default_factory=Counter)
+    parsing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(PARSES_AT_ONCE))
     _reserved: int = 0
     _written: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -65,24 +74,33 @@ class Admission:
                 raise self._full(job.disk_bytes) from refused
             raise self._refused(refused.limit) from refused
 
+    @property
+    def uploads(self) -> int:
+        """Number of uploads in progress."""
+        return self._uploads.total()
+
     @contextlib.contextmanager
-    def slot(self) -> Iterator[None]:
-        """Count an upload while it is received.
+    def slot(self, client: str) -> Iterator[None]:
+        """Count an upload of a client, the owner of a key or an address, while it is received.
 
         Raises:
             ProblemError: ``too-many-uploads``.
         """
         if self.uploads >= self.settings.max_uploads:
-            raise ProblemError(
-                "too-many-uploads",
-                f"{self.uploads} uploads are in progress, which is the limit; try again in a few seconds",
-                retry_after=BUSY_SECONDS,
-            )
-        self.uploads += 1
+            self._refuse_upload(f"{self.uploads} uploads are in progress")
+        if self._uploads[client] >= self.settings.max_uploads_of_one:
+            which = "this key" if self.settings.keys else "this address"
+            self._refuse_upload(f"{self._uploads[client]} uploads of {which} are in progress")
+        self._uploads[client] += 1
         try:
             yield
         finally:
-            self.uploads -= 1
+            self._uploads[client] -= 1
+            self._uploads += Counter()  # forgets clients without uploads
+
+    def _refuse_upload(self, found: str) -> NoReturn:
+        text = f"{found}, which is the limit; try again in a few seconds"
+        raise ProblemError("too-many-uploads", text, retry_after=BUSY_SECONDS)
 
     def check_space(self, size: int) -> None:
         """Refuse ``size`` bytes that would not fit even without the reclaimable files of ended jobs; reserve nothing.
@@ -144,7 +162,7 @@ class Admission:
         return ProblemError("disk-full", text, retry_after=FULL_SECONDS)
 
     def _refused(self, limit: str) -> ProblemError:
-        seconds = QueueEstimator(self.store, self.settings.workers).seconds_to_room()
+        seconds = self.queue.current().seconds_to_room()
         if limit == "queue":
             text = f"{self.settings.max_queue} jobs are waiting, which is the limit; try again in {seconds:.0f} s"
             return ProblemError("queue-full", text, retry_after=seconds)

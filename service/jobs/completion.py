@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
+
+from sqlalchemy.exc import SQLAlchemyError
 
 from ..core.clock import Clock
 from ..core.metrics import Metrics
 from ..core.models import Job, State
 from ..core.problems import PROBLEM_TYPES, problem
 from ..core.settings import ServiceSettings
+from ..storage.database_health import is_full
 from ..storage.job_records import Store
 from ..storage.job_storage import RESULT, JobStorage
+
+T = TypeVar("T")
 
 log = logging.getLogger("kissgs.service")
 
@@ -75,6 +81,39 @@ class JobCompletion:
             when = "before it was started" if seconds is None else f"after {seconds:.1f} s"
             log.info("job %s %s %s", job.id, state, when)
         return moved
+
+    def cancel(self, job: Job) -> bool:
+        """Record that a job was cancelled, also on a full disk; return False if it has already ended."""
+        return self._despite_full_disk(lambda: self.end(job, State.CANCELLED, upload_kept=False, disk_bytes=0))
+
+    def expire(self, number: int, job_id: str, **values: Any) -> bool:  # noqa: ANN401
+        """Record that an ended job has expired, with the columns ``values``, and remove its files.
+
+        On a full disk the files go first, because the record needs space. Returns whether the files are removed.
+        """
+        gone: dict[str, Any] = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0, **values}
+        try:
+            self.store.move(number, State.EXPIRED, **gone)
+        except SQLAlchemyError as error:
+            if not is_full(error):
+                raise
+            self.storage.remove_job(job_id)
+            self._despite_full_disk(lambda: self.store.move(number, State.EXPIRED, **gone))
+        return self.storage.remove_job(job_id)
+
+    def forget(self, number: int) -> None:
+        """Remove the record of a job, also on a full disk."""
+        self._despite_full_disk(lambda: self.store.forget(number))
+        self.storage.keep_reserve()
+
+    def _despite_full_disk(self, change: Callable[[], T]) -> T:
+        """Make a change of the database, if necessary with the reserve of disk space."""
+        try:
+            return change()
+        except SQLAlchemyError as error:
+            if not (is_full(error) and self.storage.free_reserve()):
+                raise
+        return change()
 
     def _failed(self, job: Job, code: str, detail: str, dead: str | None = None) -> bool:
         document = problem(code if code in PROBLEM_TYPES else "internal", detail).model_dump(exclude_none=True)

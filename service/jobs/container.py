@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import hmac
-from dataclasses import dataclass
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -14,13 +16,36 @@ from ..core.clock import Clock
 from ..core.metrics import Metrics
 from ..core.notifier import JobNotifier
 from ..core.problems import ProblemError
+from ..core.schemas import Health
 from ..core.settings import ServiceSettings
 from ..storage.job_records import Store
 from ..storage.job_storage import JobStorage
 from .admission import Admission
 from .decoding import Decoder
 from .event_stream import EventStream
+from .status import QueueEstimator
 from .worker import Worker
+
+READY_SECONDS = 2.0
+"""Age up to which the result of a check is given again: each check writes to the disk, and anybody may ask for one."""
+
+
+class Readiness:
+    """The latest result of the checks of all parts, of which one runs at a time."""
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+        self._found: Health | None = None
+        self._checked = 0.0
+
+    async def health(self, check: Callable[[], Awaitable[Health]]) -> Health:
+        """Return the latest result, or that of a new check."""
+        clock = asyncio.get_running_loop().time
+        async with self._lock:
+            if self._found is None or clock() - self._checked > READY_SECONDS:
+                self._found = await check()
+                self._checked = clock()
+            return self._found
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +59,11 @@ class ServiceContainer:
     metrics: Metrics
     clock: Clock
     worker: Worker
+    queue: QueueEstimator
     admission: Admission
     decoder: Decoder
     event_stream: EventStream
+    readiness: Readiness = field(default_factory=Readiness)
 
 
 def _context(request: Request) -> ServiceContainer:

@@ -6,6 +6,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
+from typing import Any
 from weakref import WeakValueDictionary
 
 from anyio.to_thread import run_sync
@@ -39,7 +40,7 @@ class EventStream:
 
     store: Store
     notifier: JobNotifier
-    workers: int
+    queue: QueueEstimator
     _feeds: WeakValueDictionary[str, _Feed] = field(default_factory=WeakValueDictionary)
 
     async def stream(self, job: Job, after: int) -> AsyncIterator[str]:
@@ -76,11 +77,13 @@ class EventStream:
         current = self.store.get(job.id)
         return current, self.store.events(job.number, after)
 
+    def _status(self, job: Job) -> dict[str, Any]:
+        return job_status(job, self.queue.current()).model_dump(mode="json", exclude_none=True)
+
     async def _format(self, event: Event, current: Job | None) -> str:
         data = event.data
         if (
             event.kind == "state" and current is not None and event.seq == current.last_event
         ):  # the full status is sent with the latest event only
-            status = await run_sync(job_status, current, QueueEstimator(self.store, self.workers))
-            data = {**data, "job": status.model_dump(mode="json", exclude_none=True)}
+            data = {**data, "job": await run_sync(self._status, current)}
         return f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"

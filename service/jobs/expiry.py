@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import logging
 from dataclasses import dataclass
-from typing import Any
 
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
@@ -64,20 +63,18 @@ class ExpiryTask:
             Ids of the jobs that have expired.
         """
         store, storage, now = self.context.store, self.context.storage, self.context.clock()
-        keep, expired = self.context.settings.keep_seconds, []
-        store.heartbeat()
+        completion, keep, expired = self.context.worker.completion, self.context.settings.keep_seconds, []
+        storage.keep_reserve()
         if now - self.began < min(GRACE_SECONDS, keep):
             return []
         while due := store.due(ENDED, now):
             for number, job_id in due:
-                gone: dict[str, Any] = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0}
-                if store.move(number, State.EXPIRED, expires_at=now + keep, **gone):
-                    storage.remove_job(job_id)
-                    expired.append(job_id)
+                completion.expire(number, job_id, expires_at=now + keep)
+                expired.append(job_id)
         while due := store.due([State.EXPIRED], now):
             for number, job_id in due:
                 if storage.remove_job(job_id):
-                    store.forget(number)
+                    completion.forget(number)
                 else:
                     store.update(number, expires_at=now + RETRY_SECONDS)
         if expired:

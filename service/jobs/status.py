@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import statistics
+import threading
 
 from ..core.clock import as_datetime
 from ..core.models import ACTIVE, Job, State
 from ..core.presets import can_train, limited_seconds, usual_seconds
 from ..core.schemas import FINETUNED, TIMED, Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
+from ..storage.job_queries import in_turn
 from ..storage.job_records import Store
 
 
 class QueueEstimator:
-    """Estimates of positions and times from one reading of the queue, on first use.
+    """Estimates of positions and times, from one reading of the queue for each change of it.
 
     Args:
         store: job store.
@@ -20,41 +22,39 @@ class QueueEstimator:
     """
 
     def __init__(self, store: Store, workers: int) -> None:
-        self.now = store.clock()
         self._store, self._workers = store, workers
-        self._active: list[Job] | None = None
-        self._replicas: int | None = None
+        self._lock = threading.Lock()
+        self._changes: int | None = None
+        self._latest: _Queue | None = None
+
+    def current(self) -> QueueEstimates:
+        """Return the estimates at this moment."""
+        with self._lock:
+            changes = self._store.changes  # first, so that a change during the reading is read the next time
+            if self._latest is None or changes is None or changes != self._changes:
+                self._latest, self._changes = _Queue(self._store, self._workers), changes
+            return QueueEstimates(self._latest, self._store.clock())
+
+
+class _Queue:
+    """All active jobs at one time, and the rates of recent ones."""
+
+    def __init__(self, store: Store, workers: int) -> None:
+        self._store = store
         self._rates: dict[tuple[str, bool], float | None] = {}
+        self.workers = workers * store.count_replicas()
+        active, turns = store.active(), store.turns
+        self.running = [(self.total(job), job.started_at) for job in active if job.state == State.RUNNING]
+        self.positions: dict[int, int] = {}
+        self.seconds_before: dict[int, float] = {}
+        before = 0.0
+        for job in in_turn((job for job in active if job.state == State.QUEUED), turns):
+            self.positions[job.number] = 1 + len(self.positions)
+            self.seconds_before[job.number] = before
+            before += _remaining(self.total(job), 0.0)
 
-    def position(self, job: Job) -> int:
-        """Return the position of a queued job; 1 is next."""
-        return 1 + sum(other.state == State.QUEUED for other in self._ahead(job))
-
-    def seconds_left(self, job: Job) -> float:
-        """Estimate the seconds until a queued or running job ends."""
-        ahead = self._ahead(job) if job.state == State.QUEUED else []
-        return self._work(job) + sum(map(self._work, ahead)) / self._all_workers()
-
-    def seconds_to_room(self) -> float:
-        """Estimate the seconds until the queue has room, 1 to 300."""
-        running = [self._work(job) for job in self._jobs() if job.state == State.RUNNING]
-        return min(300.0, max(1.0, min(running, default=1.0) / self._all_workers()))
-
-    def _all_workers(self) -> int:
-        if self._replicas is None:
-            self._replicas = self._store.count_replicas()
-        return self._workers * self._replicas
-
-    def _jobs(self) -> list[Job]:
-        if self._active is None:
-            self._active = self._store.active()
-        return self._active
-
-    def _ahead(self, job: Job) -> list[Job]:
-        return [other for other in self._jobs() if other.state == State.RUNNING or other.number < job.number]
-
-    def _work(self, job: Job) -> float:
-        """Estimate the remaining seconds of a job itself, from recent jobs with equal preset and evaluation."""
+    def total(self, job: Job) -> float:
+        """Estimate the seconds of a job from start to end, from recent jobs with equal preset and evaluation."""
         kind = _kind_without_limit(job), job.evaluate
         if kind not in self._rates:
             rates = self._store.rates(*kind)
@@ -63,11 +63,39 @@ class QueueEstimator:
         total = usual_seconds(*kind, job.gaussians) if rate is None else rate * job.gaussians
         if (limit := job.options.get("time_limit")) is not None:
             total = limited_seconds(*kind, job.gaussians, total, limit)
-        spent = self.now - job.started_at if job.state == State.RUNNING and job.started_at is not None else 0.0
-        return max(total - spent, 0.1 * total, 0.5)  # a running job is never taken for done
+        return total
 
 
-def job_status(job: Job, queue: QueueEstimator) -> JobStatus:
+class QueueEstimates:
+    """Estimates at one moment, ``now`` in seconds since 1970."""
+
+    def __init__(self, queue: _Queue, now: float) -> None:
+        self.now, self._queue = now, queue
+        self._running = [_remaining(total, now - (now if began is None else began)) for total, began in queue.running]
+
+    def position(self, job: Job) -> int:
+        """Return the position of a queued job; 1 is next."""
+        return self._queue.positions.get(job.number, 1)  # just started
+
+    def seconds_left(self, job: Job) -> float:
+        """Estimate the seconds until a queued or running job ends."""
+        runs = job.state == State.RUNNING and job.started_at is not None
+        seconds = _remaining(self._queue.total(job), self.now - (job.started_at or self.now) if runs else 0.0)
+        if job.state != State.QUEUED:
+            return seconds
+        before = self._queue.seconds_before.get(job.number, 0.0)
+        return seconds + (sum(self._running) + before) / self._queue.workers
+
+    def seconds_to_room(self) -> float:
+        """Estimate the seconds until the queue has room, 1 to 300."""
+        return min(300.0, max(1.0, min(self._running, default=1.0) / self._queue.workers))
+
+
+def _remaining(total: float, spent: float) -> float:
+    return max(total - spent, 0.1 * total, 0.5)  # a running job is never taken for done
+
+
+def job_status(job: Job, queue: QueueEstimates) -> JobStatus:
     """Return the current status of a job."""
     waits, runs, result = job.state == State.QUEUED, job.state == State.RUNNING, job.result or {}
     return JobStatus(
@@ -106,7 +134,7 @@ def _kind_without_limit(job: Job) -> str:
     return job.preset.removesuffix(TIMED) + (FINETUNED if open_to_tuning else "")
 
 
-def _estimate(job: Job, queue: QueueEstimator) -> Estimate:
+def _estimate(job: Job, queue: QueueEstimates) -> Estimate:
     seconds = queue.seconds_left(job)
     return Estimate(seconds_left=round(seconds, 1), ready_at=as_datetime(queue.now + seconds))
 

@@ -110,7 +110,7 @@ class Worker:
 
     async def cancel(self, job: Job) -> None:
         """Cancel a job that has not ended; on return, its process has ended and its files are removed."""
-        if not await run_sync(lambda: self.completion.end(job, State.CANCELLED, upload_kept=False, disk_bytes=0)):
+        if not await run_sync(lambda: self.completion.cancel(job)):
             return
         process = self._processes.get(job.id)
         if process is not None:

@@ -4,6 +4,7 @@
     jobs/ID/                     files of a job (:mod:`service.storage.job_files`)
     jobs/.orphaned/ID/           folders of jobs that the database does not know; never read or removed
     lock, identity, database     lock of the service, number of the folder, number of its database
+    reserve                      space that deleting and starting need on a full disk
 
 Nothing is removed behind a link in place of a job's folder.
 """
@@ -30,6 +31,9 @@ ORPHANED = ".orphaned"
 """Name of the folder, within ``jobs``, for folders that no job of the database owns."""
 
 JOB = re.compile("[0-9a-f]{32}")
+
+RESERVE_BYTES = 1 << 20
+"""Bytes of the reserve: to open an SQLite database and change it takes 100 kB of journal, each change 20 to 40."""
 
 _UPLOAD = re.compile(r"[0-9a-f]{16}\.part")
 
@@ -176,6 +180,25 @@ class DataFolder:
     def free_bytes(self) -> int:
         """Return the free bytes of the disk."""
         return shutil.disk_usage(self.root).free
+
+    def keep_reserve(self) -> None:
+        """Take the reserve if it is missing, or what is left of it on a full disk."""
+        path = self.root / "reserve"
+        try:
+            size = min(RESERVE_BYTES, self.free_bytes() - RESERVE_BYTES // 16)
+            if not path.exists() and size > 0:
+                with path.open("wb") as file:
+                    os.posix_fallocate(file.fileno(), 0, size)
+        except OSError:
+            self.free_reserve()
+
+    def free_reserve(self) -> bool:
+        """Free the reserve, for a change that will free more; return whether there was one."""
+        try:
+            (self.root / "reserve").unlink()
+        except OSError:
+            return False
+        return True
 
     # Numbers -------------------------------------------------------------------------------------------------------
 

@@ -49,6 +49,12 @@ def error_text(error: BaseException) -> str:
     return lines[0].strip() if lines else type(error).__name__
 
 
+def is_full(error: BaseException) -> bool:
+    """Return whether a database failed because its disk is full."""
+    reason = error_text(error).lower()
+    return "is full" in reason or "no space left" in reason
+
+
 def check_rows(connection: sa.Connection) -> None:
     """Read the last row of each table, with all columns, as a quick check.
 

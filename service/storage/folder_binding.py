@@ -31,6 +31,8 @@ def open_store(settings: ServiceSettings, storage: JobStorage, clock: Callable[[
         SettingsError: it cannot be opened, does not belong to the folder, or is in use. Nothing has been removed.
     """
     stored = storage.job_ids()
+    if storage.free_bytes() < NEARLY_FULL_BYTES:
+        storage.free_reserve()
     try:
         store = _open(settings, storage, clock, create=not stored)
     except NewDatabaseError as error:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import heapq
+from collections import deque
+from collections.abc import Iterable, Mapping
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session, load_only
@@ -50,7 +52,7 @@ class JobQueries:
 
     def active(self) -> list[Job]:
         """Return all queued and running jobs, with only the columns that estimates need."""
-        columns = load_only(Job.state, Job.preset, Job.evaluate, Job.gaussians, Job.options, Job.started_at)
+        columns = load_only(Job.owner, Job.state, Job.preset, Job.evaluate, Job.gaussians, Job.options, Job.started_at)
         with self._reading() as session:
             return list(session.scalars(sa.select(Job).where(Job.state.in_(ACTIVE)).options(columns)))
 
@@ -115,6 +117,27 @@ class JobQueries:
         """Return the number of queued jobs."""
         with self._reading() as session:
             return count(session, Job.state == State.QUEUED)
+
+
+def in_turn(queued: Iterable[Job], turns: Mapping[str, int]) -> list[Job]:
+    """Return queued jobs in the order in which :meth:`Store.claim` starts them.
+
+    The owners take turns, first the one whose ``turns``, the number of its last start, is the lowest; of one owner, the
+    oldest job is first.
+    """
+    waiting: dict[str, deque[Job]] = {}
+    for job in sorted(queued, key=lambda job: job.number):
+        waiting.setdefault(job.owner, deque()).append(job)
+    heads = [(turns.get(owner, 0), jobs[0].number, owner) for owner, jobs in waiting.items()]
+    heapq.heapify(heads)
+    order: list[Job] = []
+    latest = max(turns.values(), default=0)
+    while heads:
+        _, _, owner = heapq.heappop(heads)
+        order.append(waiting[owner].popleft())
+        if waiting[owner]:
+            heapq.heappush(heads, (latest + len(order), waiting[owner][0].number, owner))
+    return order
 
 
 def disk_bytes(session: Session) -> int:

@@ -47,6 +47,9 @@ class LimitExceeded(Exception):
 class Store(JobQueries, ReplicaRecords):
     """Jobs and events in a database. Methods block for milliseconds and are safe in any thread.
 
+    Attributes:
+        turns: by owner, the number of the last start of one of its jobs, counted from 1 since this service has started.
+
     Args:
         url: SQLAlchemy URL.
         clock: returns the time, seconds since 1970.
@@ -61,6 +64,8 @@ class Store(JobQueries, ReplicaRecords):
         self._monitor = DatabaseMonitor(self._engine)
         self._monitor.identity = self.meta_value(IDENTITY)
         self.clock = clock
+        self.turns: dict[str, int] = {}
+        self._changes = 0
 
     def close(self) -> None:
         """Release the database lease and close all connections."""
@@ -125,6 +130,11 @@ class Store(JobQueries, ReplicaRecords):
 
     # Jobs ----------------------------------------------------------------------------------------------------------
 
+    @property
+    def changes(self) -> int | None:
+        """Number of changes of the queue so far; None if other replicas may change it, too."""
+        return self._changes if self.replica is None else None
+
     def add(self, job: Job, *, max_queue: int, max_owner: int, max_disk: int | None = None) -> Job:
         """Queue a job; of a replica, drop the claim of it.
 
@@ -152,14 +162,19 @@ class Store(JobQueries, ReplicaRecords):
                 _add_event(session, job, "state", {"state": State.QUEUED})
         except IntegrityError as error:
             raise LimitExceeded("key") from error
+        self._changes += 1
         return job
 
     # Changes -------------------------------------------------------------------------------------------------------
 
     def claim(self) -> Job | None:
-        """Set the oldest queued job to running and return it; None if the queue is empty."""
+        """Set the next queued job to running and return it; None if the queue is empty.
+
+        The owners of keys take turns, so that nobody waits for all jobs of another; of one, the oldest is next.
+        """
         with self._write() as session:
-            query = sa.select(Job).where(Job.state == State.QUEUED).order_by(Job.number).limit(1)
+            turn = [sa.case(self.turns, value=Job.owner, else_=0)] if self.turns else []
+            query = sa.select(Job).where(Job.state == State.QUEUED).order_by(*turn, Job.number).limit(1)
             job = session.scalar(query.with_for_update(skip_locked=True))
             if job is None:
                 return None
@@ -170,7 +185,9 @@ class Store(JobQueries, ReplicaRecords):
             if self.replica is not None:
                 replicas.take(session, job.id, self.replica)
             _add_event(session, job, "state", {"state": State.RUNNING, "start": job.starts})
-            return job
+            self.turns = {**self.turns, job.owner: max(self.turns.values(), default=0) + 1}
+        self._changes += 1
+        return job
 
     def progress(self, number: int, stage: str, fraction: float, note: str = "") -> None:
         """Store the progress of a running job: stage, fraction from 0 to 1, and an optional note."""
@@ -207,7 +224,8 @@ class Store(JobQueries, ReplicaRecords):
                 job.finished_at = self.clock()
             job.state = state
             _add_event(session, job, "state", {"state": state, **({"problem": job.problem} if job.problem else {})})
-            return True
+        self._changes += 1
+        return True
 
     def update(self, number: int, **values: Any) -> None:  # noqa: ANN401
         """Set columns without adding an event."""

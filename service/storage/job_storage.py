@@ -84,6 +84,13 @@ class JobStorage(ABC):
     def free_bytes(self) -> int:
         """Return the free bytes of this machine's disk."""
 
+    def keep_reserve(self) -> None:  # noqa: B027  nothing to do if the database lies elsewhere
+        """Take disk space for what must work on a full disk, if there is enough."""
+
+    def free_reserve(self) -> bool:
+        """Free that space; return whether there was any."""
+        return False
+
     @abstractmethod
     def remove_uploads(self) -> None:
         """Remove incomplete uploads of a previous service."""

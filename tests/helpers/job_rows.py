@@ -21,5 +21,5 @@ def job(owner="", **values):
     return Job(id=uuid.uuid4().hex, owner=owner, **{**fixed, **values})
 
 
-def add(store, owner="", **values):
-    return store.add(job(owner, **values), max_queue=10, max_owner=3)
+def add(store, owner="", *, max_queue=10, max_owner=3, **values):
+    return store.add(job(owner, **values), max_queue=max_queue, max_owner=max_owner)

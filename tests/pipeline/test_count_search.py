@@ -136,7 +136,7 @@ def test_fewer_gaussians_for_a_size(share):
     assert {trial.count for trial in found.report.trials} <= {*counts, 600}
     assert found.report.compaction.count in [*counts, 600]
     if share == 0.45:  # all Gaussians do not fit
-        with pytest.raises(UnsupportedError, match="or for fewer Gaussians: --compact auto"):
+        with pytest.raises(UnsupportedError, match="or for fewer Gaussians: compact with auto_count"):
             kissgs.compress(SCENE, settings=whole)
         return
     all_of_them = kissgs.compress(SCENE, settings=whole, evaluate=True).report.evaluation

@@ -170,8 +170,8 @@ def test_details(tmp_path):
 def test_damaged_files_are_explained_by_the_reader_of_their_ending(tmp_path):
     for name, message in {
         "a.spz": "is not an .spz file",
-        "a.glb": "is not readable glTF",
-        "a.gltf": "is not readable glTF",
+        "a.glb": "is not readable JSON",
+        "a.gltf": "is not readable JSON",
         "a.sog": "is not a readable zip file",
         "a.splat": "is not a .splat file",
         "a.ksplat": "is cut short",

@@ -15,6 +15,8 @@ SCENE = 500_000
 class Records:
     """Job records whose rates are seconds per Gaussian by kind."""
 
+    turns, changes = {}, 0
+
     def __init__(self, **rates):
         self.given = {name.replace("_", "+"): rate for name, rate in rates.items()}
 
@@ -42,7 +44,7 @@ def seconds(records=None, gaussians=SCENE, started=None, **options):
         state=State.QUEUED if started is None else State.RUNNING,
         started_at=started,
     )
-    return QueueEstimator(records or Records(), 1).seconds_left(job)
+    return QueueEstimator(records or Records(), 1).current().seconds_left(job)
 
 
 @pytest.fixture

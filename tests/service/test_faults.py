@@ -9,9 +9,11 @@ import time
 import pytest
 from helpers.running import is_alive, wait_until
 from helpers.service import FAST, SLOW, SMALL, Service, problem, scene_bytes
+from sqlalchemy.exc import OperationalError
 
 import kissgs
 from service.http.server import config_of
+from service.jobs.completion import JobCompletion
 
 BIG = scene_bytes(20_000, 3)
 MEDIUM = scene_bytes(6_000, 2)
@@ -102,6 +104,71 @@ def test_a_disk_that_fills_up_during_a_job(tiny_disk):
         if status["state"] == "failed":
             assert (status["problem"]["code"], status["problem"]["retryable"]) == ("output", True)
         assert service.only_result(service.submit()) == EXPECTED
+
+
+def fill(folder):
+    with (folder / "filler").open("ab", buffering=0) as file:
+        for size in (4096, 1):
+            with contextlib.suppress(OSError):
+                while file.write(bytes(size)):
+                    pass
+
+
+def test_a_full_disk_prevents_neither_deletion_nor_a_start(tiny_disk):
+    """Deletion once failed, although the message advised it, and so did a start with a job waiting."""
+    service = Service(tiny_disk / "data")
+    service.log = tiny_disk.parent / "log"
+    with service:
+        ended = service.ended(service.submit())
+        running = service.running(service.submit(MEDIUM, SLOW))
+        others = [service.submit(scene_bytes(10, 0)) for _ in range(3)]
+        fill(tiny_disk)
+        assert service.http.delete(ended["links"]["self"]).status_code == 204
+        fill(tiny_disk)
+        assert service.http.delete(others[0]["links"]["self"]).status_code == 204
+        for number in (signal.SIGKILL, signal.SIGTERM):
+            service.kill(number)
+            fill(tiny_disk)
+            service.restart()
+            assert service.status(running)["state"] in ("queued", "running")
+        for job in (running, others[1]):
+            assert service.http.delete(job["links"]["self"]).status_code == 204
+        (tiny_disk / "filler").unlink()
+        assert service.ended(others[2])["state"] == "succeeded"
+
+
+class FullDisk:
+    """Store and storage on one disk, where a record takes space that only removed files or the reserve give."""
+
+    def __init__(self, *, files, reserve):
+        self.files, self.reserve, self.free = files, reserve, False
+        self.records = []
+
+    def move(self, number, state, **values):
+        if not self.free:
+            raise OperationalError("", {}, Exception("database or disk is full"))
+        self.records.append(state)
+        return True
+
+    def remove_job(self, job_id):
+        self.free |= self.files
+        self.files = False
+        return True
+
+    def free_reserve(self):
+        freed, self.reserve = self.reserve, False
+        self.free |= freed
+        return freed
+
+
+@pytest.mark.parametrize(("files", "reserve"), [(True, False), (False, True)])
+def test_the_record_of_a_deletion_finds_space(files, reserve):
+    disk = FullDisk(files=files, reserve=reserve)
+    completion = JobCompletion(None, disk, disk, None, None)
+    assert completion.expire(1, "id")
+    assert (disk.records, disk.files) == (["expired"], False)
+    with pytest.raises(OperationalError):
+        JobCompletion(None, nothing := FullDisk(files=False, reserve=False), nothing, None, None).expire(1, "id")
 
 
 def test_a_short_job_ends_before_the_service_stops(start):

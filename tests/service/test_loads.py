@@ -1,6 +1,7 @@
 """Many clients, also idle and hostile ones; oracle: the responses for a single client."""
 
 import contextlib
+import hashlib
 import os
 import re
 import resource
@@ -13,9 +14,15 @@ import time
 import uuid
 
 import pytest
+from helpers.running import wait_until
 from helpers.service import SLOW, SMALL, events, problem, read_response, scene_bytes
+from starlette.requests import Request
 
 from kissgs.benchmark import service_load
+from service.core.problems import ProblemError
+from service.core.settings import ServiceSettings
+from service.http.submission import _address
+from service.jobs.admission import Admission
 
 BIG = scene_bytes(20_000, 3)
 
@@ -380,3 +387,49 @@ def test_a_stalled_upload_does_not_delay_a_stop(start):
         answer = read_response(connection)
     assert answer.startswith(b"HTTP/1.1 503")
     assert service.process.wait(300) == 0
+
+
+def test_nobody_holds_all_upload_slots(start):
+    """One key once held all of them, with uploads of 9 kB/s."""
+    entries = [f"{owner}:{hashlib.sha256(owner.encode()).hexdigest()}" for owner in ("alice", "bob")]
+    service = start(KISSGS_KEYS=", ".join(entries), KISSGS_MAX_UPLOADS=6)
+    head = (
+        "POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer alice\r\nContent-Length: 5000\r\n\r\nply\n"
+    )
+    with contextlib.ExitStack() as stack:
+        for _ in range(2):
+            stack.enter_context(service.raw(head.encode()))
+        wait_until(lambda: "kissgs_uploads_in_flight 2.0" in service.http.get("/metrics").text)
+        answer = service.http.post("/v1/jobs", content=SMALL, headers=_bearer("alice"))
+        assert "this key" in problem(answer, 429, "too-many-uploads")["detail"]
+        assert service.http.post("/v1/jobs", content=SMALL, headers=_bearer("bob")).status_code == 202
+    wait_until(lambda: service.http.post("/v1/jobs", content=SMALL, headers=_bearer("alice")).status_code == 202)
+
+
+def test_an_address_has_a_quarter_of_the_upload_slots():
+    admission = Admission(ServiceSettings(max_uploads=8), None, None, None)
+    with admission.slot("192.0.2.1"), admission.slot("192.0.2.1"):
+        with pytest.raises(ProblemError, match="this address"), admission.slot("192.0.2.1"):
+            pass
+        with admission.slot("192.0.2.2"):
+            assert admission.uploads == 3
+    with admission.slot("192.0.2.1"):
+        assert admission.uploads == 1
+
+
+@pytest.mark.parametrize(
+    ("host", "counted"),
+    [
+        ("192.0.2.1", "192.0.2.1"),
+        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
+        ("2001:db8:1:2::9", "2001:db8:1:2::/64"),
+        ("fe80::1%eth0", "fe80::/64"),
+    ],
+)
+def test_an_ipv6_client_counts_by_its_network(host, counted):
+    """Oracle: RFC 6177, by which a site has at least a /64."""
+    assert _address(Request({"type": "http", "client": (host, 1), "headers": []})) == counted
+
+
+def _bearer(key):
+    return {"Authorization": f"Bearer {key}"}

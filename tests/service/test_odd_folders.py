@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from helpers.data_folders import add_a_job, finish_a_job, listing, names, service
+from helpers.running import wait_until
 from helpers.service import SLOW, SMALL, problem, scene_bytes
 
 from service.core.models import State
@@ -184,7 +185,7 @@ def test_readiness(start, name, change):
     if change != "moved away":
         folder.unlink() if change == "a file" else folder.rmdir()
     (it.folder / "away").rename(folder)
-    assert it.http.get("/readyz").status_code == 200
+    wait_until(lambda: it.http.get("/readyz").status_code == 200)  # a result may be two seconds old
     assert it.ended(it.submit())["state"] == "succeeded"
 
 

@@ -130,6 +130,37 @@ def test_health(service):
     assert service.http.get("/version").json()["container"] == "SOG-XT"
 
 
+def test_readiness_is_checked_every_two_seconds(monkeypatch):
+    """Every request once wrote to the disk, and strangers slowed submissions down with it."""
+    import asyncio
+
+    from service.core.schemas import Health
+    from service.jobs import container
+
+    running = checks = 0
+
+    async def check():
+        nonlocal running, checks
+        running, checks = running + 1, checks + 1
+        assert running == 1
+        await asyncio.sleep(0.01)
+        running -= 1
+        return Health(ready=checks == 1, checks={})
+
+    async def ask(readiness):
+        found = await asyncio.gather(*(readiness.health(check) for _ in range(50)))
+        return {health.ready for health in found}
+
+    async def ask_twice():
+        readiness = container.Readiness()
+        assert await ask(readiness) == await ask(readiness) == {True}
+        monkeypatch.setattr(container, "READY_SECONDS", 0.0)
+        assert False in await ask(readiness)
+
+    assert container.READY_SECONDS <= 2
+    asyncio.run(ask_twice())
+
+
 def test_an_ended_worker_is_not_ready(tmp_path, environment):
     import asyncio
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 
 import pytest
+from helpers.preview_browser import VENDOR
 from helpers.service import SLOW, SMALL, scene_bytes
 from helpers.viewers import chromium
 
@@ -349,3 +350,15 @@ def test_no_horizontal_overflow(visit, service, width, scheme):
         page.goto(f"{service.url}/{address}")
         page.locator("#recent-list li").first.wait_for()
         assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+@pytest.mark.skipif(not VENDOR.exists(), reason="scripts/vendor has not run")
+def test_the_api_explorer_needs_no_other_host(visit, service):
+    """It was once blank without the internet, and ran a script of another site."""
+    page = visit()
+    policy = page.goto(f"{service.url}/docs").headers["content-security-policy"]
+    assert "script-src 'self';" in policy
+    page.locator("#operations-facts-limits").click()
+    page.get_by_role("button", name="Try it out").click()
+    page.get_by_role("button", name="Execute").click()
+    page.locator(".live-responses-table .response-col_status", has_text="200").first.wait_for()

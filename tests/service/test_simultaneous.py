@@ -46,7 +46,7 @@ def test_many_simultaneous_jobs(start):
 
 
 def test_simultaneous_requests_with_one_idempotency_key(start):
-    service = start()
+    service = start(KISSGS_MAX_UPLOADS=32)
     with ThreadPoolExecutor(8) as pool:
         jobs = list(pool.map(lambda _: service.submit(scene_bytes(6_000, 2), **{"Idempotency-Key": "same"}), range(8)))
     assert len({job["id"] for job in jobs}) == 1

@@ -8,6 +8,7 @@ import pytest
 from helpers.job_rows import add
 
 from service.core.models import ENDED, State
+from service.jobs.status import QueueEstimator, job_status
 from service.storage.job_records import LimitExceeded, Store
 
 ALLOWED = {
@@ -51,6 +52,42 @@ def test_state_transitions(store, before, after):
     events = len(store.events(number))
     assert store.move(number, after) == ((before, after) in ALLOWED)
     assert len(store.events(number)) == events + ((before, after) in ALLOWED)
+
+
+def test_owners_take_turns(store):
+    """One key with many jobs once let all others wait. Oracle: the order written out; positions must agree."""
+    jobs = [add(store, owner, max_owner=9) for owner in "aaaaabbc"]
+    estimator = QueueEstimator(store, 1)
+    positions = sorted(jobs, key=lambda job: estimator.current().position(job))
+    started = [store.claim().number]
+    after_one = sorted(jobs[1:], key=lambda job: estimator.current().position(job))
+    started += [store.claim().number for _ in jobs[1:]]
+    order = [1, 6, 8, 2, 7, 3, 4, 5]
+    assert [jobs.index(next(job for job in jobs if job.number == number)) + 1 for number in started] == order
+    assert [job.number for job in positions] == started
+    assert [job.number for job in after_one] == started[1:]
+    late = [add(store, owner, max_owner=9) for owner in "abd"]
+    assert [store.claim().number for _ in late] == [late[2].number, late[1].number, late[0].number]
+
+
+def test_the_queue_is_read_once_for_each_change_of_it(store, monkeypatch):
+    """A list of 100 jobs with 195 queued once took 193 ms. Oracle: the number of readings."""
+    jobs = [add(store, str(i % 3), max_queue=99, max_owner=99) for i in range(30)]
+    read, readings = store.active, []
+    monkeypatch.setattr(store, "active", lambda: readings.append(1) or read())
+    estimator = QueueEstimator(store, 1)
+    for change in (
+        lambda: None,
+        store.claim,
+        lambda: store.move(jobs[20].number, State.CANCELLED),
+        lambda: add(store, max_queue=99),
+    ):
+        change()
+        readings.clear()
+        for job in jobs * 3:
+            job_status(store.get(job.id), estimator.current())
+        assert len(readings) == 1
+        store.progress(jobs[0].number, "codebook", 0.5)
 
 
 def test_jobs_are_claimed_once_and_in_order(store):

@@ -13,6 +13,8 @@ PACKAGES = {
     "three": ("LICENSE", "build/three.module.min.js", "build/three.core.min.js", "build/three.cjs",
               "examples/jsm/controls/OrbitControls.js", "examples/jsm/postprocessing/Pass.js"),
     "@sparkjsdev/spark": ("LICENSE", "dist/spark.module.min.js", "dist/spark.cjs.js"),
+    "swagger-ui-dist": ("LICENSE", "NOTICE", "swagger-ui-bundle.js", "swagger-ui-bundle.js.LICENSE.txt",
+                        "swagger-ui.css", "swagger-ui.js"),
 }  # fmt: skip
 
 NPM = f"""#!{sys.executable}
@@ -83,6 +85,9 @@ def test_it_installs_the_needed_files_once(tree):
         *("three/LICENSE", "three/build/three.module.min.js", "three/build/three.core.min.js"),
         *("three/examples/jsm/controls/OrbitControls.js", "three/examples/jsm/postprocessing/Pass.js"),
         *("spark/LICENSE", "spark/dist/spark.module.min.js", "versions.json"),
+        *("swagger-ui-dist/LICENSE", "swagger-ui-dist/NOTICE"),
+        *("swagger-ui-dist/swagger-ui-bundle.js", "swagger-ui-dist/swagger-ui.css"),
+        "swagger-ui-dist/swagger-ui-bundle.js.LICENSE.txt",
     }
     versions = json.loads((tree / "web_decoder" / "vendor" / "versions.json").read_bytes())
     pinned = json.loads((tree / "web_decoder" / "vendor-lock" / "package.json").read_bytes())["dependencies"]

@@ -1,6 +1,9 @@
 """Requests split into any packets; oracles: RFC 2046, RFC 6454 and the grammar of PLY."""
 
 import asyncio
+import contextlib
+import threading
+import time
 
 import pytest
 from helpers.service import FAST, SMALL, problem, read_response
@@ -8,7 +11,8 @@ from helpers.service import FAST, SMALL, problem, read_response
 from service.core.problems import ProblemError
 from service.core.settings import ServiceSettings
 from service.http.multipart import MAX_PREAMBLE_BYTES, PartBegin, PartData, parts
-from service.http.uploads import Spool
+from service.http.uploads import Spool, scene_name
+from service.jobs.admission import Admission
 
 HEAD = SMALL.index(b"end_header\n") + 11
 BOUNDARY = "multipart/form-data; boundary=b"
@@ -49,6 +53,8 @@ def test_an_id_with_a_zero_byte(service):
 
 class UnlimitedAdmission:
     """Admission without limits."""
+
+    parsing = contextlib.nullcontext()
 
     def check_space(self, size):
         pass
@@ -158,3 +164,143 @@ def test_text_around_a_form_is_limited(service, where):
     answer = service.http.post("/v1/jobs", content=iter(packets), headers={"Content-Type": BOUNDARY})
     problem(answer, 422, "invalid-request")
     assert list((service.folder / "incoming").iterdir()) == []
+
+
+FRAMINGS = {
+    "both": (b"HTTP/1.1", b"Content-Length: 4\r\nTransfer-Encoding: chunked\r\n"),
+    "both, chunked first": (b"HTTP/1.1", b"Transfer-Encoding: Chunked\r\nContent-Length: 4\r\n"),
+    "two lengths": (b"HTTP/1.1", b"Content-Length: 4\r\nContent-Length: 5\r\n"),
+    "two lengths in one line": (b"HTTP/1.1", b"Content-Length: 4, 5\r\n"),
+    "signed length": (b"HTTP/1.1", b"Content-Length: +4\r\n"),
+    "another coding": (b"HTTP/1.1", b"Transfer-Encoding: gzip, chunked\r\n"),
+    "two codings": (b"HTTP/1.1", b"Transfer-Encoding: chunked\r\nTransfer-Encoding: identity\r\n"),
+    "chunked in HTTP/1.0": (b"HTTP/1.0", b"Connection: keep-alive\r\nTransfer-Encoding: chunked\r\n"),
+    "space before the colon": (b"HTTP/1.1", b"Transfer-Encoding : chunked\r\nContent-Length: 4\r\n"),
+    "bare carriage return": (b"HTTP/1.1", b"X: a\rTransfer-Encoding: chunked\r\nContent-Length: 4\r\n"),
+}
+
+
+def all_received(connection):
+    """Return all that the service sends until it closes the connection."""
+    connection.settimeout(60)
+    answer = b""
+    with contextlib.suppress(ConnectionResetError):
+        while block := connection.recv(65536):
+            answer += block
+    return answer
+
+
+@pytest.mark.parametrize("kind", FRAMINGS)
+def test_requests_of_ambiguous_length_are_refused(service, kind):
+    """The rest was once answered as another request. Oracle: RFC 9112, sections 2.2, 5.1, 6.1 and 6.3."""
+    version, headers = FRAMINGS[kind]
+    rest = b"0\r\n\r\nGET /version HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with service.raw(b"POST /v1/jobs %s\r\nHost: localhost\r\n%s\r\n%s" % (version, headers, rest)) as connection:
+        answer = all_received(connection)
+    assert answer.startswith(b"HTTP/1.1 400")
+    assert answer.count(b"HTTP/1.1 ") == 1
+    assert b"\r\nCross-Origin-Resource-Policy: same-origin\r\n" in answer
+
+
+@pytest.mark.parametrize("path", ["/", "/v1/jobs", "/static/style.css", "/preview/", "/nothing", "/docs"])
+def test_other_sites_cannot_embed_answers(service, path):
+    """Oracle: the Fetch standard's Cross-Origin-Resource-Policy check."""
+    assert service.http.get(path).headers["cross-origin-resource-policy"] == "same-origin"
+
+
+def test_lines_of_a_header_may_end_without_a_carriage_return(service):
+    """RFC 9112, section 2.2, permits it; the end of the request is then the same for everyone."""
+    head = b"POST /v1/jobs HTTP/1.1\nHost: localhost\nContent-Length: 4\nConnection: close\n\n"
+    with service.raw(head + b"ply\nGET /version HTTP/1.1\r\nHost: localhost\r\n\r\n") as connection:
+        answer = all_received(connection)
+    assert answer.count(b"HTTP/1.1 ") == 1
+    assert answer.startswith(b"HTTP/1.1 422")
+
+
+NAMES = {
+    "filename*=UTF-8''s%C3%BC%C3%9F.ply": "süß.ply",
+    "filename*=utf-8'de'%e2%82%ac.ply": "€.ply",
+    "filename*=iso-8859-1''caf%e9.ply": "café.ply",
+    "filename=\"plain.ply\"; filename*=UTF-8''n%C3%A9.ply": "né.ply",
+    "filename*=UTF-8''n%C3%A9.ply; filename=plain.ply": "né.ply",
+    "filename*=\"UTF-8''quoted.ply\"": "quoted.ply",
+    "FileName* = UTF-8''spaced.ply ": "spaced.ply",
+    # Malformed, or of an encoding that RFC 8187 does not name.
+    "filename*=UTF-8''caf%e9.ply; filename=plain.ply": "plain.ply",
+    "filename*=UTF-8''%zz.ply; filename=plain.ply": "plain.ply",
+    "filename*=UTF-8''a b.ply; filename=plain.ply": "plain.ply",
+    "filename*=UTF-16''a.ply; filename=plain.ply": "plain.ply",
+    "filename*=süß.ply; filename=plain.ply": "plain.ply",
+    "filename*=UTF-8''; filename=plain.ply": "plain.ply",
+    "filename*=UTF-8''%e9.ply": None,
+    # Text in quotes is no parameter.
+    "filename=\"x; filename*=UTF-8''other.ply\"": "x; filename*=UTF-8''other.ply",
+}
+
+
+def file_names(parameters):
+    form = b'--b\r\nContent-Disposition: form-data; name="file"; %s\r\n\r\n\r\n--b--\r\n' % parameters.encode()
+
+    async def chunks():
+        yield form
+
+    async def collect():
+        return [event.filename async for event in parts(BOUNDARY, chunks())]
+
+    return asyncio.run(collect())
+
+
+@pytest.mark.parametrize("given", NAMES)
+def test_extended_file_names(given):
+    """Oracle: RFC 8187 and RFC 6266, section 4.3."""
+    assert file_names(given) == [NAMES[given]]
+
+
+@pytest.mark.parametrize(
+    ("escaped", "name"),
+    [
+        ("..%2F..%2Fetc%2Fpasswd.ply", "passwd"),
+        ("C%3A%5Cscenes%5Ca.ply", "a"),
+        ("a%0D%0AX%3A%201%00.ply", "aX 1"),
+        ("%E2%80%AEylp.a.ply", "ylp.a"),
+        ("%3Cb%3E%22.ply", "b"),
+        ("n" * 300 + ".ply", "n" * 100),
+        ("%2F", "scene"),
+    ],
+)
+def test_extended_file_names_are_harmless(escaped, name):
+    (found,) = file_names(f"filename*=UTF-8''{escaped}")
+    assert scene_name(found) == name
+
+
+def test_two_uploads_at_a_time_are_parsed(tmp_path, monkeypatch):
+    """The headers of sixteen simultaneous uploads once took memory all at once."""
+    running, most, lock = 0, 0, threading.Lock()
+    read = Spool._read_info
+
+    def watched(spool):
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        time.sleep(0.02)
+        try:
+            return read(spool)
+        finally:
+            with lock:
+                running -= 1
+
+    monkeypatch.setattr(Spool, "_read_info", watched)
+
+    async def receive():
+        admission = UnlimitedAdmission()
+        admission.parsing = Admission(ServiceSettings(), None, None, None).parsing
+        await asyncio.gather(*(one(admission, tmp_path / f"{i}.part") for i in range(8)))
+
+    async def one(admission, path):
+        async with Spool(ServiceSettings(), admission, path) as spool:
+            await spool.write(SMALL)
+            assert (await spool.finish()).info.count == 300
+
+    asyncio.run(receive())
+    assert most == 2

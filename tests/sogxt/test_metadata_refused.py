@@ -52,7 +52,7 @@ def test_impossible_meta_json_is_refused(change, sentence):
 
 @pytest.mark.parametrize("data", [b"", b"{", b"\xff\xfe\xfd", b'{"a": ' * 5000, b"NaN", b"[" * 100_000])
 def test_what_is_no_json_is_refused(data):
-    assert refusal({"meta.json": data}) == "meta.json is not readable JSON"
+    assert refusal({"meta.json": data}) == "meta.json is not readable JSON; export the scene again"
 
 
 @pytest.mark.parametrize("data", [b"[]", b"null", b"3", b'"text"', b"1" * 5000])

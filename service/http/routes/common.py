@@ -15,7 +15,7 @@ from ...core.notifier import ended
 from ...core.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemError
 from ...core.schemas import JobStatus
 from ...jobs.container import Owner, Service, ServiceContainer
-from ...jobs.status import QueueEstimator, job_status
+from ...jobs.status import job_status
 
 MAX_WAIT_SECONDS = 30.0
 """Maximum duration of a long poll, shorter than typical idle time-outs of proxies."""
@@ -60,7 +60,7 @@ async def statuses(context: ServiceContainer, *jobs: Job) -> list[JobStatus]:
     """Return the statuses of jobs."""
 
     def read() -> list[JobStatus]:
-        queue = QueueEstimator(context.store, context.settings.workers)
+        queue = context.queue.current()
         return [job_status(job, queue) for job in jobs]
 
     return await run_sync(read)

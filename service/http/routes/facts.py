@@ -98,19 +98,24 @@ async def get_livez() -> Health:
     responses={503: {"model": Health, "description": "A check has failed."}},
 )
 async def get_readyz(context: Service, response: Response) -> Health:
-    """Checks of the worker, the database and the disk; route requests elsewhere while one of them fails."""
+    """Checks of the worker, the database and the disk, at most two seconds old; route requests elsewhere while one of
+    them fails."""
+    health = await context.readiness.health(lambda: _check(context))
+    response.status_code = 200 if health.ready else 503
+    response.headers.update(NO_STORE)
+    return health
+
+
+async def _check(context: ServiceContainer) -> Health:
     found = {
         "worker": context.worker.health_problem(),
         "database": await run_sync(_database_problem, context),
         "disk": await run_sync(_disk_problem, context),
     }
-    ready = not any(found.values())
     checks = {part: text or "ok" for part, text in found.items()}
     if orphaned := await run_sync(context.storage.orphaned_note):
         checks["orphaned"] = orphaned
-    response.status_code = 200 if ready else 503
-    response.headers.update(NO_STORE)
-    return Health(ready=ready, checks=checks)
+    return Health(ready=not any(found.values()), checks=checks)
 
 
 @router.get(

@@ -298,11 +298,10 @@ async def delete_job(context: Service, job: RequestedJob) -> Response:
     """Cancel a job if it has not ended, and remove all its data."""
     await context.worker.cancel(job)
     context.decoder.stop(job.id)
-    gone: dict[str, Any] = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0}
-    await run_sync(lambda: context.store.move(job.number, State.EXPIRED, **gone))
-    if not await run_sync(context.storage.remove_job, job.id):  # first, because a folder without a job would be kept
+    completion = context.worker.completion
+    if not await run_sync(completion.expire, job.number, job.id):  # first, as a folder without a job would be kept
         raise unusable_storage()
-    await run_sync(context.store.forget, job.number)
+    await run_sync(completion.forget, job.number)
     context.notifier.notify(job.id)
     context.notifier.notify(ended(job.id))
     log.info("job %s deleted", job.id)

@@ -35,6 +35,13 @@ async def get_page() -> FileResponse:
     return FileResponse(STATIC / "index.html", headers=REVALIDATE)
 
 
+@router.head("/docs")
+@router.get("/docs")
+async def get_explorer() -> FileResponse:
+    """Return the page that shows the OpenAPI document and sends requests; its script is in ``web_decoder/vendor``."""
+    return FileResponse(STATIC / "docs.html", headers=REVALIDATE)
+
+
 @router.head("/favicon.ico")
 @router.get("/favicon.ico")
 async def get_icon() -> FileResponse:

@@ -27,7 +27,8 @@ import map, which must be inline."""
 
 _JOB = re.compile(r"[0-9a-f]{32}")
 _FILE = re.compile(
-    r"(preview/)?[\w-]+\.(js|css|svg)|vendor/([\w-]+/)+([\w.-]+\.js|LICENSE)|vendor/versions\.json", re.ASCII
+    r"(preview/)?[\w-]+\.(js|css|svg)|vendor/([\w-]+/)+([\w.-]+\.(js|css)|LICENSE|NOTICE)|vendor/versions\.json",
+    re.ASCII,
 )
 """Paths that are served: no tests, no tool settings, and nothing outside the folder."""
 
