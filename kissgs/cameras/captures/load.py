@@ -12,7 +12,7 @@ from kissgs.cameras.captures.colmap import MODEL_FOLDERS, find_colmap, missing_p
 from kissgs.cameras.captures.photos import FoundPhoto, find_photos, searched_folders
 from kissgs.cameras.captures.posed_image import Capture, PosedImage
 from kissgs.cameras.captures.transforms_json import read_split_transforms, read_transforms
-from kissgs.cameras.pixels import PhotoHeader, read_photo_header
+from kissgs.cameras.pixels import PhotoHeader, is_turned, read_photo_header
 from kissgs.cameras.undistort import full_window
 from kissgs.cameras.views import UndistortionSpec, View, Views
 from kissgs.core.array_types import Float32
@@ -164,14 +164,25 @@ def _sizes(posed: PosedImage, photo: _Photo | None, scale: int) -> tuple[tuple[i
         return (width, height), (max(1, round(width / scale)), max(1, round(height / scale)))
     size = (photo.header.width, photo.header.height)
     nominal = (width or size[0] * photo.found.factor, height or size[1] * photo.found.factor)
-    expected = nominal[1] * size[0] / nominal[0]
-    if abs(size[1] - expected) > MAX_ASPECT_ERROR * size[1] + 2:
+    if not _fits(size, nominal):
+        if _fits(size[::-1], nominal) and is_turned(photo.found.path):
+            raise InvalidViewsError(
+                f"{photo.found.path} has {size[0]}x{size[1]} pixels, which its EXIF orientation turns upright, and its "
+                f"camera ({posed.where}) is for {nominal[0]}x{nominal[1]}; orientation is ignored here, so turn the "
+                "pixels of all photographs ('mogrify -auto-orient'), or compute the cameras from them as they are"
+            )
         raise InvalidViewsError(
             f"{photo.found.path} has {size[0]}x{size[1]} pixels, but its camera ({posed.where}) is for "
             f"{nominal[0]}x{nominal[1]}, another aspect ratio; name the folder of the cameras' "
             "photographs (--images of kissgs evaluate, render and bench)"
         )
     return nominal, size
+
+
+def _fits(size: tuple[int, int], nominal: tuple[int, int]) -> bool:
+    """Whether a photograph of this (width, height) may be a scaled copy of one of the nominal size."""
+    expected = nominal[1] * size[0] / nominal[0]
+    return abs(size[1] - expected) <= MAX_ASPECT_ERROR * size[1] + 2
 
 
 def _reduced(size: tuple[int, int], resolution: int) -> tuple[int, int]:

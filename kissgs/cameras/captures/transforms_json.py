@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
-from kissgs.cameras.captures.files import open_file, quoted
+from kissgs.cameras.captures.files import composed, open_file, quoted
 from kissgs.cameras.captures.posed_image import MAX_SIDE, Capture, Intrinsics, PosedImage
 from kissgs.cameras.undistort import Distortion
 from kissgs.core.array_types import Float64
@@ -88,7 +88,7 @@ def read_transforms(path: Path) -> Capture:
     images = _posed_images(path, document)
     splits = _splits(path, document)
     if splits is not None:
-        images = [_with_split(image, splits[image.name]) for image in images if image.name in splits]
+        images = [_with_split(image, splits[key]) for image in images if (key := composed(image.name)) in splits]
     return Capture(tuple(images), path.parent, f"cameras of {path}", _is_synthetic(document))
 
 
@@ -204,15 +204,15 @@ def _rotation(matrix: Float64[np.ndarray, "3 3"], where: str) -> Float64[np.ndar
 
 
 def _splits(path: Path, document: _Transforms) -> dict[str, Literal["train", "test"]] | None:
-    """Return the split of each frame by name; None if the file defines none."""
+    """Return the split of each frame by composed name; None if the file defines none."""
     train, held_out = document.train_filenames, document.test_filenames
     if not held_out and document.val_filenames is not None:
         held_out = document.val_filenames
     if train is None and held_out is None:
         return None
-    all_names = {_normalized(frame.file_path) for frame in document.frames}
+    all_names = _name_set(frame.file_path for frame in document.frames)
     for names, key in ((train, "train_filenames"), (held_out, "test_filenames or val_filenames")):
-        unknown = next((name for name in names or () if _normalized(name) not in all_names), None)
+        unknown = next((name for name in names or () if not _name_set([name]) <= all_names), None)
         if unknown is not None:
             raise InvalidViewsError(
                 f"{path}: {quoted(unknown)} in {key} is not the file_path of a frame; correct the list"
@@ -226,7 +226,7 @@ def _splits(path: Path, document: _Transforms) -> dict[str, Literal["train", "te
 
 
 def _name_set(names: Iterable[str] | None) -> set[str]:
-    return {_normalized(name) for name in names or ()}
+    return {composed(_normalized(name)) for name in names or ()}
 
 
 def _with_split(image: PosedImage, split: Literal["train", "test"]) -> PosedImage:
