@@ -9,6 +9,7 @@ import typer
 
 from kissgs.cli.arguments import (
     ForceOption,
+    ForceViewsOption,
     JsonOption,
     LevelOption,
     MaxGaussiansOption,
@@ -59,6 +60,7 @@ def compact(
             "Default: renderings of the scene.",
         ),
     ] = None,
+    force_views: ForceViewsOption = False,
     preset: Annotated[
         str,
         typer.Option("--preset", "-p", help="fast only prunes; balanced, small and paper also train."),
@@ -124,6 +126,7 @@ def compact(
                 reading=reading,
                 evaluate=evaluate,
                 views=capture,
+                force_views=force_views,
                 checkpoint=sibling(scene, CHECKPOINT) if checkpoint else None,
                 overwrite=force,
                 threads=threads,

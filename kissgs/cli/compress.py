@@ -12,6 +12,7 @@ import typer
 from kissgs.cli.arguments import (
     ContainerOption,
     ForceOption,
+    ForceViewsOption,
     JsonOption,
     LevelOption,
     MaxGaussiansOption,
@@ -87,6 +88,7 @@ def compress(
             "held-out views evaluate. Default: virtual cameras.",
         ),
     ] = None,
+    force_views: ForceViewsOption = False,
     cache: Annotated[
         bool, typer.Option("--cache", help="Cache the sensitivity next to the scene as NAME.sensitivity.npz.")
     ] = False,
@@ -139,6 +141,7 @@ def compress(
         cache=cache,
         evaluate=evaluate,
         views=views,
+        force_views=force_views,
         checkpoint=checkpoint,
         force=force,
         threads=threads,

@@ -122,6 +122,7 @@ def render(
     from kissgs.cameras.captures.camera_json import write_camera
     from kissgs.cameras.render import RenderJob
     from kissgs.cli.console import progress_bar
+    from kissgs.evaluation.capture_fit import in_scene_frame
     from kissgs.io.atomic import refuse_existing
     from kissgs.pipeline.scene_files import load
 
@@ -163,10 +164,13 @@ def render(
                 threads=threads,
                 progress=progress,
             )
+            fitting = None
+            if capture is not None:
+                fitting = in_scene_frame(job.splats, capture, threads=threads, progress=progress)
             if orbit:
                 rendered = job.animation(frames) if animated else job.orbit_sheet(frames)
             else:
-                rendered = job.view_sheet(capture) if sheet else job.single(capture, view)
+                rendered = job.view_sheet(fitting) if sheet else job.single(fitting, view)
             progress("write", 0.0)
             data = _encoded(rendered, suffix, FPS if fps is None else fps, QUALITY if quality is None else quality)
             progress("write", 1.0)

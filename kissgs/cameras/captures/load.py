@@ -11,7 +11,7 @@ import numpy as np
 from kissgs.cameras.captures.colmap import MODEL_FOLDERS, find_colmap, missing_part, read_colmap
 from kissgs.cameras.captures.photos import FoundPhoto, find_photos, searched_folders
 from kissgs.cameras.captures.posed_image import Capture, PosedImage
-from kissgs.cameras.captures.transforms_json import read_split_transforms, read_transforms
+from kissgs.cameras.captures.transforms_json import read_split_transforms, read_transforms, similarities
 from kissgs.cameras.pixels import PhotoHeader, is_turned, read_photo_header
 from kissgs.cameras.undistort import full_window
 from kissgs.cameras.views import UndistortionSpec, View, Views
@@ -49,6 +49,10 @@ def load_views(
     width, so that portrait photographs stay larger. Photographs of a distorting lens are undistorted when their pixels
     are loaded.
 
+    Cameras are in the coordinates of the camera file. nerfstudio trains scenes in others: its
+    ``dataparser_transforms.json``, in the capture's folder or beside the camera file, is read for those who compare the
+    views with a scene (:attr:`Views.similarities`).
+
     If there is no folder of photographs, views have cameras only, without distortion, and ``note`` says so. If only
     some photographs are missing, an error is raised, because results from fewer views could pass for those of all.
 
@@ -68,8 +72,10 @@ def load_views(
         UnsupportedError: a camera has an unsupported model, such as a fisheye.
     """
     _check_arguments(scale, resolution, hold_out)
+    path = Path(path)
     try:
-        capture = _read_capture(Path(path))
+        capture = _read_capture(path)
+        moves = similarities((path if path.is_dir() else path.parent, capture.root), capture.applied)
     except OSError as error:  # even testing for a path fails without permission or if a name is too long
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
     names = [posed.photo for posed in capture.images]
@@ -86,10 +92,11 @@ def load_views(
         views.append((_view(posed, photo, nominal, _reduced(size, limit), background), posed.split))
     train, test = _split(views, hold_out)
     if photos is not None:
-        return Views(train, test, background, f"{capture.source}, photographs of {_folders(photos)}")
+        source = f"{capture.source}, photographs of {_folders(photos)}"
+        return Views(train, test, background, source, similarities=moves)
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
-    return Views(train, test, background, f"{capture.source}, no photographs", note)
+    return Views(train, test, background, f"{capture.source}, no photographs", note, moves)
 
 
 @dataclass(frozen=True, slots=True)

@@ -221,15 +221,15 @@ def test_photographs_of_another_aspect_ratio(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("orientation", "size", "told"), [(6, (80, 120), True), (1, (80, 120), False), (6, (90, 90), False)]
+    ("orientation", "size", "named"), [(6, (80, 120), True), (1, (80, 120), False), (6, (90, 90), False)]
 )
-def test_exif_orientation_is_named_where_it_is_the_reason(tmp_path, orientation, size, told):
+def test_exif_orientation_is_named_where_it_is_the_reason(tmp_path, orientation, size, named):
     """The camera is for 120x80: for what a viewer shows of the photograph, which is stored lying on its side."""
     capture(tmp_path, names=["a.jpg"], size=(120, 80))
     exif = Image.Exif()
     exif[0x0112] = orientation
     Image.new("RGB", size).save(tmp_path / "images" / "a.jpg", exif=exif)
-    assert ("EXIF" in message(tmp_path)) == told
+    assert ("EXIF" in message(tmp_path)) == named
     assert "images/a.jpg" in message(tmp_path)
 
 
