@@ -11,18 +11,42 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
-from PIL import Image
+from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
+from PIL.ExifTags import Base
 
 from kissgs.core.array_types import Float32, UInt8
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
-FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
+FORMATS = tuple(
+    plugin.format
+    for plugin in (
+        JpegImagePlugin.JpegImageFile,
+        PngImagePlugin.PngImageFile,
+        WebPImagePlugin.WebPImageFile,
+        TiffImagePlugin.TiffImageFile,
+        BmpImagePlugin.BmpImageFile,
+    )
+)
 """Formats that are read; Pillow's rarely used readers are kept away from untrusted files."""
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 """Extensions of photographs, in lower case; any other suffix is part of the name."""
+
+MAX_PIXELS = 1 << 28
+"""Maximum number of pixels, 268 million: phones have up to 200 million. Decoded, they take 1.1 GB; a transparent image,
+which is composited, twice that."""
+
+DRAFT_PIXELS = 89_478_485
+"""A JPEG with more pixels is decoded at a half, a quarter or an eighth of its size where the requested one is smaller;
+others are decoded whole. Pillow warns above this number."""
+
+BAND_PIXELS = 1 << 22
+"""Number of pixels that are converted to RGB at a time where that needs numbers larger than a byte."""
+
+_QUARTER_TURNS = (5, 6, 7, 8)  # values of EXIF's orientation that exchange width and height
 
 _ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
 
@@ -53,11 +77,20 @@ def read_photo_header(path: Path) -> PhotoHeader:
     """Read the header of a photograph, without its pixels.
 
     Raises:
-        InvalidViewsError: the file cannot be read, has another format, or has too many pixels for Pillow's limit
-            against decompression bombs (about 90 megapixels).
+        InvalidViewsError: the file cannot be read, has another format, or has more than :data:`MAX_PIXELS`.
     """
     with _opened(path) as image:
         return PhotoHeader(image.width, image.height, _is_transparent(image))
+
+
+def is_turned(path: Path) -> bool:
+    """Whether the photograph's EXIF orientation, which is ignored, exchanges width and height.
+
+    Raises:
+        InvalidViewsError: as for :func:`read_photo_header`; a PNG file is read whole.
+    """
+    with _opened(path) as image:
+        return image.getexif().get(Base.Orientation) in _QUARTER_TURNS
 
 
 def read_photo(
@@ -75,9 +108,12 @@ def read_photo(
     with _opened(path) as image:
         if image.mode in ("I", "F"):
             raise UnsupportedError(f"{path} has 32 bits per channel, which is not supported; save it with 8 or 16")
+        box = None
+        if image.width * image.height > DRAFT_PIXELS and (draft := image.draft(None, (width, height))) is not None:
+            box = draft[1]  # of the whole photograph: the last pixels of a draft may reach beyond it
         rgb = _to_rgb(image, background)
         if rgb.size != (width, height):
-            rgb = rgb.resize((width, height), Image.Resampling.BICUBIC)
+            rgb = rgb.resize((width, height), Image.Resampling.BICUBIC, box)
         return np.array(rgb, dtype=np.uint8)
 
 
@@ -86,10 +122,15 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         if not path.is_file():  # opening a named pipe would wait for its writer
             raise InvalidViewsError(f"cannot read {path}: there is no such file")
-        with Image.open(path, formats=FORMATS) as image:
+        with path.open("rb") as file, _image_of(file) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise InvalidViewsError(
+                    f"{path} has {image.width}x{image.height} pixels; at most {MAX_PIXELS // 10**6} megapixels are "
+                    "read; reduce it"
+                )
             yield image
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise InvalidViewsError(f"{path} has more pixels than can be read safely; reduce it") from error
+    except Image.DecompressionBombError as error:  # Pillow's own limit for WebP
+        raise InvalidViewsError(f"{path} has too many pixels for a photograph of its format; reduce it") from error
     except MemoryError as error:
         raise InvalidViewsError(f"{path} does not fit into memory; reduce it") from error
     except _DAMAGED as error:
@@ -100,17 +141,38 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         ) from error
 
 
+def _image_of(file: BinaryIO) -> Image.Image:
+    """Open an image as ``Image.open`` does, whose limit is too low for phones and warns on standard error."""
+    prefix = file.read(16)
+    for name in FORMATS:
+        factory, accept = Image.OPEN[name]
+        if accept is not None and accept(prefix) is True:
+            file.seek(0)
+            return factory(file, "")
+    raise SyntaxError("of no format that is read")
+
+
 def _is_transparent(image: Image.Image) -> bool:
     return image.mode in _ALPHA_MODES or "transparency" in image.info
 
 
 def _to_rgb(image: Image.Image, background: Float32[np.ndarray, "3"]) -> Image.Image:
-    if image.mode.startswith("I;16"):  # Pillow would clip at 255
-        grey = np.asarray(image).astype(np.uint32)
-        return Image.fromarray(((grey + 128) // 257).astype(np.uint8)).convert("RGB")
-    if not _is_transparent(image):
+    if image.mode == "RGB" and not _is_transparent(image):
+        return image
+    if not (image.mode.startswith("I;16") or _is_transparent(image)):
         return image.convert("RGB")
-    pixels = np.asarray(image.convert("RGBA"))
+    rgb, rows = Image.new("RGB", image.size), max(1, BAND_PIXELS // image.width)
+    for top in range(0, image.height, rows):
+        band = image.crop((0, top, image.width, min(top + rows, image.height)))
+        rgb.paste(Image.fromarray(_band_to_rgb(band, background)), (0, top))
+    return rgb
+
+
+def _band_to_rgb(band: Image.Image, background: Float32[np.ndarray, "3"]) -> UInt8[np.ndarray, "h w 3"]:
+    if band.mode.startswith("I;16"):  # Pillow would clip at 255
+        grey = np.asarray(band).astype(np.uint32)
+        return np.repeat(((grey + 128) // 257).astype(np.uint8)[:, :, None], 3, axis=2)
+    pixels = np.asarray(band.convert("RGBA"))
     opacity = pixels[:, :, 3:] * np.float32(1 / 255)
     mixed = pixels[:, :, :3] * opacity + background * np.float32(255) * (1 - opacity)
-    return Image.fromarray((mixed + np.float32(0.5)).astype(np.uint8))
+    return np.asarray((mixed + np.float32(0.5)).astype(np.uint8))

@@ -111,6 +111,27 @@ class View:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Similarity:
+    """A change of world coordinates that keeps shapes: a rotation, a translation and a scale.
+
+    Attributes:
+        source: the file or field that has it, for messages.
+        matrix: ``(4, 4)`` float64, from the old coordinates to the new ones.
+    """
+
+    source: str
+    matrix: Float64[np.ndarray, "4 4"]
+
+    def moved(self, view: View) -> View:
+        """Return the view in the new coordinates; lengths along its camera's axes change by the scale."""
+        scale = np.cbrt(np.linalg.det(self.matrix[:3, :3]))
+        viewmat = view.camera.viewmat @ np.linalg.inv(self.matrix)
+        viewmat[:3] *= scale
+        target = None if view.target is None else self.matrix[:3, :3] @ view.target + self.matrix[:3, 3]
+        return replace(view, camera=replace(view.camera, viewmat=viewmat), target=target)
+
+
 TargetSource = Literal["photos", "cameras", "scene"]
 """Source of training targets: a capture's photographs; renderings of the original scene from the capture's cameras; or
 renderings from virtual cameras."""
@@ -126,6 +147,8 @@ class Views:
         background: ``(3,)`` float32 RGB, 0 to 1, behind renderings.
         source: description of the files that were read, for messages.
         note: clause about an unexpected property of the capture, for messages; empty if there is none.
+        similarities: from the cameras' coordinates to others that the scene may have, according to the capture's files;
+            which of them are the scene's, its renderings tell (:func:`kissgs.evaluation.capture_fit.in_scene_frame`).
     """
 
     train: tuple[View, ...]
@@ -133,6 +156,7 @@ class Views:
     background: Float32[np.ndarray, "3"]
     source: str
     note: str = ""
+    similarities: tuple[Similarity, ...] = ()
 
     @property
     def all(self) -> tuple[View, ...]:

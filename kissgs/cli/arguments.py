@@ -80,6 +80,9 @@ ViewsOption = Annotated[
         "Default: virtual cameras.",
     ),
 ]
+ForceViewsOption = Annotated[
+    bool, typer.Option("--force-views", help="Accept --views whose photographs do not show the scene.")
+]
 ScaleOption = Annotated[
     int | None,
     typer.Option(min=1, help="Downscaling factor of the photographs of --views: 4 reads the folder images_4."),

@@ -10,6 +10,7 @@ import typer
 from kissgs.cli.arguments import (
     AntialiasedOption,
     ForceOption,
+    ForceViewsOption,
     JsonOption,
     LevelOption,
     MaxGaussiansOption,
@@ -62,6 +63,7 @@ def compact(
             "Default: renderings of the scene.",
         ),
     ] = None,
+    force_views: ForceViewsOption = False,
     preset: Annotated[
         str,
         typer.Option("--preset", "-p", help="fast only prunes; balanced, small and paper also train."),
@@ -128,6 +130,7 @@ def compact(
                 reading=reading,
                 evaluate=evaluate,
                 views=capture,
+                force_views=force_views,
                 checkpoint=sibling(scene, CHECKPOINT) if checkpoint else None,
                 overwrite=force,
                 threads=threads,

@@ -13,6 +13,7 @@ from kissgs.cli.arguments import (
     AntialiasedOption,
     ContainerOption,
     ForceOption,
+    ForceViewsOption,
     JsonOption,
     LevelOption,
     MaxGaussiansOption,
@@ -90,6 +91,7 @@ def compress(
             "held-out views evaluate. Default: virtual cameras.",
         ),
     ] = None,
+    force_views: ForceViewsOption = False,
     cache: Annotated[
         bool, typer.Option("--cache", help="Cache the sensitivity next to the scene as NAME.sensitivity.npz.")
     ] = False,
@@ -151,6 +153,7 @@ def compress(
         cache=cache,
         evaluate=evaluate,
         views=views,
+        force_views=force_views,
         checkpoint=checkpoint,
         force=force,
         threads=threads,

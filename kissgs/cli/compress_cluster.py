@@ -141,6 +141,7 @@ class ClusterCompression:
             "cache": str(sibling(name, ".sensitivity.npz")) if options.cache else None,
             "evaluate": options.evaluate,
             "views": None if options.views is None else str(options.views.absolute()),
+            "force_views": options.force_views,
             "checkpoint": str(sibling(name, CHECKPOINT)) if options.checkpoint else None,
             "threads": int(requested.cpus),
             "device": options.device,

@@ -47,6 +47,7 @@ def compress_here(options: CompressOptions, capture: Views | None, scene: str, t
             cache=sibling(scene, ".sensitivity.npz") if options.cache else None,
             evaluate=options.evaluate,
             views=capture,
+            force_views=options.force_views,
             checkpoint=sibling(scene, CHECKPOINT) if options.checkpoint else None,
             overwrite=options.force,
             threads=options.threads,

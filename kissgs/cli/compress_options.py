@@ -24,6 +24,7 @@ class CompressOptions:
         cache: whether the sensitivity is kept next to the scene.
         evaluate: whether the result is decoded and evaluated.
         views: path of the capture; None for virtual cameras.
+        force_views: whether a capture whose photographs do not show the scene is accepted.
         checkpoint: whether the state of training is kept next to the scene.
         force: whether existing output files are overwritten.
         threads: number of threads; 0 for one per processor.
@@ -37,6 +38,7 @@ class CompressOptions:
     cache: bool
     evaluate: bool
     views: Path | None
+    force_views: bool
     checkpoint: bool
     force: bool
     threads: int

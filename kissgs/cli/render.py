@@ -126,6 +126,7 @@ def render(
     from kissgs.cameras.captures.camera_json import write_camera
     from kissgs.cameras.render import RenderJob
     from kissgs.cli.console import progress_bar
+    from kissgs.evaluation.capture_fit import in_scene_frame
     from kissgs.io.atomic import refuse_existing
     from kissgs.pipeline.scene_files import load
 
@@ -168,11 +169,14 @@ def render(
                 threads=threads,
                 progress=progress,
             )
+            fitting = None
+            if capture is not None:
+                seen = capture.relative_to(job.splats.origin)
+                fitting = in_scene_frame(job.splats, seen, threads=threads, progress=progress)
             if orbit:
                 rendered = job.animation(frames) if animated else job.orbit_sheet(frames)
             else:
-                seen = None if capture is None else capture.relative_to(job.splats.origin)
-                rendered = job.view_sheet(seen) if sheet else job.single(seen, view)
+                rendered = job.view_sheet(fitting) if sheet else job.single(fitting, view)
             progress("write", 0.0)
             data = _encoded(rendered, suffix, FPS if fps is None else fps, QUALITY if quality is None else quality)
             progress("write", 1.0)

@@ -55,6 +55,7 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
         cache=arguments["cache"],
         evaluate=arguments["evaluate"],
         views=open_views(None if arguments["views"] is None else Path(arguments["views"])),
+        force_views=arguments["force_views"],
         checkpoint=arguments["checkpoint"],
         threads=arguments["threads"],
         device=arguments["device"],

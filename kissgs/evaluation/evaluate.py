@@ -19,6 +19,7 @@ from kissgs.core.origin import with_origin
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
+from kissgs.evaluation.capture_fit import in_scene_frame
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison
 from kissgs.evaluation.visibility import share_shown
 from kissgs.rendering.camera import Camera
@@ -59,7 +60,9 @@ def evaluate(
     Args:
         reference: the original scene; cleaned first, like the candidate.
         candidate: the scene to evaluate, with any number of Gaussians in any order.
-        views: views of a capture. Without photographs, the candidate is compared only with renderings of the reference.
+        views: views of a capture, which are moved into the reference's coordinates if the capture's files say how
+            (:func:`kissgs.evaluation.capture_fit.in_scene_frame`). Without photographs, the candidate is compared only
+            with renderings of the reference.
         split: which of the views to use. If "test" is empty, "train" is used; see :attr:`Evaluation.split`.
         seed: seed of the drawn cameras.
         distance: distance of the drawn cameras from what they look at, in units of that where they were drawn; a
@@ -77,7 +80,10 @@ def evaluate(
     """
     reference, candidate = clean(reference)[0], with_origin(clean(candidate)[0], reference.origin)
     measure = _measure(flip, lpips, device)
-    given = [] if views is None else [_select_split(views.relative_to(reference.origin), split)]
+    if views is not None:
+        _select_split(views, split)  # refused before any work
+        views = in_scene_frame(reference, views.relative_to(reference.origin), threads=threads, progress=progress)
+    given = [] if views is None else [_select_split(views, split)]
     load_kernels(progress)
     drawn = farther(evaluation_views(reference, seed=seed, threads=threads, progress=progress), distance)
     groups = [*given, _select_split(drawn, "all")]
@@ -127,6 +133,7 @@ def compare_images(
         UnsupportedError: see :func:`evaluate`.
     """
     reference, candidate = clean(reference)[0], clean(candidate)[0]
+    views = in_scene_frame(reference, views, threads=threads, progress=progress)
     group = _select_split(views, "test")
     if device == "cpu":
         load_kernels(progress)

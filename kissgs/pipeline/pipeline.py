@@ -81,6 +81,7 @@ def compact(
     reading: ReadOptions = DEFAULT_READ_OPTIONS,
     evaluate: bool = False,
     views: Views | None = None,
+    force_views: bool = False,
     checkpoint: AnyPath | None = None,
     overwrite: bool = False,
     threads: int = 0,
@@ -98,6 +99,7 @@ def compact(
         evaluate: measure PSNR, SSIM, MS-SSIM and bytes after every step, for the report.
         views: capture whose training photographs are the targets, and whose held-out views are for evaluation; by
             default renderings of the scene from virtual cameras.
+        force_views: accept ``views`` whose photographs do not show the scene.
         checkpoint: file in which the state of the training is saved every half minute. An identical call resumes from
             it with an identical result. It is removed once ``destination`` is written.
         overwrite: replace ``destination`` if it exists.
@@ -118,10 +120,12 @@ def compact(
         check_ply(target, overwrite=overwrite)
     clock = StageTimer(progress)
     splats, cleaned, _ = open_scene(source, reading, threads, clock)
+    views = None if views is None else views.relative_to(splats.origin)
+    views, note = _fitting(splats, views, force_views, threads, clock)
     result = compact_scene(
         splats,
         settings.compact,
-        None if views is None else views.relative_to(splats.origin),
+        views,
         evaluate=evaluate,
         checkpoint=Path(checkpoint) if checkpoint is not None else None,
         threads=threads,
@@ -137,7 +141,13 @@ def compact(
         )
         delete_checkpoints(result.checkpoint)
     clock.stop()
-    report = replace(result.report, cleaned=cleaned, cpu_seconds=clock.cpu_seconds, peak_memory=peak_memory())
+    report = replace(
+        result.report,
+        cleaned=cleaned,
+        cpu_seconds=clock.cpu_seconds,
+        peak_memory=peak_memory(),
+        note="; ".join(filter(None, [note, result.report.note])),
+    )
     return replace(result, report=report)
 
 
@@ -152,6 +162,7 @@ def compress(
     cache: AnyPath | None = None,
     evaluate: bool = False,
     views: Views | None = None,
+    force_views: bool = False,
     checkpoint: AnyPath | None = None,
     overwrite: bool = False,
     threads: int = 0,
@@ -180,7 +191,8 @@ def compress(
             of ``views`` if they have any; see :func:`kissgs.evaluate`. The report then has an ``evaluation``.
         views: capture of the scene: its training views give the sensitivity and the training targets, its held-out
             views are for evaluation; by default virtual cameras. Presets without rate-distortion planning use the
-            held-out views only.
+            held-out views only. Where they are used, some of their photographs are compared with the scene first.
+        force_views: accept ``views`` whose photographs do not show the scene.
         checkpoint: checkpoint file of the compaction, see :func:`kissgs.compact`. Fine-tuning has another one beside
             it, with "-finetune" in its name, except in a search for a goal.
         overwrite: replace ``destination`` if it exists.
@@ -209,6 +221,9 @@ def compress(
     views = None if views is None else views.relative_to(original.origin)
     source_count, sh_degree = len(original) + cleaned.removed, original.sh_degree
     keep_all = sensitivity is not None
+    views_note = ""
+    if evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled:
+        views, views_note = _fitting(original, views, force_views, threads, clock)
     plan = work_plan(requested, views, len(original), deadline, keep_all=keep_all, threads=threads)
     settings = plan.settings
     encoding = Encoding(
@@ -260,7 +275,7 @@ def compress(
         finetuning=result.finetuning,
         invisible=encoded.invisible,
         pruned_by_rd=encoded.pruned_by_rd,
-        note="; ".join(filter(None, [*notes, encoded.coarse, encoded.note, result.note, plan.note])),
+        note="; ".join(filter(None, [*notes, views_note, encoded.coarse, encoded.note, result.note, plan.note])),
         clipped_colors=encoded.clipped_colors,
         form_error=encoded.form_error,
         max_quantization_error=encoded.errors,
@@ -275,6 +290,17 @@ def compress(
     order = encoded.order if compacted is None else compacted.index[encoded.order]
     remaining = () if target is not None else tuple(path for path in checkpoints if path is not None)
     return Compressed(encoded.files, order, report, remaining, kind)
+
+
+def _fitting(
+    splats: Splats, views: Views | None, force: bool, threads: int, progress: Progress
+) -> tuple[Views | None, str]:
+    """Return the views in the coordinates of the scene and a note; raise InvalidViewsError if they do not show it."""
+    if views is None:
+        return None, ""
+    from kissgs.evaluation.capture_fit import fitting_views
+
+    return fitting_views(splats, views, force=force, threads=threads, progress=progress)
 
 
 def _check_finetuning(

@@ -38,8 +38,8 @@ class Report:
         cpu_seconds: processor time of all stages, over all threads.
         peak_memory: largest resident size of this process so far, bytes.
         settings: all settings, as used.
-        note: what the user may not expect: more than a fifth of the Gaussians left out, or a target size above the
-            finest container of the scene; empty if there is nothing to say.
+        note: what the user may not expect: more than a fifth of the Gaussians left out, a target size above the finest
+            container of the scene, or a capture that is unlike the scene; empty if there is nothing to say.
         evaluation: comparison of the container's renderings with those of the cleaned input; None unless requested.
     """
 

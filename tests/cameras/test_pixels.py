@@ -124,12 +124,42 @@ def test_headers_of_truncated_photographs_are_still_read(tmp_path):
     assert read_photo_header(path) == PhotoHeader(60, 40, transparent=False)
 
 
-def test_too_many_pixels(tmp_path):
-    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+def png_header(path, width, height):
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     data = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR" + header
-    path = tmp_path / "a.png"
     path.write_bytes(data + struct.pack(">I", zlib.crc32(b"IHDR" + header)) + struct.pack(">I4s", 9, b"IDAT"))
-    assert message(path) == f"{path} has more pixels than can be read safely; reduce it"
+    return path
+
+
+def test_photographs_of_phones_are_read_without_a_warning_and_bombs_refused(tmp_path):
+    """The largest phones have 200 megapixels; a file of a few kilobytes may declare any number."""
+    assert read_photo_header(png_header(tmp_path / "a.png", 16320, 12240)).width == 16320
+    for side in (16385, 60_000):
+        bomb = png_header(tmp_path / "a.png", 16384, side)
+        assert message(bomb) == f"{bomb} has 16384x{side} pixels; at most 268 megapixels are read; reduce it"
+
+
+def test_a_large_jpeg_is_decoded_smaller_at_the_same_place(tmp_path, monkeypatch):
+    """Sides that are no multiples of the factor, so that the last pixels of the draft reach beyond the photograph."""
+    x, y = np.meshgrid(np.arange(1203) / 1203, np.arange(811) / 811)
+    waves = np.stack([np.sin(20 * x), np.cos(14 * y), np.sin(9 * x + 11 * y)], axis=-1)
+    image = Image.fromarray(np.uint8(127.5 + 120 * waves))
+    path = saved(tmp_path, image, "a.jpg", quality=98, subsampling=0)
+    monkeypatch.setattr("kissgs.cameras.pixels.DRAFT_PIXELS", 1203 * 811 - 1)
+    found = read_photo(path, 120, 81, BLACK)
+    expected = np.asarray(image.resize((120, 81), Image.Resampling.BOX))
+    assert np.abs(found.astype(int) - expected).mean() < 1
+
+
+@pytest.mark.parametrize("background", [BLACK, WHITE])
+def test_bands_make_no_difference(tmp_path, monkeypatch, background):
+    alpha = np.arange(24).reshape(4, 6, 1) * 10
+    transparent = saved(tmp_path, Image.fromarray(np.uint8(np.concatenate([COLOUR, alpha], axis=2))))
+    grey = saved(tmp_path, Image.fromarray(GREY.astype(np.uint16) * 257), "b.png")
+    whole = [read_photo(path, 6, 4, background) for path in (transparent, grey)]
+    monkeypatch.setattr("kissgs.cameras.pixels.BAND_PIXELS", 18)
+    for path, expected in zip((transparent, grey), whole, strict=True):
+        np.testing.assert_array_equal(read_photo(path, 6, 4, background), expected)
 
 
 def test_pixels_of_32_bits(tmp_path):

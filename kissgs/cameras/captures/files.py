@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,3 +33,8 @@ def open_file(path: Path) -> Iterator[tuple[io.BufferedReader, int]]:
 def quoted(text: str) -> str:
     """Return ``text`` in quotes, with unprintable characters escaped, of at most 80 characters."""
     return repr(text if len(text) <= 80 else text[:79] + "…")
+
+
+def composed(name: str) -> str:
+    """Return a name in the composed Unicode form (NFC), to compare it: archives of macOS have decomposed names."""
+    return unicodedata.normalize("NFC", name)

@@ -11,8 +11,8 @@ import numpy as np
 from kissgs.cameras.captures.colmap import MODEL_FOLDERS, find_colmap, missing_part, read_colmap
 from kissgs.cameras.captures.photos import FoundPhoto, find_photos, searched_folders
 from kissgs.cameras.captures.posed_image import Capture, PosedImage
-from kissgs.cameras.captures.transforms_json import read_split_transforms, read_transforms
-from kissgs.cameras.pixels import PhotoHeader, read_photo_header
+from kissgs.cameras.captures.transforms_json import read_split_transforms, read_transforms, similarities
+from kissgs.cameras.pixels import PhotoHeader, is_turned, read_photo_header
 from kissgs.cameras.undistort import full_window
 from kissgs.cameras.views import UndistortionSpec, View, Views
 from kissgs.core.array_types import Float32
@@ -49,6 +49,10 @@ def load_views(
     width, so that portrait photographs stay larger. Photographs of a distorting lens are undistorted when their pixels
     are loaded.
 
+    Cameras are in the coordinates of the camera file. nerfstudio trains scenes in others: its
+    ``dataparser_transforms.json``, in the capture's folder or beside the camera file, is read for those who compare the
+    views with a scene (:attr:`Views.similarities`).
+
     If there is no folder of photographs, views have cameras only, without distortion, and ``note`` says so. If only
     some photographs are missing, an error is raised, because results from fewer views could pass for those of all.
 
@@ -68,8 +72,10 @@ def load_views(
         UnsupportedError: a camera has an unsupported model, such as a fisheye.
     """
     _check_arguments(scale, resolution, hold_out)
+    path = Path(path)
     try:
-        capture = _read_capture(Path(path))
+        capture = _read_capture(path)
+        moves = similarities((path if path.is_dir() else path.parent, capture.root), capture.applied)
     except OSError as error:  # even testing for a path fails without permission or if a name is too long
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
     names = [posed.photo for posed in capture.images]
@@ -86,10 +92,11 @@ def load_views(
         views.append((_view(posed, photo, nominal, _reduced(size, limit), background), posed.split))
     train, test = _split(views, hold_out)
     if photos is not None:
-        return Views(train, test, background, f"{capture.source}, photographs of {_folders(photos)}")
+        source = f"{capture.source}, photographs of {_folders(photos)}"
+        return Views(train, test, background, source, similarities=moves)
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
-    return Views(train, test, background, f"{capture.source}, no photographs", note)
+    return Views(train, test, background, f"{capture.source}, no photographs", note, moves)
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,14 +171,25 @@ def _sizes(posed: PosedImage, photo: _Photo | None, scale: int) -> tuple[tuple[i
         return (width, height), (max(1, round(width / scale)), max(1, round(height / scale)))
     size = (photo.header.width, photo.header.height)
     nominal = (width or size[0] * photo.found.factor, height or size[1] * photo.found.factor)
-    expected = nominal[1] * size[0] / nominal[0]
-    if abs(size[1] - expected) > MAX_ASPECT_ERROR * size[1] + 2:
+    if not _fits(size, nominal):
+        if _fits(size[::-1], nominal) and is_turned(photo.found.path):
+            raise InvalidViewsError(
+                f"{photo.found.path} has {size[0]}x{size[1]} pixels, which its EXIF orientation turns upright, and its "
+                f"camera ({posed.where}) is for {nominal[0]}x{nominal[1]}; orientation is ignored here, so turn the "
+                "pixels of all photographs ('mogrify -auto-orient'), or compute the cameras from them as they are"
+            )
         raise InvalidViewsError(
             f"{photo.found.path} has {size[0]}x{size[1]} pixels, but its camera ({posed.where}) is for "
             f"{nominal[0]}x{nominal[1]}, another aspect ratio; name the folder of the cameras' "
             "photographs (--images of kissgs evaluate, render and bench)"
         )
     return nominal, size
+
+
+def _fits(size: tuple[int, int], nominal: tuple[int, int]) -> bool:
+    """Whether a photograph of this (width, height) may be a scaled copy of one of the nominal size."""
+    expected = nominal[1] * size[0] / nominal[0]
+    return abs(size[1] - expected) <= MAX_ASPECT_ERROR * size[1] + 2
 
 
 def _reduced(size: tuple[int, int], resolution: int) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from kissgs.cameras.captures.files import quoted
+from kissgs.cameras.captures.files import composed, quoted
 from kissgs.cameras.pixels import EXTENSIONS
 from kissgs.core.errors import InvalidViewsError
 
@@ -66,8 +66,9 @@ def find_photos(
 
     The default is the full-size folder, else that of scale 4, at which the protocol of 3DGS trains outdoor scenes, else
     the largest; ``input`` if there is no ``images`` of any scale. If no file has the exact name, one with another
-    extension or case is accepted. An absolute path that does not exist is searched for in the capture's folder: first
-    in a folder with the name of the path's own folder, then in ``images``.
+    Unicode form, extension or case is accepted; a folder may have another Unicode form, too. An absolute path that does
+    not exist is searched for in the capture's folder: first in a folder with the name of the path's own folder, then in
+    ``images``.
 
     Args:
         names: paths of photographs, relative to ``root`` or absolute, with or without extension.
@@ -88,7 +89,7 @@ def find_photos(
     if images is None:
         searched = [_search_folders(name, root, scale, listing) for name in names]
     else:
-        folder = _named_folder(images, root)
+        folder = _named_folder(images, root, listing)
         searched = [[_within(folder, name)] for name in names]
     found = [listing.find_first(folders) for folders in searched]
     missing = [i for i, photo in enumerate(found) if photo is None]
@@ -131,18 +132,33 @@ class _FolderListing:
     """Files of folders; each folder is read once."""
 
     def __init__(self) -> None:
-        self._listings: dict[Path, tuple[set[str], dict[str, list[str]]]] = {}
+        self._listings: dict[Path, tuple[dict[str, str], dict[str, list[str]]]] = {}
         self._variants: dict[Path, dict[int, Path]] = {}
+        self._folders: dict[Path, Path] = {}
 
     def find_first(self, folders: Iterable[_SearchFolder]) -> FoundPhoto | None:
         """Return the first photograph found, by folder and then by name; None if there is none."""
         for entry in folders:
             for name in entry.names:
                 path = PurePosixPath(name)
-                file = self._match(entry.folder / path.parent, path.name)
+                folder = self.spelled(entry.folder / path.parent)
+                file = self._match(folder, path.name)
                 if file is not None:
-                    return FoundPhoto(entry.folder / path.parent / file, entry.factor, entry.folder)
+                    return FoundPhoto(folder / file, entry.factor, entry.folder)
         return None
+
+    def spelled(self, folder: Path) -> Path:
+        """Return the existing folder of this path, perhaps with names in another Unicode form; else the path itself."""
+        if str(folder).isascii() or folder.parent == folder or _is_folder(folder):
+            return folder
+        if folder not in self._folders:
+            parent, wanted = self.spelled(folder.parent), composed(folder.name)
+            try:
+                found = sorted(path for path in parent.iterdir() if composed(path.name) == wanted and path.is_dir())
+            except (OSError, ValueError):  # there is none, or it cannot be read
+                found = []
+            self._folders[folder] = found[0] if found else folder
+        return self._folders[folder]
 
     def variants(self, folder: Path) -> dict[int, Path]:
         """Return the existing ones of ``folder`` and its scaled copies, by scale.
@@ -150,9 +166,10 @@ class _FolderListing:
         If there is no ``images`` of any scale, ``input`` takes its place with scale 1.
         """
         if folder not in self._variants:
-            found = {1: folder} if _is_folder(folder) else {}
+            whole = self.spelled(folder)
+            found = {1: whole} if _is_folder(whole) else {}
             for factor in range(2, MAX_FACTOR + 1):
-                scaled = folder.parent / f"{folder.name}_{factor}"
+                scaled = self.spelled(folder.parent / f"{folder.name}_{factor}")
                 if _is_folder(scaled):
                     found[factor] = scaled
             if not found and folder.name == IMAGES and _is_folder(folder.parent / INPUT):
@@ -165,29 +182,30 @@ class _FolderListing:
         if folder not in self._listings:
             self._listings[folder] = _list(folder)
         files, stems = self._listings[folder]
+        name = name if name in files else composed(name)
         if name in files:
-            return name
+            return files[name]
 
         def dissimilarity(file: str) -> tuple[bool, bool, str]:
-            return _stem(file) != _stem(name), file.lower() != name.lower(), file
+            return _stem(composed(file)) != _stem(name), composed(file).lower() != name.lower(), file
 
         return min(stems.get(_stem(name).lower(), ()), key=dissimilarity, default=None)
 
 
-def _list(folder: Path) -> tuple[set[str], dict[str, list[str]]]:
-    """Return all files of ``folder``, and its image files by stem in lower case."""
+def _list(folder: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
+    """Return the files of ``folder`` by exact and composed name, and its image files by composed stem in lower case."""
     try:
         with os.scandir(folder) as entries:
-            files = {entry.name for entry in entries if entry.is_file()}
+            names = sorted(entry.name for entry in entries if entry.is_file())
     except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a name with a NUL character
-        files = set()
+        names = []
     except OSError as error:
         raise InvalidViewsError(f"cannot read {folder}: {(error.strerror or str(error)).lower()}") from error
     stems: dict[str, list[str]] = {}
-    for file in files:
+    for file in names:
         if Path(file).suffix.lower() in EXTENSIONS:
-            stems.setdefault(_stem(file).lower(), []).append(file)
-    return files, stems
+            stems.setdefault(_stem(composed(file)).lower(), []).append(file)
+    return {**{composed(file): file for file in names}, **{file: file for file in names}}, stems
 
 
 def _stem(name: str) -> str:
@@ -245,8 +263,8 @@ def _suffixes(parts: Sequence[str]) -> tuple[str, ...]:
     return tuple("/".join(parts[i:]) for i in range(len(parts)))
 
 
-def _named_folder(images: Path, root: Path) -> Path:
-    for folder in (images, root / images):
+def _named_folder(images: Path, root: Path, listing: _FolderListing) -> Path:
+    for folder in (listing.spelled(images), listing.spelled(root / images)):
         if _is_folder(folder):
             return folder
     raise InvalidViewsError(f"there is neither a folder {images} nor {root / images}; check --images")

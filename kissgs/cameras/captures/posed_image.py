@@ -86,12 +86,15 @@ class Capture:
         root: folder that paths of photographs are relative to.
         source: description of the files that were read, for messages.
         white: whether transparent pixels are composited over white.
+        applied: ``(4, 4)`` transform, rotation and translation, from the coordinates of a former model to those of
+            the poses; None if there was none.
     """
 
     images: tuple[PosedImage, ...]
     root: Path
     source: str
     white: bool = False
+    applied: Float64[np.ndarray, "4 4"] | None = None
 
 
 def _focal(length: float | None, angle: float | None, side: int) -> float | None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from kissgs.cameras.captures.camera_json import read_cameras
-from kissgs.cameras.captures.files import quoted
+from kissgs.cameras.captures.files import composed, quoted
 from kissgs.cameras.views import View
 from kissgs.core.errors import InvalidViewsError
 
@@ -51,13 +51,18 @@ def pick_view(views: Sequence[View], which: str, source: str) -> View:
             raise InvalidViewsError(f"there is no view {which} in {source}; numbers go from 0 to {len(views) - 1}")
         return views[int(which)]
     if not found:
-        found = [view for view in views if which in (PurePosixPath(view.name).name, PurePosixPath(view.name).stem)]
+        found = [view for view in views if composed(which) in _names(view)]
     if len(found) == 1:
         return found[0]
     if found:
         raise InvalidViewsError(f"{len(found)} views in {source} have the name {quoted(which)}; give the number of one")
     first, last = views[0].name, views[-1].name
     raise InvalidViewsError(f"there is no view {quoted(which)} in {source}; the first is {first}, the last {last}")
+
+
+def _names(view: View) -> tuple[str, str, str]:
+    path = PurePosixPath(composed(view.name))
+    return str(path), path.name, path.stem
 
 
 def _split(which: str) -> tuple[str, str] | None:

@@ -2,8 +2,9 @@
 
 Poses in these files go from camera to world, with OpenGL's axes (z backward, y up); they are converted to world to
 camera, with z forward and y down. World coordinates are those of the file: instant-ngp's ``scale`` and ``offset`` are
-not applied, and nerfstudio's ``applied_transform``, with which it converted a COLMAP model, is not undone. Gaussians
-trained on that COLMAP model have other coordinates; for them, use the model.
+not applied. Scenes may have others: those of the COLMAP model from which nerfstudio converted the poses by
+``applied_transform``, or those in which nerfstudio trained, by ``dataparser_transforms.json``. :func:`similarities`
+returns these.
 """
 
 from __future__ import annotations
@@ -13,14 +14,15 @@ import dataclasses
 import math
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
-from kissgs.cameras.captures.files import open_file, quoted
+from kissgs.cameras.captures.files import composed, open_file, quoted
 from kissgs.cameras.captures.posed_image import MAX_SIDE, Capture, Intrinsics, PosedImage
 from kissgs.cameras.undistort import Distortion
+from kissgs.cameras.views import Similarity
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
@@ -30,6 +32,9 @@ MAX_JSON_BYTES = 1 << 28
 MAX_SKEW = 0.01
 """Maximum relative difference between the singular values of a rotation matrix, to accept rounded numbers."""
 
+DATAPARSER_TRANSFORMS = "dataparser_transforms.json"
+"""File of nerfstudio's trainer: from coordinates of the COLMAP model, else of ``transforms.json``, to the scene's."""
+
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 """Supported values of ``camera_model``; all given distortion coefficients apply, whatever the value."""
 
@@ -37,6 +42,8 @@ _Side = Annotated[FiniteFloat, Field(ge=1, le=MAX_SIDE)]
 _Length = Annotated[FiniteFloat, Field(gt=0)]
 _Angle = Annotated[FiniteFloat, Field(gt=0, lt=math.pi)]
 _Row = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
+_Matrix = Annotated[list[_Row], Field(min_length=3, max_length=4)]
+_Document = TypeVar("_Document", bound=BaseModel)
 
 
 class _Intrinsics(BaseModel):
@@ -64,7 +71,7 @@ class _Intrinsics(BaseModel):
 
 class _Frame(_Intrinsics):
     file_path: str
-    transform_matrix: Annotated[list[_Row], Field(min_length=3, max_length=4)]
+    transform_matrix: _Matrix
 
 
 class _Transforms(_Intrinsics):
@@ -72,6 +79,12 @@ class _Transforms(_Intrinsics):
     train_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
+    applied_transform: Any = None  # another program's invalid one is no reason to refuse the file
+
+
+class _DataparserTransforms(BaseModel):
+    transform: _Matrix
+    scale: _Length = 1.0
 
 
 def read_transforms(path: Path) -> Capture:
@@ -85,12 +98,12 @@ def read_transforms(path: Path) -> Capture:
         InvalidViewsError: the file cannot be read or is not JSON, or fields are missing, invalid or contradictory.
         UnsupportedError: a camera is a fisheye or has a distortion coefficient k4.
     """
-    document = _read(path)
+    document = _read(path, _Transforms)
     images = _posed_images(path, document)
     splits = _splits(path, document)
     if splits is not None:
-        images = [_with_split(image, splits[image.name]) for image in images if image.name in splits]
-    return Capture(tuple(images), path.parent, f"cameras of {path}", _is_synthetic(document))
+        images = [_with_split(image, splits[key]) for image in images if (key := composed(image.name)) in splits]
+    return Capture(tuple(images), path.parent, f"cameras of {path}", _is_synthetic(document), _applied(path, document))
 
 
 def read_split_transforms(folder: Path) -> Capture:
@@ -103,16 +116,58 @@ def read_split_transforms(folder: Path) -> Capture:
     train_path = folder / "transforms_train.json"
     tests = [folder / f"transforms_{name}.json" for name in ("test", "val")]
     test_path = next((path for path in tests if path.is_file()), None)
-    document = _read(train_path)
+    document = _read(train_path, _Transforms)
     train, white = _posed_images(train_path, document), _is_synthetic(document)
     if test_path is None:
         return Capture(tuple(train), folder, f"cameras of {train_path}", white)
-    test = _posed_images(test_path, _read(test_path))
+    test = _posed_images(test_path, _read(test_path, _Transforms))
     images = [*(_with_split(image, "train") for image in train), *(_with_split(image, "test") for image in test)]
     return Capture(tuple(images), folder, f"cameras of {train_path} and {test_path.name}", white)
 
 
-def _read(path: Path) -> _Transforms:
+def similarities(folders: Iterable[Path], applied: Float64[np.ndarray, "4 4"] | None) -> tuple[Similarity, ...]:
+    """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have.
+
+    Args:
+        folders: folders that may have nerfstudio's ``dataparser_transforms.json``, which it writes beside its
+            checkpoints; the first that has one counts.
+        applied: the capture's ``applied_transform``, see :class:`kissgs.cameras.captures.posed_image.Capture`.
+
+    Raises:
+        InvalidViewsError: the file cannot be read, or is not of nerfstudio's form.
+    """
+    found = []
+    path = next((path for folder in folders if (path := folder / DATAPARSER_TRANSFORMS).is_file()), None)
+    if path is not None:
+        document = _read(path, _DataparserTransforms)
+        matrix = _similarity(document.transform, f"{path}, transform")
+        matrix[:3] *= document.scale
+        if applied is not None:  # nerfstudio writes the product of both, its oldest versions do not
+            found.append(Similarity(path.name, matrix @ np.linalg.inv(applied)))
+        found.append(Similarity(path.name, matrix))
+    if applied is not None:
+        found.append(Similarity("the inverse of applied_transform", np.linalg.inv(applied)))
+    return tuple(found)
+
+
+def _applied(path: Path, document: _Transforms) -> Float64[np.ndarray, "4 4"] | None:
+    """Return the ``applied_transform``; None if it is missing, invalid or the identity."""
+    try:
+        matrix = _similarity(TypeAdapter(_Matrix).validate_python(document.applied_transform), str(path))
+    except (ValidationError, InvalidViewsError):
+        return None
+    return None if np.allclose(matrix, np.eye(4)) else matrix
+
+
+def _similarity(rows: list[list[float]], where: str) -> Float64[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3] = rows[:3]
+    rotation = _rotation(matrix[:3, :3], where)
+    matrix[:3, :3] = rotation * np.cbrt(np.linalg.det(matrix[:3, :3]))
+    return matrix
+
+
+def _read(path: Path, model: type[_Document]) -> _Document:
     with open_file(path) as (file, size):
         if size > MAX_JSON_BYTES:
             raise InvalidViewsError(
@@ -122,7 +177,7 @@ def _read(path: Path) -> _Transforms:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InvalidViewsError(f"{path} is text in UTF-16; save it as UTF-8")
     try:
-        return _Transforms.model_validate_json(data.removeprefix(b"\xef\xbb\xbf"))
+        return model.model_validate_json(data.removeprefix(b"\xef\xbb\xbf"))
     except ValidationError as error:
         problem = error.errors(include_url=False, include_context=False, include_input=False)[0]
         if problem["type"] == "json_invalid":
@@ -184,7 +239,7 @@ def _viewmat(frame: _Frame, where: str) -> Float64[np.ndarray, "4 4"]:
     matrix = np.array(frame.transform_matrix)
     if len(matrix) == 4 and not np.allclose(matrix[3], (0, 0, 0, 1)):
         raise InvalidViewsError(f"{where}: the last row of transform_matrix is not 0 0 0 1; export it again")
-    rotation = _rotation(matrix[:3, :3], where) * (1, -1, -1)  # flip the camera's y and z axes
+    rotation = _rotation(matrix[:3, :3], f"{where}: transform_matrix") * (1, -1, -1)  # flip the camera's y and z axes
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation.T
     with np.errstate(all="ignore"):  # Camera rejects values that overflow
@@ -197,25 +252,23 @@ def _rotation(matrix: Float64[np.ndarray, "3 3"], where: str) -> Float64[np.ndar
     largest = np.abs(matrix).max()
     left, lengths, right = np.linalg.svd(matrix / max(largest, np.finfo(np.float64).tiny))
     if largest == 0 or lengths[2] < (1 - MAX_SKEW) * lengths[0]:
-        raise InvalidViewsError(
-            f"{where}: transform_matrix is not a rotation: its axes are skewed or differ in length; export it again"
-        )
+        raise InvalidViewsError(f"{where} is not a rotation: its axes are skewed or differ in length; export it again")
     rotation = left @ right
     if not np.linalg.det(rotation) > 0:
-        raise InvalidViewsError(f"{where}: transform_matrix mirrors the world; export it with a right-handed world")
+        raise InvalidViewsError(f"{where} mirrors the world; export it with a right-handed world")
     return np.asarray(rotation)
 
 
 def _splits(path: Path, document: _Transforms) -> dict[str, Literal["train", "test"]] | None:
-    """Return the split of each frame by name; None if the file defines none."""
+    """Return the split of each frame by composed name; None if the file defines none."""
     train, held_out = document.train_filenames, document.test_filenames
     if not held_out and document.val_filenames is not None:
         held_out = document.val_filenames
     if train is None and held_out is None:
         return None
-    all_names = {_normalized(frame.file_path) for frame in document.frames}
+    all_names = _name_set(frame.file_path for frame in document.frames)
     for names, key in ((train, "train_filenames"), (held_out, "test_filenames or val_filenames")):
-        unknown = next((name for name in names or () if _normalized(name) not in all_names), None)
+        unknown = next((name for name in names or () if not _name_set([name]) <= all_names), None)
         if unknown is not None:
             raise InvalidViewsError(
                 f"{path}: {quoted(unknown)} in {key} is not the file_path of a frame; correct the list"
@@ -229,7 +282,7 @@ def _splits(path: Path, document: _Transforms) -> dict[str, Literal["train", "te
 
 
 def _name_set(names: Iterable[str] | None) -> set[str]:
-    return {_normalized(name) for name in names or ()}
+    return {composed(_normalized(name)) for name in names or ()}
 
 
 def _with_split(image: PosedImage, split: Literal["train", "test"]) -> PosedImage:

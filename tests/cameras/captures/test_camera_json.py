@@ -118,6 +118,8 @@ def test_selection_by_name_number_and_file_name():
     assert pick_view(views, "b.png", "x").name == pick_view(views, "b", "x").name == "right/b.png"
     assert pick_view(views, "0", "x").name == "1", "a number is an index"
     assert pick_view(views, "1", "x").name == "1", "unless it is a name"
+    decomposed = View("images/u\u0308.png", camera)
+    assert [pick_view([decomposed], which, "x") for which in ("images/ü.png", "ü.png", "ü")] == [decomposed] * 3
     for which, sentence in (
         ("7", "from 0 to 4"),
         ("a", "2 views in x have the name 'a'"),

@@ -220,6 +220,19 @@ def test_photographs_of_another_aspect_ratio(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("orientation", "size", "named"), [(6, (80, 120), True), (1, (80, 120), False), (6, (90, 90), False)]
+)
+def test_exif_orientation_is_named_where_it_is_the_reason(tmp_path, orientation, size, named):
+    """The camera is for 120x80: for what a viewer shows of the photograph, which is stored lying on its side."""
+    capture(tmp_path, names=["a.jpg"], size=(120, 80))
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.new("RGB", size).save(tmp_path / "images" / "a.jpg", exif=exif)
+    assert ("EXIF" in message(tmp_path)) == named
+    assert "images/a.jpg" in message(tmp_path)
+
+
 def test_no_capture(tmp_path):
     folders = "in it or in sparse/0, sparse, colmap/sparse/0"
     assert message(tmp_path) == f"{tmp_path} has no cameras: neither a COLMAP model ({folders}) nor a transforms.json"

@@ -1,6 +1,7 @@
 """Oracle: folders made by hand, and the expected file of each name."""
 
 import os
+import unicodedata
 
 import pytest
 from helpers.examples import examples
@@ -63,6 +64,25 @@ def test_folders_by_scale(tmp_path, folders, scale, expected):
 def test_names_by_stem(tmp_path, existing, name, expected):
     touch(tmp_path, *(f"images/{file}" for file in existing))
     assert found(tmp_path, f"images/{name}") == [f"images/{expected}"]
+
+
+@pytest.mark.parametrize(("written", "stored"), [("NFC", "NFD"), ("NFD", "NFC")])
+@pytest.mark.parametrize("name", ["images/über.jpg", "images/Küche/ß/é.JPEG", "fotós/á/ö.png", "é.jpg"])
+def test_unicode_forms_of_names_and_folders(tmp_path, written, stored, name):
+    """macOS decomposes names in archives; the camera file has them as they were."""
+    root = tmp_path / unicodedata.normalize("NFD", "Möbel")
+    there = unicodedata.normalize(stored, name)
+    touch(root, there)
+    assert found(root, unicodedata.normalize(written, name)) == [there]
+    assert found(root, str(root / unicodedata.normalize(written, name))) == [there]
+    folder = unicodedata.normalize(written, str(there).rpartition("/")[0] or ".")
+    assert found(root, unicodedata.normalize(written, "elsewhere/" + name.rpartition("/")[2]), images=root / folder)
+
+
+def test_the_exact_unicode_form_comes_first(tmp_path):
+    forms = [unicodedata.normalize(form, "images/é.jpg") for form in ("NFC", "NFD")]
+    touch(tmp_path, *forms)
+    assert found(tmp_path, *forms) == forms
 
 
 def test_spellings_of_a_path(tmp_path):

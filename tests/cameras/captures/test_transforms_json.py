@@ -151,6 +151,13 @@ def test_own_split(tmp_path, lists, train, test):
     assert [view.name for view in views.test] == [f"images/{letter}.jpg" for letter in test]
 
 
+def test_unicode_forms_of_names_in_lists(tmp_path):
+    entries = frames(POSES)
+    entries[0]["file_path"] = "images/u\u0308.jpg"
+    write_json(tmp_path / "transforms.json", {**NERFSTUDIO, "frames": entries, "test_filenames": ["images/ü.jpg"]})
+    assert [view.name for view in load_views(tmp_path).test] == ["images/u\u0308.jpg"]
+
+
 @pytest.mark.parametrize(("scale", "noise"), [(3.0, 0.0), (0.01, 0.0), (1.0, 1e-3)])
 def test_rotations_scaled_or_rounded(tmp_path, scale, noise):
     entry = frames(POSES)[0]
