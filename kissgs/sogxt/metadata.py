@@ -107,7 +107,7 @@ class Layout(BaseModel):
     grid_side: Annotated[int, Number] = Field(ge=1, le=MAX_GRID_SIDE)
     codebook_side: Annotated[int, Number] = Field(ge=1, le=MAX_CODEBOOK_SIDE)
     ranges: dict[str, tuple[list[Limit], list[Limit]]]
-    count: int | None = Field(None, ge=0)
+    count: int | None = Field(None, ge=0, le=MAX_GRID_SIDE**2)
     provenance: Provenance | None = None
     crc32: dict[str, Annotated[int, Field(ge=0, lt=1 << 32)]] = Field(default_factory=dict)
     """CRC-32 of each image's pixels (:func:`kissgs.io.webp.pixels_crc32`); in ``meta.json`` only."""
