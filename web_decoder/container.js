@@ -5,6 +5,7 @@ import { collect, openZip } from "./zip.js";
 
 /** @import { Options, Plane, Scene, Task } from "./types.js" */
 /** @typedef {(file: string, limit: number) => Promise<Uint8Array>} Read */
+/** @typedef {(limit: number) => Promise<Uint8Array>} ReadOne */
 /** @typedef {(received: number, total: number) => void} Count */
 
 /**
@@ -23,10 +24,12 @@ import { collect, openZip } from "./zip.js";
  * @property {string} name
  * @property {number} images their usual number
  * @property {new (message: string, options: ErrorOptions) => Error} Failure
- * @property {(json: Uint8Array, maxGaussians: number) => Assembly} assemble checks the metadata
+ * @property {(json: Uint8Array, maxGaussians: number, yaml?: Uint8Array) => Assembly} assemble checks the metadata
  */
 
 export const META = "meta.json";
+/** What decoders in Python read; in a zip it is compared. */
+export const YAML = "container_meta.yaml";
 /** Number of SH coefficients beside `sh0`, by degree. */
 export const COEFFICIENTS = [0, 3, 8, 15];
 export const MAX_SIGNED_LOG = 88.7; // exp() of more is not a float32
@@ -61,12 +64,12 @@ export async function load(source, options, { name, images, Failure, assemble })
   const reportProgress = () => call(() => options.onProgress?.({ ...progress }));
   const pool = options.pool ?? new Pool(options.workers);
   try {
-    const read = await open(source, name, { ...options.request, signal: aborting }, (received, total) => {
+    const [read, yaml] = await open(source, name, { ...options.request, signal: aborting }, (received, total) => {
       progress.received += received;
       progress.total += total;
       reportProgress();
     });
-    const assembly = assemble(await read(META, MAX_META_BYTES), maxGaussians);
+    const assembly = assemble(await read(META, MAX_META_BYTES), maxGaussians, await yaml?.(MAX_META_BYTES));
     const { scene, files, coarse } = assembly;
     progress.planes = files.length;
     /** @type {Promise<Uint8Array>[]} */
@@ -143,13 +146,13 @@ function zipOf(bytes, hint) {
   }
 }
 
-/** @type {(source: Parameters<typeof load>[0], name: string, request: RequestInit, count: Count) => Promise<Read>} */
+/** @type {(source: Parameters<typeof load>[0], name: string, request: RequestInit, count: Count) => Promise<[Read, ReadOne?]>} */
 async function open(source, name, request, count) {
   let hint = "";
   if (typeof source === "string" || source instanceof URL) {
     const url = new URL(source, globalThis.location?.href);
     if (/\/(meta\.json)?$/.test(url.pathname)) {
-      return (file, limit) => download(new URL(file + url.search, url), limit, request, count);
+      return [(file, limit) => download(new URL(file + url.search, url), limit, request, count)];
     }
     source = await download(url, MAX_ZIP_BYTES, request, count);
     hint = " (the address of a folder ends with a slash)";
@@ -158,11 +161,13 @@ async function open(source, name, request, count) {
     count(source.byteLength, source.byteLength);
   }
   const files = zipOf(source instanceof Uint8Array ? source : new Uint8Array(source), hint);
-  return async (file, limit) => {
-    const read = files.get(file.replace(/.*\//, "")); // as in the zip's table, without folders
-    if (!read) throw new Error(`this is no ${name} container: it has no ${file}`);
-    return read(limit);
+  /** @type {Read} */
+  const read = async (file, limit) => {
+    const one = files.get(file.replace(/.*\//, "")); // as in the zip's table, without folders
+    if (!one) throw new Error(`this is no ${name} container: it has no ${file}`);
+    return one(limit);
   };
+  return [read, files.get(YAML)];
 }
 
 /** @type {(url: URL, limit: number, request: RequestInit, count: Count) => Promise<Uint8Array>} */

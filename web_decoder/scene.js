@@ -1,6 +1,6 @@
 /** Conversion of decoded images to the arrays of a scene, see docs/reference/format.md of kissgs. */
 
-import { COEFFICIENTS, MAX_SIGNED_LOG, META, parseMeta, positionOf } from "./container.js";
+import { COEFFICIENTS, MAX_SIGNED_LOG, META, parseMeta, positionOf, YAML } from "./container.js";
 import { crc32 } from "./zip.js";
 
 /** @import { Attribute, Plane, Scene } from "./types.js" */
@@ -84,6 +84,41 @@ const valuesOf = ([lowest, highest], ranges, levels = 256, finish = (value) => v
     return finish(low + (level / Math.max(highest - lowest, 1)) * (high - low));
   });
 
+/**
+ * Whether a YAML file beside meta.json states the same numbers, by the word before them, as in kissgs/sogxt/metadata_reader.py.
+ * @param {Uint8Array} yaml
+ * @param {Record<string, number>} sizes by word; those of the first two must be there
+ * @param {Record<string, Range[]>} ranges by field
+ */
+function agrees(yaml, sizes, ranges) {
+  /** @type {Record<string, number[]>} */
+  const stated = Object.create(null);
+  let [field, before, key] = ["", "", ""];
+  for (const word of new TextDecoder().decode(yaml).match(/[^ \t\r\n,:"'[\]{}]+/g) ?? []) {
+    if (word.length <= 100 && /^[-+]?((0|[1-9]\d*)(\.\d*)?|\.\d+)(e[-+]?\d+)?$/i.test(word)) {
+      (stated[key] ??= []).push(Number(word));
+    } else if (word !== "-") {
+      if (before === "input_fields") field = word;
+      key = /^m(in|ax)_values$/.test(word) ? `${field} ${word}` : word;
+      stated[key] = [];
+      before = word;
+    }
+  }
+  const same = (/** @type {number[]} */ found, /** @type {number[]} */ wanted) =>
+    found?.length === wanted.length && wanted.every((value, i) => value === found[i]);
+  return (
+    Object.entries(sizes).every(([word, size], i) => same(stated[word] ?? (i < 2 ? [] : [size]), [size])) &&
+    Object.entries(ranges).every(([name, channels]) =>
+      ["min_values", "max_values"].every((end, i) =>
+        same(
+          (stated[`${name} ${end}`] ?? []).map(Math.fround),
+          channels.map((range) => range[i]),
+        ),
+      ),
+    )
+  );
+}
+
 /** A scene that is assembled from decoded images, which may arrive in any order. */
 export class Assembly {
   files = PLANES;
@@ -96,8 +131,9 @@ export class Assembly {
   /**
    * @param {Uint8Array} json
    * @param {number} maxGaussians
+   * @param {Uint8Array} [yaml] a YAML file beside it, which must state the same
    */
-  constructor(json, maxGaussians) {
+  constructor(json, maxGaussians, yaml) {
     const meta = parse(json);
     const { count, gridSide, means, mask, quats, shN, format = "sog-xt", version = 3 } = meta;
     const { layout = "uv-codebook", coeffs = 15, tileRows = TILE_ROWS, tileCols = TILE_COLUMNS } = shN;
@@ -140,8 +176,17 @@ export class Assembly {
     const degree = Math.max(inferred, sh_degree);
     const sizes = [count, gridSide, codebookSide, degree];
     const numbers = new Float64Array([...sizes, ...Object.values(this.ranges).flat(2)]);
-    if (CHECKSUM in meta && crc32(new Uint8Array(numbers.buffer)) !== meta[CHECKSUM]) {
+    const checksum = crc32(new Uint8Array(numbers.buffer));
+    if (CHECKSUM in meta && checksum !== meta[CHECKSUM]) {
       fail(`${META} is damaged: its numbers do not give its ${CHECKSUM}`);
+    }
+    const words = { grid_side: gridSide, f_rest_centroids_side: codebookSide, count, sh_degree: degree };
+    const fields = Object.entries(this.ranges).map(([file, range]) => [
+      file === HIGH ? "means" : file.slice(0, -5),
+      range,
+    ]);
+    if (yaml && !agrees(yaml, { ...words, [CHECKSUM]: checksum }, Object.fromEntries(fields))) {
+      fail(`${YAML} and ${META} do not state the same numbers: one is damaged, or of another scene`);
     }
     /** @type {Scene} */
     this.scene = {

@@ -25,5 +25,5 @@ export const decode = (source, options = {}) =>
     name: "SOG-XT",
     images: PLANES.length,
     Failure: SogxtError,
-    assemble: (json, maxGaussians) => new Assembly(json, maxGaussians),
+    assemble: (json, maxGaussians, yaml) => new Assembly(json, maxGaussians, yaml),
   });

@@ -11,6 +11,7 @@ const LOCAL = 0x04034b50;
 const END_SIZE = 22;
 const MAX_COMMENT = 0xffff;
 const MAX_ENTRIES = 1000;
+const MAX_DIRECTORY = 1 << 21;
 
 /** Four tables, for four bytes at a time. */
 const CRC = new Int32Array(4 * 256);
@@ -49,41 +50,53 @@ export function openZip(bytes) {
     end = end > bytes.length - END_SIZE - MAX_COMMENT ? end - 1 : -1;
   if (end < 0) throw new ZipError("not a zip file, or one that is cut off");
   const count = view.getUint16(end + 10, true);
-  if (count === 0xffff || view.getUint32(end + 16, true) === 0xffffffff)
+  const size = view.getUint32(end + 12, true);
+  const offset = view.getUint32(end + 16, true);
+  if (count === 0xffff || offset === 0xffffffff)
     throw new ZipError("a 64-bit zip, which is not supported: store fewer and smaller files");
   if (count > MAX_ENTRIES) throw new ZipError(`a zip of more than ${MAX_ENTRIES} files`);
   const files = new Map();
-  let at = view.getUint32(end + 16, true);
+  const before = end - size - offset; // data before the zip, such as a self-extractor
+  const damaged = new ZipError("the zip's table of files is damaged");
+  if (before < 0 || size > MAX_DIRECTORY) throw damaged;
+  let at = end - size;
   for (let i = 0; i < count; i++) {
-    if (at + 46 > end || view.getUint32(at, true) !== ENTRY) throw new ZipError("the zip's table of files is damaged");
-    const length = view.getUint16(at + 28, true);
-    const name = new TextDecoder().decode(bytes.subarray(at + 46, at + 46 + length)).replace(/.*[\\/]/s, "");
+    if (at + 46 > end || view.getUint32(at, true) !== ENTRY) throw damaged;
+    const path = bytes.subarray(at + 46, at + 46 + view.getUint16(at + 28, true));
+    const name = new TextDecoder("utf-8", { ignoreBOM: true }).decode(path).replace(/.*[\\/]/s, "");
     const entry = {
       name,
+      path,
       flags: view.getUint16(at + 8, true),
       method: view.getUint16(at + 10, true),
       crc: view.getUint32(at + 16, true),
       packed: view.getUint32(at + 20, true),
       size: view.getUint32(at + 24, true),
-      local: view.getUint32(at + 42, true),
+      local: before + view.getUint32(at + 42, true),
     };
     if (files.has(name)) throw new ZipError(`the zip has ${name} twice`);
     if (name) files.set(name, (/** @type {number} */ limit) => read(bytes, view, entry, limit));
-    at += 46 + length + view.getUint16(at + 30, true) + view.getUint16(at + 32, true);
+    at += 46 + path.length + view.getUint16(at + 30, true) + view.getUint16(at + 32, true);
   }
+  if (at !== end) throw damaged;
   return files;
 }
 
 /**
  * @param {Uint8Array} bytes
  * @param {DataView} view
- * @param {{name: string, flags: number, method: number, crc: number, packed: number, size: number, local: number}} entry
+ * @param {{name: string, path: Uint8Array, flags: number, method: number, crc: number, packed: number, size: number, local: number}} entry
  * @param {number} limit
  */
-async function read(bytes, view, { name, flags, method, crc, packed, size, local }, limit) {
+async function read(bytes, view, { name, path, flags, method, crc, packed, size, local }, limit) {
   if (size > limit) throw new ZipError(`${name} has ${size} bytes, more than the ${limit} that it may have`);
   if (flags & 1) throw new ZipError(`${name} is encrypted`);
-  if (local + 30 > bytes.length || view.getUint32(local, true) !== LOCAL)
+  if (
+    local + 30 + path.length > bytes.length ||
+    view.getUint32(local, true) !== LOCAL ||
+    view.getUint16(local + 26, true) !== path.length ||
+    path.some((byte, i) => byte !== bytes[local + 30 + i])
+  )
     throw new ZipError(`${name} is not where the zip says`);
   const start = local + 30 + view.getUint16(local + 26, true) + view.getUint16(local + 28, true);
   let content = bytes.subarray(start, start + packed);

@@ -22,7 +22,9 @@ def warmup() -> None:
         load_encoder()
         load_rasterizer()
         from kissgs.compaction import merging  # noqa: F401
-        from kissgs.planning import table_fields  # noqa: F401
+        from kissgs.finetuning import kernels  # noqa: F401
+        from kissgs.planning import rdo_kernels, table_kernels  # noqa: F401
+        from kissgs.training import adam_kernels  # noqa: F401
 
         progress("kernels", 1.0)
         try:

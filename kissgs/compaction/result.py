@@ -54,13 +54,13 @@ class CountTrial:
     ssim_decides: bool = False
 
     def summary(self) -> str:
-        """Return the loss that decides in one phrase: "50,000 Gaussians lose 0.12 dB"."""
+        """Return the loss that decides in one phrase: "50,000 Gaussians lose 0.120 dB"."""
         return f"{self.count:,} Gaussians lose {self.loss()}"
 
     def loss(self) -> str:
-        """Return the loss that decides: "0.12 dB" or "0.003 of SSIM"."""
+        """Return the loss that decides: "0.120 dB" or "0.003 of SSIM"."""
         decides = self.ssim_decides and self.ssim_drop is not None
-        return f"{self.ssim_drop:.3g} of SSIM" if decides else f"{self.drop:.2f} dB"
+        return f"{self.ssim_drop:.3g} of SSIM" if decides else f"{self.drop:.3f} dB"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -72,7 +72,7 @@ def html_report(
 ) -> str:
     """Return an evaluation as a self-contained HTML page, with styles, script and images embedded.
 
-    Up to :data:`MAX_VIEWS` views are shown with images, evenly selected, the worst first. The worst
+    The worst :data:`MAX_VIEWS` views are shown with images, the worst first. The worst
     :data:`MAX_SURROUNDINGS` views of the ``surroundings`` follow.
 
     Args:
@@ -121,12 +121,9 @@ def html_report(
 
 
 def select_views(evaluation: Evaluation) -> list[int]:
-    """Return the indices of the views to show: the one with the lowest PSNR first, then others, evenly spread."""
-    count = len(evaluation.views)
-    worst = min(range(count), key=lambda i: evaluation.views[i].ranking_psnr)
-    selected = np.unique(np.rint(np.linspace(0, count - 1, min(count, MAX_VIEWS))).astype(int)).tolist()
-    selected.remove(min(selected, key=lambda i: abs(i - worst)))
-    return [worst, *selected]
+    """Return the indices of the views to show: those of the lowest PSNR, the worst first."""
+    views = evaluation.views
+    return sorted(range(len(views)), key=lambda i: views[i].ranking_psnr)[:MAX_VIEWS]
 
 
 def _sentence(note: str) -> str:

@@ -11,7 +11,7 @@ from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics
 
 def summary_line(evaluation: Evaluation, shown: int) -> str:
     """Return what was compared, as plain text to be escaped; ``shown`` is the number of views with images."""
-    rest = " Their images are below" if shown == len(evaluation.views) else f" Images of {shown} of them are below"
+    rest = " Their images are below" if shown == len(evaluation.views) else f" Images of the worst {shown} are below"
     rest += ", the worst first."
     return f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}.{rest}"
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
-import zipfile
+import struct
+import threading
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 from kissgs.core.errors import InvalidContainerError
 from kissgs.io.atomic import reason_of
@@ -21,7 +23,12 @@ MAX_TREE_ENTRIES = 20_000
 MAX_DIRECTORY_BYTES = 1 << 21
 """Largest list of entries in a zip, which is read whole."""
 
-_ENTRY, _END, _END64 = b"PK\x01\x02", b"PK\x05\x06", b"PK\x06\x07"
+_END, _END64 = b"PK\x05\x06", b"PK\x06\x07"
+_END_SIZE, _MAX_COMMENT = 22, 0xFFFF
+_ENTRY = struct.Struct("<4s4xHH4xIIIHHH8xI")
+_LOCAL = struct.Struct("<4s22xHH")
+_STORED, _DEFLATED = 0, 8
+_BLOCK = 1 << 20
 
 ZIP_MAGICS = (b"PK\x03\x04", _END)
 """First bytes of a zip file, and of an empty one."""
@@ -99,23 +106,24 @@ class ZipSource:
     def __init__(self, file: io.BufferedIOBase, label: str, root: str | None = None) -> None:
         if sniff_format(file) == "ply":
             raise InvalidContainerError(f"{label} is a .ply, not a container; kissgs convert reads both")
-        self._zip, entries = _open_zip(file, label, MAX_TREE_ENTRIES if root else MAX_ZIP_ENTRIES)
+        entries = _read_directory(file, label, MAX_TREE_ENTRIES if root else MAX_ZIP_ENTRIES)
+        self._file, self._lock = file, threading.Lock()
         self._flat = root is None
-        paths = [(entry.filename.replace("\\", "/"), entry) for entry in entries]
         folder = ""
         if root is not None:
-            above = [path[: -len(root)] for path, _ in paths if path.rsplit("/", 1)[-1] == root]
+            above = [entry.path[: -len(root)] for entry in entries if entry.path.rsplit("/", 1)[-1] == root]
             if len(above) != 1:
                 raise InvalidContainerError(f"{label} holds {len(above)} files named {root!r}; one is needed")
             folder = above[0]
-        self._entries: dict[str, zipfile.ZipInfo] = {}
-        for path, entry in paths:
-            if not path.startswith(folder):
+        self._entries: dict[str, _Entry] = {}
+        for entry in entries:
+            if not entry.path.startswith(folder) or entry.path.endswith("/"):
                 continue
-            name = path.rsplit("/", 1)[-1] if self._flat else path[len(folder) :]
+            name = self._key(entry.path) if self._flat else entry.path[len(folder) :]
             if name in self._entries:
                 raise InvalidContainerError(f"{label} holds two files named {name!r}")
-            self._entries[name] = entry
+            if name:
+                self._entries[name] = entry
 
     def names(self) -> frozenset[str]:
         """See :class:`Source`."""
@@ -123,63 +131,117 @@ class ZipSource:
 
     def size(self, name: str) -> int:
         """See :class:`Source`."""
-        return self._entries[self._key(name)].compress_size
+        return self._entries[self._key(name)].packed
 
     def read(self, name: str, limit: int) -> bytes:
         """See :class:`Source`."""
-        entry = self._entries.get(self._key(name))
-        _check(name, entry is not None, entry.file_size if entry else 0, limit)
+        key = self._key(name)
+        _check(name, key in self._entries, self._entries[key].size if key in self._entries else 0, limit)
+        entry = self._entries[key]
+        if entry.method not in (_STORED, _DEFLATED):
+            raise InvalidContainerError(f"{name} has zip compression method {entry.method}; store or deflate it")
         try:
-            with self._zip.open(entry or name) as file:
-                data = file.read(limit + 1)  # never trust the declared size of a deflated entry
-        except Exception as error:
+            return self._content(entry)
+        except (OSError, ValueError, zlib.error) as error:
             raise InvalidContainerError(f"{name} cannot be read from the zip: it is damaged or encrypted") from error
-        _check(name, True, len(data), limit)
+
+    def _content(self, entry: _Entry) -> bytes:
+        magic, name_length, extra_length = _LOCAL.unpack(self._bytes(entry.local, _LOCAL.size))
+        if magic != ZIP_MAGICS[0] or self._bytes(entry.local + _LOCAL.size, name_length) != entry.raw_name:
+            raise ValueError("no such entry there")
+        start = entry.local + _LOCAL.size + name_length + extra_length
+        if entry.method == _DEFLATED:
+            data = self._inflated(start, entry.packed, entry.size)
+        else:
+            data = self._bytes(start, min(entry.packed, entry.size + 1))
+        if entry.flags & 1 or len(data) != entry.size or zlib.crc32(data) != entry.crc:
+            raise ValueError("encrypted, or other bytes than were stored")
+        return data
+
+    def _inflated(self, start: int, packed: int, size: int) -> bytes:
+        """Unpack ``packed`` bytes; stop after ``size`` bytes and one more, since the declared size may be a lie."""
+        inflater, data = zlib.decompressobj(-zlib.MAX_WBITS), bytearray()
+        for at in range(start, start + packed, _BLOCK):
+            data += inflater.decompress(self._bytes(at, min(_BLOCK, start + packed - at)), size + 1 - len(data))
+            if len(data) > size or inflater.unused_data:
+                break
+        if not inflater.eof or inflater.unused_data:
+            raise ValueError("the compressed data ends elsewhere")
+        return bytes(data)
+
+    def _bytes(self, offset: int, count: int) -> bytes:
+        with self._lock:  # several threads read
+            self._file.seek(offset)
+            data = self._file.read(count)
+        if len(data) < count:
+            raise ValueError("the file ends before")
         return data
 
     def _key(self, name: str) -> str:
         return name.rsplit("/", 1)[-1] if self._flat else name
 
 
-def _open_zip(file: io.BufferedIOBase, label: str, most: int) -> tuple[zipfile.ZipFile, list[zipfile.ZipInfo]]:
-    """Open a zip; return it and its files."""
+class _Entry(NamedTuple):
+    """Entry of a zip's directory: its path with slashes, and its fields; ``local`` is the offset in the file."""
+
+    path: str
+    raw_name: bytes
+    flags: int
+    method: int
+    crc: int
+    packed: int
+    size: int
+    local: int
+
+
+def _read_directory(file: io.BufferedIOBase, label: str, most: int) -> list[_Entry]:
+    """Return the entries of a zip, by the rule of docs/reference/format.md, which web_decoder/zip.js follows too."""
+    damaged = InvalidContainerError(f"{label} is not a readable zip file; export or download it again")
     try:
-        _check_directory(file, label, most)
-        archive = zipfile.ZipFile(file)
-        entries = archive.infolist()
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
-        raise InvalidContainerError(f"{label} is not a readable zip file; export or download it again") from error
-    return archive, [entry for entry in entries if entry.filename and not entry.is_dir()]
-
-
-def _check_directory(file: io.BufferedIOBase, label: str, most: int) -> None:
-    """Refuse zips of more than ``most`` entries before any is read, and those of a kind that no reader of SOG knows."""
-    begin = max(0, file.seek(0, io.SEEK_END) - (1 << 16) - 42)
-    file.seek(begin)
-    tail = file.read()
-    at = len(tail) - 22
-    if not (at >= 0 and tail[at:].startswith(_END) and tail.endswith(b"\0\0")):  # with a comment, as zipfile finds it
-        at = tail.rfind(_END)
-    if at >= 0 and len(tail) >= at + 22:
-        size = int.from_bytes(tail[at + 12 : at + 16], "little")
+        length = file.seek(0, io.SEEK_END)
+        file.seek(max(0, length - _END_SIZE - _MAX_COMMENT))
+        tail = file.read()
+        at = tail.rfind(_END, 0, max(0, len(tail) - _END_SIZE + len(_END)))
+        if at < 0:
+            raise damaged
+        count, size, offset = struct.unpack_from("<HII", tail, at + 10)
+        if count == 0xFFFF or offset == 0xFFFFFFFF or tail[max(0, at - 20) : at].startswith(_END64):
+            raise InvalidContainerError(f"{label} is a zip64 file; pack it as an ordinary zip")
+        if count > most:
+            raise InvalidContainerError(f"{label} has {count} entries; a container has 12 files")
         if size > MAX_DIRECTORY_BYTES:
             raise InvalidContainerError(
                 f"{label} has a list of entries above {MAX_DIRECTORY_BYTES} bytes; pack it again"
             )
-        if tail[max(0, at - 20) : at].startswith(_END64):
-            raise InvalidContainerError(f"{label} is a zip64 file; pack it as an ordinary zip")
-        file.seek(max(0, begin + at - size))
-        if (count := file.read(size).count(_ENTRY)) > most:
-            raise InvalidContainerError(f"{label} has {count} entries; a container has 12 files")
-    file.seek(0)
+        start = length - len(tail) + at - size
+        if start < offset:
+            raise damaged
+        file.seek(start)
+        directory = file.read(size)
+    except (OSError, ValueError) as error:
+        raise damaged from error
+    entries, at = [], 0
+    for _ in range(count):
+        if at + _ENTRY.size > size:
+            raise damaged
+        magic, flags, method, crc, packed, unpacked, name, extra, comment, local = _ENTRY.unpack_from(directory, at)
+        raw_name = directory[at + _ENTRY.size : at + _ENTRY.size + name]
+        at += _ENTRY.size + name + extra + comment
+        if magic != b"PK\x01\x02" or at > size:
+            raise damaged
+        path = raw_name.decode("utf-8", "replace").replace("\\", "/")
+        # Data before the zip, such as a self-extractor, moves all entries.
+        entries.append(_Entry(path, raw_name, flags, method, crc, packed, unpacked, start - offset + local))
+    if at != size:
+        raise damaged
+    return entries
 
 
 def zip_names(file: io.BufferedIOBase) -> list[str]:
     """Return the names of all entries of a zip, folders included; none if it cannot be read."""
     try:
-        _check_directory(file, "the file", MAX_TREE_ENTRIES)
-        return zipfile.ZipFile(file).namelist()
-    except (InvalidContainerError, zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError):
+        return [entry.path for entry in _read_directory(file, "the file", MAX_TREE_ENTRIES)]
+    except InvalidContainerError:
         return []
 
 
@@ -201,7 +263,7 @@ def sniff_format(file: io.BufferedIOBase) -> Literal["ply", "zip"] | None:
     file.seek(0)
     if head[:3] == b"ply" and head[3:].isspace():
         return "ply"
-    return "zip" if head in ZIP_MAGICS or zipfile.is_zipfile(file) else None
+    return "zip" if head in ZIP_MAGICS or zip_names(file) else None
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from kissgs.core.signed_log import signed_exp
 from kissgs.io.packed_files import Source, open_source
 from kissgs.pipeline.container_facts import Facts
 from kissgs.sogxt.metadata import CHANNELS, Layout
-from kissgs.sogxt.metadata_reader import read_layout
+from kissgs.sogxt.metadata_reader import read_layout, read_provenance
 from kissgs.sogxt.names import FILES, PLANES
 
 NAMES = {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
@@ -26,14 +26,13 @@ def sogxt_facts(path: Path) -> Facts:
         KissgsError: the container is damaged or incomplete.
     """
     with open_source(path) as files:
-        layout = read_layout(files)
+        layout, made = read_layout(files), read_provenance(files)
         present = files.names()
         missing = [name for name in PLANES if name not in present]
         if missing:
             raise InvalidContainerError(f"{path} is incomplete: missing {', '.join(missing)}")
         parts = {name: files.size(name) for name in FILES if name in present}
         count = layout.count if layout.count is not None else _count_mask(files, layout)
-    made = layout.provenance
     return Facts(
         count=count,
         sh_degree=layout.sh_degree,

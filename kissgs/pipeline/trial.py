@@ -26,6 +26,7 @@ class Trial:
         drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.psnr_loss.drop_of`).
         ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.psnr_loss.ssim_drop_of`); None where that is
             no goal.
+        against: what ``drop`` is a loss against: "photos", or "renderings", from which it is estimated.
         worst: PSNR of the worst view, decibels.
         fifth_percentile: fifth percentile of the views' PSNR, decibels.
     """
@@ -38,6 +39,7 @@ class Trial:
     ssim_drop: float | None = None
     worst: float | None = None
     fifth_percentile: float | None = None
+    against: str | None = None
 
     def with_evaluation(self, evaluation: Evaluation, *, ssim: bool = False) -> Trial:
         """Return a copy with the figures of an evaluation, also those of SSIM if requested."""
@@ -50,18 +52,20 @@ class Trial:
             ssim_drop=ssim_drop_of(evaluation) if ssim else None,
             worst=worst,
             fifth_percentile=fifth,
+            against=evaluation.against,
         )
 
     def summary(self) -> str:
-        """Return size and quality in one phrase: "812 kB at 41.20 dB, drop 0.12 dB, worst view 35.1 dB"."""
+        """Return size and quality in one phrase: "812 kB at 41.20 dB, drop 0.120 dB, worst view 35.1 dB"."""
         quality = self.quality()
         return f"{self.bytes / 1000:,.0f} kB{quality and f' at {quality}'}"
 
     def quality(self) -> str:
         """Return the figures of quality in one phrase, empty where the goal is a size."""
+        against = {"photos": " to photographs", "renderings": " by its renderings"}.get(self.against or "", "")
         parts = [
             None if self.psnr is None else f"{self.psnr:.2f} dB",
-            None if self.drop is None else f"drop {self.drop:.2f} dB",
+            None if self.drop is None else f"drop {self.drop:.3f} dB{against}",
             None if self.ssim_drop is None else f"SSIM drop {self.ssim_drop:.3g}",
             None if self.worst is None else f"worst view {self.worst:.1f} dB",
         ]

@@ -111,7 +111,7 @@ class Layout(BaseModel):
     grid_side: Annotated[int, Number] = Field(ge=1, le=MAX_GRID_SIDE)
     codebook_side: Annotated[int, Number] = Field(ge=1, le=MAX_CODEBOOK_SIDE)
     ranges: dict[str, tuple[list[Limit], list[Limit]]]
-    count: int | None = Field(None, ge=0)
+    count: int | None = Field(None, ge=0, le=MAX_GRID_SIDE**2)
     provenance: Provenance | None = None
     origin: Origin = WORLD
     model: str | None = None

@@ -1,8 +1,10 @@
-"""Reading of a container's metadata: the YAML if it exists, else ``meta.json``. Unknown keys are ignored."""
+"""Reading of a container's metadata: ``meta.json`` if it exists, else the YAML. Unknown keys are ignored."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import math
+import re
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,17 +16,36 @@ from kissgs.core.origin import read_origin
 from kissgs.io.container_names import LEVELS_NAME, LOD_NAME
 from kissgs.io.json_files import parse_json
 from kissgs.io.packed_files import Source
-from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout
+from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout, Provenance
 from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME, YAML_NAME
 
 MAX_METADATA_BYTES = 1 << 20
 """Largest size of a metadata file, bytes; kissgs writes about 4 kB each."""
 
+MAX_YAML_EVENTS = 20_000
+"""Largest number of values, and beginnings and ends of lists and mappings, of the YAML; kissgs writes about 500."""
+
 MAX_YAML_DEPTH = 50
-"""Largest nesting; kissgs writes 6 levels. libyaml composes recursively, and Python's limit does not stop it."""
+"""Largest nesting; kissgs writes 6 levels."""
 
 MAX_YAML_ALIASES = 20
-"""Largest number of aliases: dumpers write one if two fields share a list; thousands would take hours to expand."""
+"""Largest number of aliases: dumpers write one if two fields share a list; thousands would take long to go through."""
+
+MAX_NUMBER_LENGTH = 100
+"""Largest number of characters of a number of the YAML; kissgs writes up to 25. Longer ones are text."""
+
+_CONSTANTS: dict[str, float | bool | None] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    ".inf": math.inf,
+    "-.inf": -math.inf,
+    ".nan": math.nan,
+}
+
+_NUMBER = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
+
+_WORD = re.compile(r"""[^ \t\r\n,:"'\[\]{}]+""")
 
 MISSING = object()
 """Placeholder for a missing checksum: other encoders and early versions of kissgs write none."""
@@ -41,14 +62,33 @@ def read_layout(source: Source) -> Layout:
         UnsupportedError: the images are not WebP, or ``meta.json`` is of another format or version.
     """
     names = source.names()
-    name = next((name for name in (YAML_NAME, JSON_NAME) if name in names), None)
-    if name is None:
-        raise InvalidContainerError(
-            f"this is no container: it has neither {YAML_NAME} nor {JSON_NAME}, and no {LOD_NAME} or {LEVELS_NAME} of "
-            "a streamed scene; name the folder or the zip that has one"
-        )
-    read = _from_yaml if name == YAML_NAME else _from_json
-    raw = read(source.read(name, MAX_METADATA_BYTES))
+    if JSON_NAME in names:
+        layout = _layout_of(_from_json(source.read(JSON_NAME, MAX_METADATA_BYTES)), JSON_NAME)
+        if YAML_NAME in names:
+            _compare(source.read(YAML_NAME, MAX_METADATA_BYTES), layout)
+        return layout
+    if YAML_NAME in names:
+        return _layout_of(_from_yaml(source.read(YAML_NAME, MAX_METADATA_BYTES)), YAML_NAME)
+    raise InvalidContainerError(
+        f"this is no container: it has neither {YAML_NAME} nor {JSON_NAME}, and no {LOD_NAME} or {LEVELS_NAME} of "
+        "a streamed scene; name the folder or the zip that has one"
+    )
+
+
+def read_provenance(source: Source) -> Provenance | None:
+    """Return what kissgs recorded about the encoding, of which ``meta.json`` has a part; None for other encoders.
+
+    Raises:
+        InvalidContainerError: the metadata is missing, damaged or invalid.
+        UnsupportedError: see :func:`read_layout`.
+    """
+    if YAML_NAME not in source.names():
+        return read_layout(source).provenance
+    return _layout_of(_from_yaml(source.read(YAML_NAME, MAX_METADATA_BYTES)), YAML_NAME).provenance
+
+
+def _layout_of(raw: dict[str, Any], name: str) -> Layout:
+    """Check the fields of :class:`Layout` from the file ``name``."""
     checksum = raw.pop(CHECKSUM)
     try:
         # Some YAML dumpers write numbers as text, so that is accepted; in JSON it is refused, as in browsers.
@@ -59,6 +99,37 @@ def read_layout(source: Source) -> Layout:
     if checksum is not MISSING and checksum != layout.checksum:
         raise InvalidContainerError(f"{name} is damaged: its numbers do not give its {CHECKSUM}; copy it again")
     return layout
+
+
+def _compare(data: bytes, layout: Layout) -> None:
+    """Refuse a YAML file whose numbers are not those of ``meta.json``, as ``web_decoder/scene.js`` does.
+
+    Numbers are compared by the word before them, so that browsers need no YAML reader.
+    """
+    stated: dict[str, list[float]] = {}
+    field = before = key = ""
+    for word in _WORD.findall(data.decode("utf-8-sig", "replace")):
+        if len(word) <= MAX_NUMBER_LENGTH and _NUMBER.fullmatch(word):
+            stated.setdefault(key, []).append(float(word))
+        elif word != "-":
+            field = word if before == "input_fields" else field
+            key = f"{field} {word}" if word in ("min_values", "max_values") else word
+            stated[key] = []
+            before = word
+    needed = {"grid_side": [layout.grid_side], "f_rest_centroids_side": [layout.codebook_side]}
+    optional = {"count": [layout.count], "sh_degree": [layout.sh_degree], CHECKSUM: [layout.checksum]}
+    same = all(stated.get(key) == value for key, value in needed.items())
+    same = same and all(stated.get(key, value) == value for key, value in optional.items())
+    with np.errstate(over="ignore"):
+        for field in CHANNELS:
+            for end, values in zip(("min_values", "max_values"), layout.limits(field), strict=True):
+                found = np.array(stated.get(f"{field} {end}", ()), dtype=np.float32)
+                same = same and np.array_equal(found, values)
+    if not same:
+        raise InvalidContainerError(
+            f"{YAML_NAME} and {JSON_NAME} do not state the same numbers: one is damaged or of another scene; "
+            "copy the container again, or remove the wrong one"
+        )
 
 
 def _check_ranges(layout: Layout, name: str) -> None:
@@ -76,14 +147,12 @@ def _check_ranges(layout: Layout, name: str) -> None:
 
 def _from_yaml(data: bytes) -> dict[str, Any]:
     """Return the fields of :class:`Layout` from the YAML, as tolerant as the reference decoder."""
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        _check_nesting(yaml.parse(data, Loader=loader))
-        document = yaml.load(data, Loader=loader)
+        document = _load_yaml(data)
         sides = document["meta"]
         ops = document["ops"]
         ranges = dict(found for op in ops for found in _ranges_of(op) if found[0] in CHANNELS)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InvalidContainerError(f"{YAML_NAME} is not readable YAML") from error
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
         raise InvalidContainerError(
@@ -103,18 +172,62 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
     }
 
 
-def _check_nesting(events: Iterable[yaml.Event]) -> None:
-    """Raise YAMLError for documents that are nested too deeply, or that aliases or merge keys expand without bound."""
-    depth = aliases = 0
-    for event in events:
+def _load_yaml(data: bytes) -> Any:  # noqa: ANN401
+    """Return a document of lists, mappings with keys of text, and the plain values of YAML 1.2: see :func:`_value`.
+
+    PyYAML's loaders know more (numbers of base 60, merge keys, keys of any type), which takes minutes to expand.
+
+    Raises:
+        YAMLError: it is no YAML, has more than that, or is beyond a limit.
+    """
+    waiting: list[tuple[Any, list[Any]]] = [(None, [])]
+    anchors: dict[str | None, Any] = {}
+    aliases = 0
+    for number, event in enumerate(yaml.parse(data, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))):
         aliases += isinstance(event, yaml.AliasEvent)
+        if number > MAX_YAML_EVENTS or len(waiting) > MAX_YAML_DEPTH or aliases > MAX_YAML_ALIASES:
+            raise yaml.YAMLError("too many values or aliases, or nested too deep")
+        if getattr(event, "tag", None) is not None:
+            raise yaml.YAMLError("tags are not read")
         if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-        merges = isinstance(event, yaml.ScalarEvent) and event.value == "<<"
-        if merges or depth > MAX_YAML_DEPTH or aliases > MAX_YAML_ALIASES:
-            raise yaml.YAMLError("nested too deep, or with too many aliases or merge keys")
+            waiting.append((event, []))
+            continue
+        parent, items = waiting[-1]
+        value: Any
+        if isinstance(event, yaml.CollectionEndEvent):
+            value = _mapping(items) if isinstance(parent, yaml.MappingStartEvent) else items
+            event, items = waiting.pop()[0], waiting[-1][1]
+        elif isinstance(event, yaml.AliasEvent):
+            if event.anchor not in anchors:
+                raise yaml.YAMLError("an alias of nothing")
+            value = anchors[event.anchor]
+        elif isinstance(event, yaml.ScalarEvent):
+            is_key = isinstance(parent, yaml.MappingStartEvent) and len(items) % 2 == 0
+            value = event.value if is_key or not event.implicit[0] else _value(event.value)
+        else:
+            continue
+        anchors[event.anchor] = value
+        items.append(value)
+    documents = waiting[0][1]
+    if len(documents) > 1:
+        raise yaml.YAMLError("more than one document")
+    return documents[0] if documents else None
+
+
+def _mapping(items: list[Any]) -> dict[str, Any]:
+    keys = items[::2]
+    if not all(isinstance(key, str) and key != "<<" for key in keys):
+        raise yaml.YAMLError("a key is no text, or merges mappings")
+    return dict(zip(keys, items[1::2], strict=True))
+
+
+def _value(text: str) -> bool | float | str | None:
+    """Return the null, true, false or number that an unquoted text stands for, else the text."""
+    if text in _CONSTANTS:
+        return _CONSTANTS[text]
+    if len(text) > MAX_NUMBER_LENGTH or not _NUMBER.fullmatch(text):
+        return text
+    return int(text) if text.lstrip("+-").isdigit() else float(text)
 
 
 def _ranges_of(op: Mapping[str, Any]) -> Iterator[tuple[str, tuple[list[Any], list[Any]]]]:

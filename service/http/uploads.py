@@ -34,6 +34,14 @@ UPLOAD_ENDINGS = {"ply": "ply", "sog": "sog", "spz": "spz", "splat": "splat", "k
 HEAD_BYTES = 512
 """Bytes from which a format is recognised."""
 
+GAUSSIANS_PER_BYTE = 2
+"""Largest number of Gaussians per byte of an upload: a position alone takes more than 4 bits, whole Gaussians of real
+containers 4 to 20 bytes. Images of equal pixels hold millions in 4 kB, which keep a worker for an hour, because all of
+them cover the same pixels."""
+
+FREE_GAUSSIANS = 1 << 16
+"""Number of Gaussians that an upload of any size may have."""
+
 CLOSE = {"Connection": "close"}
 
 STEP_BYTES = 16 << 20
@@ -120,7 +128,7 @@ class Spool:
         await run_sync(self._close)
         async with self._admission.parsing:
             info = await run_sync(self._read_info)
-        self._refuse_count(info)
+        refuse_count(info.count, self._size, self._settings.max_gaussians)
         self._kept = True
         return Received(self._path, self._size, self._hash.hexdigest(), info)
 
@@ -194,7 +202,7 @@ class Spool:
             info = kissgs.read_ply_info(head[:limit], size=max(whole, self._size))
         except kissgs.KissgsError as error:
             raise self._named(error) from error
-        self._refuse_count(info)
+        refuse_count(info.count, max(whole, self._size), self._settings.max_gaussians)
 
     def _refuse_size(self, size: int) -> None:
         if size > self._settings.max_upload_bytes:
@@ -204,14 +212,6 @@ class Spool:
                 "prune the scene first, or compress it with the command line",
             )
 
-    def _refuse_count(self, info: kissgs.SceneInfo | kissgs.PlyInfo) -> None:
-        if info.count > self._settings.max_gaussians:
-            raise ProblemError(
-                "unsupported",
-                f"the scene has {info.count:,} Gaussians, and the limit is {self._settings.max_gaussians:,}; "
-                "prune it first, or compress it with the command line",
-            )
-
     def _named(self, error: kissgs.KissgsError) -> ProblemError:
         """Convert an error of the library to a problem that names the upload instead of a path of the server."""
         text = str(error).replace(str(self._path), self._path.name).replace(self._path.name, "the upload")
@@ -219,6 +219,26 @@ class Spool:
         if "the upload" not in text:
             text = f"the upload cannot be read: {text}"
         return ProblemError("invalid-scene" if error.code == "invalid-container" else error.code, text)
+
+
+def refuse_count(count: int, size: int, most: int) -> None:
+    """Refuse a scene of more than ``most`` Gaussians, or of more than different ones take in ``size`` bytes.
+
+    Raises:
+        ProblemError: there are too many.
+    """
+    if count > most:
+        raise ProblemError(
+            "unsupported",
+            f"the scene has {count:,} Gaussians, and the limit is {most:,}; "
+            "prune it first, or compress it with the command line",
+        )
+    if count > FREE_GAUSSIANS + GAUSSIANS_PER_BYTE * size:
+        raise ProblemError(
+            "unsupported",
+            f"the scene has {count:,} Gaussians in {size:,} bytes, so that most of them are copies of others; "
+            "remove the copies, or compress it with the command line",
+        )
 
 
 async def timed(request: Request, settings: ServiceSettings, stopping: asyncio.Event) -> AsyncIterator[bytes]:

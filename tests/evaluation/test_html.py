@@ -86,7 +86,8 @@ def test_every_view_has_images_without_photographs():
     page = Page(text)
     worst = min(range(3), key=lambda i: found.views[i].comparison.candidate_vs_reference.psnr)
     ids = [section["id"] for section in page.of("section") if "id" in section]
-    assert ids == [f"view-{worst}", *(f"view-{i}" for i in range(3) if i != worst)]
+    by_psnr = np.argsort([each.comparison.candidate_vs_reference.psnr for each in found.views])
+    assert ids == [f"view-{i}" for i in by_psnr]
     assert len(page.images) == 3 * (3 + 3)
     first = page.images[:6]
     assert all(image.shape == (40, 60, 3) for image in first)
@@ -146,11 +147,8 @@ def test_twelve_of_many_views_are_shown_the_worst_first():
     views = cameras(test=30, train=0, size=(8, 6))
     found = compare_images(one, damaged(one), views)
     shown = select_views(found)
-    worst = int(np.argmin([each.comparison.candidate_vs_reference.psnr for each in found.views]))
-    assert len(shown) == len(set(shown)) == MAX_VIEWS
-    assert shown[0] == worst
-    assert shown[1:] == sorted(shown[1:])
-    assert np.diff(sorted(shown)).max() <= 6
+    by_psnr = np.argsort([each.comparison.candidate_vs_reference.psnr for each in found.views], kind="stable")
+    assert shown == by_psnr[:MAX_VIEWS].tolist()
     text = html_report(found, ReportScene(name="a", splats=one), ReportScene(name="b", splats=damaged(one)))
     page = Page(text)
     assert [section["id"] for section in page.of("section") if "id" in section] == [f"view-{i}" for i in shown]

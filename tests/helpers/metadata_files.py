@@ -19,7 +19,10 @@ def document():
 
 
 def with_yaml(text):
-    return {**FILES, "container_meta.yaml": text if isinstance(text, bytes) else text.encode()}
+    """Return the files without ``meta.json``, with this text as YAML."""
+    files = {**FILES, "container_meta.yaml": text if isinstance(text, bytes) else text.encode()}
+    del files["meta.json"]
+    return files
 
 
 def with_document(changed):

@@ -176,9 +176,9 @@ def test_pruning_for_a_quality(goal):
 
 def test_a_count_is_reported_by_the_loss_that_decides():
     psnr = CountTrial(50_000, 0.123, 0.00291, ssim_decides=False)
-    assert psnr.summary() == "50,000 Gaussians lose 0.12 dB"
+    assert psnr.summary() == "50,000 Gaussians lose 0.123 dB"
     assert replace(psnr, ssim_decides=True).summary() == "50,000 Gaussians lose 0.00291 of SSIM"
-    assert CountTrial(50_000, 0.123).summary() == "50,000 Gaussians lose 0.12 dB"
+    assert CountTrial(50_000, 0.123).summary() == "50,000 Gaussians lose 0.123 dB"
 
 
 @pytest.mark.quick(0)

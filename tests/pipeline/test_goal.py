@@ -148,9 +148,9 @@ def test_nothing_lost_is_an_unknown_distance():
 
 def test_a_trial_names_the_loss_of_ssim_where_it_is_a_goal():
     trial = Trial(1, 1e-9, 812_000, psnr=41.2, drop=0.12, worst=35.1)
-    assert trial.summary() == "812 kB at 41.20 dB, drop 0.12 dB, worst view 35.1 dB"
+    assert trial.summary() == "812 kB at 41.20 dB, drop 0.120 dB, worst view 35.1 dB"
     text = Trial(1, 1e-9, 812_000, psnr=41.2, drop=0.12, ssim_drop=0.00291, worst=35.1).summary()
-    assert text == "812 kB at 41.20 dB, drop 0.12 dB, SSIM drop 0.00291, worst view 35.1 dB"
+    assert text == "812 kB at 41.20 dB, drop 0.120 dB, SSIM drop 0.00291, worst view 35.1 dB"
     assert "SSIM drop 2.35e-05" in Trial(1, 1e-9, 812_000, ssim_drop=0.000023456).summary()
 
 

@@ -12,7 +12,8 @@ import httpx
 import pytest
 from helpers.service import FAST, SMALL, problem, read_response, scene_bytes
 
-from service.core.problems import PROBLEM_TYPES
+from service.core.problems import PROBLEM_TYPES, ProblemError
+from service.http.uploads import refuse_count
 
 
 def submit(service, data=SMALL, **arguments):
@@ -105,6 +106,15 @@ def test_too_many_gaussians_are_refused_after_the_header(service):
     assert "20,001 Gaussians" in answer
     assert "the limit is 20,000" in answer
     assert '"code":"unsupported"' in answer
+
+
+@pytest.mark.parametrize(("count", "size"), [(5_000_000, 3_800), (20_000_000, 4_000), (200_000, 60_000)])
+def test_more_gaussians_than_bytes_can_tell_apart_are_refused(count, size):
+    """A SOG whose images have one colour holds millions in 4 kB; real ones take 4 bytes or more for each."""
+    with pytest.raises(ProblemError, match="copies"):
+        refuse_count(count, size, 20_000_000)
+    refuse_count(count, 2 * count, 20_000_000)
+    refuse_count(60_000, 100, 60_000)
 
 
 def test_an_incomplete_scene_is_refused_by_its_length(service):

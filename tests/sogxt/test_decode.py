@@ -29,7 +29,8 @@ def foreign(files=FILES, **images):
     document = yaml.safe_load(files["container_meta.yaml"])
     document = {key: value for key, value in document.items() if not key.startswith("kissgs")}
     changed = {f"{name}.webp": webp(image) for name, image in images.items()}
-    return {**files, **changed, "container_meta.yaml": yaml.safe_dump(document).encode()}
+    kept = {name: data for name, data in files.items() if name != "meta.json"}
+    return {**kept, **changed, "container_meta.yaml": yaml.safe_dump(document).encode()}
 
 
 def image_of(name, files=FILES):
@@ -141,8 +142,10 @@ def test_an_image_that_was_exchanged_or_damaged(name):
     """The checksums are ours; without them, a flipped bit may still decode, to another scene."""
     data = bytearray(FILES[f"{name}.webp"])
     data[-3] ^= 1
+    assert refusal({**FILES, f"{name}.webp": bytes(data)}).startswith(f"{name}.webp is damaged")
+    alone = {key: value for key, value in FILES.items() if key != "meta.json"}
     sentence = f"{name}.webp is damaged: its SHA-256 is not the one in the metadata"
-    assert refusal({**FILES, f"{name}.webp": bytes(data)}) == sentence
+    assert refusal({**alone, f"{name}.webp": bytes(data)}) == sentence
 
 
 @pytest.mark.parametrize("name", PLANES)
@@ -166,7 +169,7 @@ def test_a_mask_that_disagrees_with_the_metadata():
     document = yaml.safe_load(FILES["container_meta.yaml"])
     document["kissgs"]["count"] = 99
     del document[CHECKSUM]
-    files = {**FILES, "container_meta.yaml": yaml.safe_dump(document).encode()}
+    files = {**foreign(), "container_meta.yaml": yaml.safe_dump(document).encode()}
     assert refusal(files) == "active_mask.webp marks 100 Gaussians; the metadata declares 99"
 
 

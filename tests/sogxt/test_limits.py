@@ -24,6 +24,7 @@ def bomb(side):
         if "centroids" not in name:
             channels = {"quaternions.webp": 4, "active_mask.webp": 1, "opacities.webp": 1}.get(name, 3)
             files[name] = encode_plane(np.ones((side, side, channels), np.uint8), quality=0, method=0)
+    del files["meta.json"]
     text = files["container_meta.yaml"].decode().split("kissgs:")[0]
     files["container_meta.yaml"] = text.replace("grid_side: 8", f"grid_side: {side}").encode()
     return files

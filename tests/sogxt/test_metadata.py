@@ -190,6 +190,20 @@ def test_spellings_of_the_same_yaml(name, text):
     assert_same(decompress(with_yaml(text)))
 
 
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [("1e-05", 1e-05), ("1.0e-05", 1e-05), ("-0.5", -0.5), ("+.5", 0.5), ("7", 7.0), ("'7'", 7.0), ("1E+1", 10.0)],
+)
+def test_numbers_of_yaml(text, wanted):
+    """YAML 1.1 reads the first as text; older encoders wrote it."""
+    files = with_document(document())
+    low = f"min_values: {quantize_of(document(), 'opacities')['min_values']}".encode()
+    changed = files["container_meta.yaml"].replace(low, f"min_values: {text}".encode(), 1)
+    assert changed != files["container_meta.yaml"]
+    layout = read_layout(MemorySource({"container_meta.yaml": changed}))
+    assert layout.limits("opacities")[0][0] == np.float32(wanted)
+
+
 def test_aliases_as_dumpers_write_them():
     """PyYAML writes a list that occurs twice as an alias: nothing hostile about that."""
     changed = document()

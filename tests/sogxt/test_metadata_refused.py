@@ -212,6 +212,13 @@ HOSTILE = {
     "dashes": "- " * 400_000,
     "brackets": "[" * 400_000,
     "questions": "? " * 400_000,
+    # Numbers of base 60 in YAML 1.1, which take minutes, or overflow.
+    "base 60": "x: " + ":".join(["1"] * 200_000),
+    "base 60, a float": "x: " + "1:" * 5_000 + "1.5",
+    "base 60, a tag": "x: !!float '" + "1:" * 200_000 + "1.5'",
+    # Multiples of a modulus, whose hashes are all 0, so that Python would compare each key with all before it.
+    "equal hashes": "{" + ", ".join(str(i * (2**61 - 1)) for i in range(1, 30_000)) + "}",
+    "many values": "[" + "1," * 500_000 + "]",
 }
 
 

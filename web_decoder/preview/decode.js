@@ -14,6 +14,6 @@ export const decode = (source, options) =>
     name: "SOG-XT or SOG",
     images: PLANES.length,
     Failure: SogxtError,
-    assemble: (json, maxGaussians) =>
-      isSog(parseMeta(json)) ? new SogAssembly(json, maxGaussians) : new Assembly(json, maxGaussians),
+    assemble: (json, maxGaussians, yaml) =>
+      isSog(parseMeta(json)) ? new SogAssembly(json, maxGaussians) : new Assembly(json, maxGaussians, yaml),
   });
