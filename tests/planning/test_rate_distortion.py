@@ -11,7 +11,7 @@ from helpers.random_sensitivity import encode_rd, random_sensitivity
 import kissgs
 from kissgs import Settings, compress, decompress
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import clean
+from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.sogxt.encode import encode
 
 RD_PRESETS = ["balanced", "small"]
@@ -160,7 +160,7 @@ def test_many_gaussians_that_were_dropped_are_noted_in_the_report(superfluous, m
     if superfluous:
         more = faint(superfluous)
         scene = kissgs.Splats(
-            **{name: np.concatenate([getattr(scene, name), getattr(more, name)]) for name in kissgs.Splats.__slots__}
+            **{name: np.concatenate([getattr(scene, name), getattr(more, name)]) for name in ATTRIBUTES}
         )
     settings = kissgs.Settings.from_preset("balanced", sensitivity_views=8, sensitivity_view_size=96)
     report = kissgs.compress(scene, settings=settings).report

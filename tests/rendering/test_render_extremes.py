@@ -14,7 +14,7 @@ from helpers.render_scenes import blobs, camera, one, together
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.core.splats import Splats
+from kissgs.core.splats import ATTRIBUTES, Splats
 
 finite32 = {"allow_nan": False, "allow_infinity": False, "width": 32}
 anywhere = st.one_of(
@@ -66,7 +66,7 @@ def test_nan_in_a_parameter_does_not_crash_the_rasteriser():
     good = one()
     for name in ("means", "quats", "scales", "opacities"):
         for value in (np.nan, np.inf, -np.inf):
-            arrays = {field: getattr(good, field).copy() for field in Splats.__slots__}
+            arrays = {field: getattr(good, field).copy() for field in ATTRIBUTES}
             arrays[name].flat[0] = value
             render_tensors(Splats(**arrays), [camera(200, 100)])
 

@@ -6,7 +6,7 @@ from helpers.hollow_scenes import box, surface
 
 from kissgs import sample_scene
 from kissgs.cameras.virtual.scene_bounds import scene_bounds, weighted_quantile
-from kissgs.core.splats import Splats
+from kissgs.core.splats import ATTRIBUTES, Splats
 
 
 def rotated(splats, matrix):
@@ -34,7 +34,7 @@ def table():
 def test_floaters_and_a_far_sky_do_not_move_the_centre():
     rng = np.random.default_rng(0)
     far = surface(rng.normal(0, 40, (2000, 3)) + 60, np.zeros(2000, int), 5.0)
-    arrays = {name: np.concatenate([getattr(box((1, 1, 1)), name), getattr(far, name)]) for name in Splats.__slots__}
+    arrays = {name: np.concatenate([getattr(box((1, 1, 1)), name), getattr(far, name)]) for name in ATTRIBUTES}
     bounds = scene_bounds(Splats(**arrays))
     assert np.abs(bounds.centre).max() < 0.2
     assert 0.5 < bounds.radius < 2
