@@ -70,7 +70,8 @@ def decompress(
         if not (quiet or as_json):
             from kissgs.cli.tables import gaussians
 
-            show(f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}")
-        return {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": target.stat().st_size}
+            show("\n".join([f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}", *splats.notes]))
+        size = target.stat().st_size
+        return {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": size, "notes": list(splats.notes)}
 
     for_each_input(containers, output, ".ply", as_json, work, unreadable=InvalidContainerError)

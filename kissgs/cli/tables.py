@@ -9,6 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
+from kissgs.core.origin import relative_to
 from kissgs.evaluation.metric_text import format_metric
 from kissgs.evaluation.results import ImageMetrics
 from kissgs.pipeline.scene_formats import CONTAINER_FORMATS, STREAMED_FORMATS
@@ -254,6 +255,8 @@ def info_table(info: Info) -> RenderableType:
         whole = f"total of level {info.details['level']}" if streamed else "total"
         blocks.insert(2, parts_table(info.parts, info.count, whole))
     details = info.details
+    if any(details.get("origin", ())):
+        blocks.append(Text(relative_to(tuple(details["origin"]))))
     if info.kind == "sogxt":
         origin = "unknown"
         if details["version"]:
@@ -265,7 +268,7 @@ def info_table(info: Info) -> RenderableType:
         around = details["environment"]
         beside = f"; in the environment, which belongs to every level: {around:,}" if around else ""
         blocks.append(Text(f"Gaussians by level, finest first: {levels}{beside}"))
-    return Group(*blocks, *_changes(info.changed))
+    return Group(*blocks, *(Text(note, style="yellow") for note in info.notes), *_changes(info.changed))
 
 
 def _kind(info: Info) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.io.scene_file import refuse_more_than
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.scene_files import read_scene, stored_bytes
+from kissgs.pipeline.scene_files import read_scene, reading_notes, stored_bytes
 from kissgs.pipeline.scene_formats import CONTAINER_FORMATS, STREAMED_FORMATS, SceneFormat, recognise, scene_root
 
 if TYPE_CHECKING:
@@ -52,7 +52,8 @@ class Info:
             and settings of the encoder (SOG-XT); version, variant of the renderer, generator and size of the codebook
             (SOG); the level that is described, and Gaussians per level and of the environment (streamed scenes);
             version and precision of positions (``.spz``); compression level and sections (``.ksplat``);
-            primitives and compression (glTF).
+            primitives and compression (glTF); the origin of positions where it is not the world's.
+        notes: what reading leaves out or changes, one phrase each; empty for containers, whose images are not decoded.
     """
 
     path: str
@@ -64,6 +65,7 @@ class Info:
     ranges: dict[str, tuple[float, float]]
     changed: dict[str, int]
     details: dict[str, Any]
+    notes: tuple[str, ...] = ()
 
     @property
     def bits_per_gaussian(self) -> float:
@@ -165,6 +167,7 @@ def _describe_file(path: Path, kind: SceneFormat, reading: ReadOptions) -> Info:
         ranges={name: _extremes(getattr(splats, name)) for name in ATTRIBUTES if getattr(splats, name).size},
         changed=clean(splats)[1].as_dict(),
         details=details,
+        notes=tuple(reading_notes(splats)),
     )
 
 

@@ -29,6 +29,7 @@ def sog_facts(path: Path) -> Facts:
         parts=parts,
         ranges=sog_ranges([layout]),
         details={
+            "origin": list(layout.origin),
             "version": layout.version,
             "antialiased": layout.antialiased,
             "model": layout.model,

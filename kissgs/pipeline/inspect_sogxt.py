@@ -40,6 +40,7 @@ def sogxt_facts(path: Path) -> Facts:
         ranges=sogxt_ranges([layout]),
         changed=made.changed if made else {},
         details={
+            "origin": list(layout.origin),
             "grid_side": layout.grid_side,
             "codebook_side": layout.codebook_side,
             "version": made.version if made else None,

@@ -14,7 +14,6 @@ from kissgs.core.array_types import Int
 from kissgs.core.deadline import Deadline
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.limits import MAX_GAUSSIANS
-from kissgs.core.origin import WORLD, relative_to
 from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_search, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
@@ -23,7 +22,7 @@ from kissgs.io.container_names import ContainerName, named_container
 from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.report import Report
-from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save_ply
+from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
 from kissgs.pipeline.training_choice import decided, work_plan
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
@@ -146,7 +145,7 @@ def compact(
         cleaned=cleaned,
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
-        note="; ".join(filter(None, [note, result.report.note])),
+        note="; ".join(filter(None, [*splats.notes, note, result.report.note])),
     )
     return replace(result, report=report)
 
@@ -243,9 +242,7 @@ def compress(
         deadline=deadline,
         disposable=not (evaluate or isinstance(source, Splats)),
     )
-    notes = list(original.notes)
-    if original.origin != WORLD:
-        notes.append(f"{relative_to(original.origin)}, which the container records")
+    notes = reading_notes(original)
     del original
     compacted, search, trials = _compact_first(encoding, checkpoint, plan.time, aims=requested.aims)
     after_search = ignore_stop_search(clock) if settings.searches else clock

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from kissgs.core.errors import InvalidContainerError, OutputError
-from kissgs.core.origin import centred, in_world
+from kissgs.core.origin import WORLD, centred, in_world, relative_to
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Cleaned, Splats, clean
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
@@ -193,6 +193,12 @@ def _reader(found: SceneFormat) -> Callable[..., Splats]:
     from kissgs.io.ply import read_ply
 
     return read_ply
+
+
+def reading_notes(splats: Splats) -> list[str]:
+    """Return what reading a scene left out or changed, and where its positions are if they are not the world's."""
+    where = [] if splats.origin == WORLD else [f"{relative_to(splats.origin)}, which containers record"]
+    return [*splats.notes, *where]
 
 
 def stored_bytes(path: Path) -> int:

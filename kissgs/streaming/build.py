@@ -22,6 +22,7 @@ from kissgs.core.splats import Splats, clean, concatenate
 from kissgs.io.atomic import atomic_file
 from kissgs.io.container_names import ContainerName
 from kissgs.pipeline.containers import MODELS, write_files
+from kissgs.pipeline.scene_files import reading_notes
 from kissgs.planning.planner import plan_encoding, visible_gaussians
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import write_container
@@ -107,10 +108,12 @@ def partition(
         cuts = cuts_without_coarse(sample, cuts, count)
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in range(cuts.chunks))):
         path.unlink(missing_ok=True)
+    notes: tuple[str, ...] = ()
     far_count, counts, sh_degree, changed = 0, np.zeros(cuts.chunks, np.int64), 0, Counter[str]()
     antialiased = False
     for block in counted():
         splats, cleaned = clean(block)
+        notes = tuple(reading_notes(splats))
         visible = visible_gaussians(splats, settings)
         changed.update({**cleaned.as_dict(), "invisible": len(splats) - len(visible)})
         splats, sh_degree, antialiased = splats.select(visible), splats.sh_degree, splats.antialiased
@@ -135,6 +138,7 @@ def partition(
         leaf=leaf_size(total, cuts.chunks, levels),
         environment=far_count,
         changed=dict(changed),
+        notes=notes,
         origin=origin,
         antialiased=antialiased,
     )

@@ -60,7 +60,7 @@ class StreamedReport:
             one. It belongs to every level, but is not counted there.
         chunks: number of chunks of the finest level.
         total_bytes: bytes of all files, the manifest included.
-        note: what the user may not expect: coarse positions; empty if there is nothing to say.
+        note: what the user may not expect: what reading left out, coarse positions; empty if there is nothing to say.
     """
 
     source_count: int
@@ -284,6 +284,6 @@ def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
         environment_count=environment_count,
         environment_bytes=environment_bytes,
         chunks=chunks,
-        note=build.coarse_note(work, layout),
+        note="; ".join(filter(None, [*layout.notes, build.coarse_note(work, layout)])),
         total_bytes=sum(sizes) + environment_bytes + (out / layout.manifest).stat().st_size,
     )

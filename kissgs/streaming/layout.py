@@ -33,6 +33,7 @@ class Layout:
         leaf: largest number of Gaussians in a leaf.
         environment: number of Gaussians in the environment; 0 without one.
         changed: number of Gaussians that cleaning removed or changed, by kind, and of those that are invisible.
+        notes: what reading the scene left out or changed, and where its positions are.
         origin: see :class:`kissgs.Splats`.
         antialiased: see :class:`kissgs.Splats`.
     """
@@ -46,6 +47,7 @@ class Layout:
     leaf: int
     environment: int
     changed: dict[str, int]
+    notes: tuple[str, ...]
     origin: Origin
     antialiased: bool = False
 
@@ -107,7 +109,7 @@ def continuation(work: Path) -> str:
 def read_layout(work: Path) -> Layout:
     """Return the layout of a scene that is partitioned."""
     found = json.loads((work / PARTITION).read_bytes())
-    return Layout(**{**found, "counts": tuple(found["counts"]), "origin": tuple(found["origin"])})
+    return Layout(**{**found, **{name: tuple(found[name]) for name in ("counts", "notes", "origin")}})
 
 
 def keep_layout(work: Path, layout: Layout) -> None:
