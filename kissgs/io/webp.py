@@ -60,9 +60,10 @@ def decode_plane(
         with WebPImagePlugin.WebPImageFile(io.BytesIO(data)) as image_file:
             image_file.load()
             pixels = np.asarray(image_file)
+            found_crc32 = None if crc32 is None else zlib.crc32(image_file.convert("RGBA").tobytes())
     except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
         raise InvalidContainerError(f"{name} is damaged: its WebP data cannot be decoded") from error
-    if crc32 is not None and pixels_crc32(pixels) != crc32:
+    if found_crc32 != crc32:
         raise InvalidContainerError(f"{name} is damaged: its pixels are not those that were stored")
     if channels == 4 and pixels.shape[2] == 3:
         pixels = np.concatenate([pixels, np.full((height, width, 1), 255, dtype=np.uint8)], axis=2)
