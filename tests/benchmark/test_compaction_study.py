@@ -94,6 +94,7 @@ def test_an_empty_scene_is_refused():
         compare_strategies(cloud(1).select(slice(0)), SHORT)
 
 
+@pytest.mark.quick(0)
 def test_a_plot_without_finite_values_is_drawn(tmp_path, points):
     compaction_plot([replace(point, psnr=math.inf) for point in points], tmp_path / "p.svg")
     assert (tmp_path / "p.svg").exists()

@@ -73,6 +73,7 @@ def city(tmp_path, monkeypatch):
 
 
 @needs_viewer
+@pytest.mark.quick(0)
 def test_a_streamed_scene(tmp_path, city):
     """The files of its folder are served one by one; ``--level`` and ``-o`` show one level, which was decoded."""
     environment = {**os.environ, "DISPLAY": ""}

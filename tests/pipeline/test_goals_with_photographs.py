@@ -15,7 +15,7 @@ from kissgs.rendering.sensitivity import WeightedCameras
 
 
 @pytest.mark.parametrize("goal", [{"max_ssim_drop": 0.05}, {"max_psnr_drop": 0.5}, {"target_size": 6200}])
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal):
     scene = cloud(300)
     views = photographs(scene, tmp_path)
@@ -62,6 +62,7 @@ def test_the_same_request_gives_the_same_bytes(tmp_path):
     assert any(trial.drop <= 1 and trial.ssim_drop <= 0.05 for trial in kept)
 
 
+@pytest.mark.quick(0)
 def test_photographs_that_train_do_not_evaluate_a_goal(tmp_path):
     """Without others that were held out, nothing is trained for a goal; nor with a sensitivity of all Gaussians."""
     scene = cloud(60)
@@ -78,6 +79,7 @@ def test_photographs_that_train_do_not_evaluate_a_goal(tmp_path):
     assert found.report.finetuning is not None
 
 
+@pytest.mark.quick(0)
 def test_the_order_leads_to_the_input(tmp_path):
     """A Gaussian of the container lies near that of the input from which it was trained."""
     scene = cloud(300)

@@ -67,7 +67,7 @@ def test_a_size_is_better_used_with_training():
 
 
 @pytest.mark.parametrize(("units", "trained"), [(1e6, True), (10, False)])
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_a_limited_time_trains_if_it_is_long(monkeypatch, units, trained):
     monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1e5 / units)
     chosen = settings(steps=20, max_psnr_drop=0.5).model_copy(update={"time_limit": 1e5})
@@ -77,6 +77,7 @@ def test_a_limited_time_trains_if_it_is_long(monkeypatch, units, trained):
         assert "too little time to train a smaller number" in report.compaction.note
 
 
+@pytest.mark.quick(0)
 def test_a_loss_that_is_estimated_is_called_so_once():
     """Regression: not where the encoder alone searched."""
     alone = {"compact": {"auto_count": False}, "finetune": {"enabled": False}}
@@ -125,12 +126,14 @@ def test_fewer_gaussians_are_no_worse_where_all_are_needed():
 FEW = with_faint(NEEDED.select(np.arange(100)))
 
 
+@pytest.mark.quick(0)
 def test_the_result_does_not_depend_on_threads():
     chosen = settings(steps=20, max_psnr_drop=1.0)
     one, other = (kissgs.compress(FEW, settings=chosen, threads=threads) for threads in (1, 2))
     assert one.files == other.files
 
 
+@pytest.mark.quick(0)
 def test_the_reported_settings_give_the_same_bytes():
     found = kissgs.compress(FEW, settings=settings(steps=20, max_ssim_drop=0.05))
     assert any(trial.count < len(FEW) for trial in found.report.trials)

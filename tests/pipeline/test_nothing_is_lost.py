@@ -17,7 +17,7 @@ def kept(scene: Splats, preset: str, **settings: object) -> Splats:
 
 
 @pytest.mark.parametrize("name", SCENES)
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_no_view_is_much_worse_than_with_uniform_steps(name: str):
     """One view in 24 may be worse: if two large Gaussians have nearly equal depth, rounding may swap their order."""
     scene = clean(SCENES[name]())[0]

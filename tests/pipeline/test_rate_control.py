@@ -71,7 +71,7 @@ def test_stopping_while_a_count_is_evaluated_keeps_it():
 
 
 @pytest.mark.parametrize("auto_count", [False, True])
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_stopping_before_fine_tuning_keeps_the_result(auto_count):
     """Stopped when sensitivity is measured again for fine-tuning, or when the first training target is rendered."""
     compact = {**PRUNE, "auto_count": True, "max_compactions": 1} if auto_count else None

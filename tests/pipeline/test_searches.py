@@ -136,7 +136,7 @@ def test_equal_gaussians_can_meet_a_psnr():
         ),
     ],
 )
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_unreachable_goals_are_refused_and_nothing_is_written(tmp_path, goal, message):
     with pytest.raises(UnsupportedError, match=message):
         kissgs.compress(SCENE, tmp_path / "a.zip", settings=Settings.from_preset("balanced", **goal, **FEW_VIEWS))

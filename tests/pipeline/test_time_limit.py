@@ -306,6 +306,7 @@ def test_a_stopped_search_for_an_aim_keeps_the_closest_container(tmp_path, monke
     assert [trial.bytes for trial in found.report.trials] == [len(found.to_zip())]
 
 
+@pytest.mark.quick(0)
 def test_the_reported_settings_are_valid(tmp_path):
     scene = cloud(100)
     views = photographs(scene, tmp_path)

@@ -89,6 +89,7 @@ def test_a_folder_is_written_shown_and_replaced_only_if_allowed(cluster, scenes,
     assert [path.name for path in tmp_path.iterdir()] == ["a.container"]
 
 
+@pytest.mark.quick(0)
 def test_a_scene_whose_node_is_killed_has_the_same_bytes(cluster, scenes, tmp_path):
     words = [
         KISSGS,

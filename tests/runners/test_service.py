@@ -74,6 +74,7 @@ def processes_of(service, *jobs):
     return look()
 
 
+@pytest.mark.quick(1)
 def test_jobs_have_the_bytes_of_the_library_and_report_every_stage(service):
     jobs = [service.submit(SMALL), service.submit(MEDIUM), service.submit(SMALL)]
     with service.http.stream("GET", jobs[1]["links"]["events"]) as answer:
@@ -101,6 +102,7 @@ def test_an_expected_error_is_that_of_the_library_without_paths(service, tmp_pat
     assert str(service.folder) not in status["problem"]["detail"]
 
 
+@pytest.mark.quick(1)
 def test_a_waiting_and_a_running_job_are_cancelled(service):
     running = [service.submit(MEDIUM, SLOW) for _ in range(2)]
     pids = processes_of(service, *running)

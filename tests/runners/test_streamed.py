@@ -59,6 +59,7 @@ def test_stopped_work_cancels_its_items_and_goes_on_elsewhere(local_runner, scen
     assert files_of(tmp_path / "city") == files_of(tmp_path / "whole")
 
 
+@pytest.mark.quick(0)
 def test_an_item_that_fails_ends_the_work(local_runner, scene, tmp_path):
     """A level that another program has removed cannot be read, and the work folder stays as it is."""
     target = tmp_path / "city" / "lod-meta.json"

@@ -169,7 +169,7 @@ def test_permanent_errors(tmp_path, monkeypatch, error):
 
 @pytest.mark.parametrize("name", ["jobs", "incoming"])
 @pytest.mark.parametrize("change", ["moved away", "a file", "another folder"])
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_readiness(start, name, change):
     it = start()
     folder = it.folder / name

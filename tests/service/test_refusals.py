@@ -72,6 +72,7 @@ def test_hostile_scenes(service, kind, form):
     assert not found["retryable"]
 
 
+@pytest.mark.quick(0)
 def test_errors_in_the_body_fail_the_job(service):
     text = header(2, "".join(f"property float {n}\n" for n in NAMES), "ascii") + b"1 2 three\n" * 50
     found = service.ended(submit(service, text).json())
@@ -274,6 +275,7 @@ def test_too_many_uploads(start):
     http.close()
 
 
+@pytest.mark.quick(0)
 def test_disk_limit(start):
     service = start(KISSGS_MAX_DISK_BYTES=2 * len(SMALL), KISSGS_KEEP_UPLOADS="true")
     job = service.ended(service.submit())

@@ -139,6 +139,7 @@ def test_cancelled_raised_by_progress_cancels_the_job(start, tmp_path):
     assert service.children() == []
 
 
+@pytest.mark.quick(0)
 def test_a_job_cancelled_on_the_server(start, tmp_path):
     service = start()
     scene = tmp_path / "scene.ply"

@@ -94,6 +94,7 @@ def test_a_job_that_crashes_the_server_fails_after_its_last_start(start):
     assert "2 times" in status["problem"]["detail"]
 
 
+@pytest.mark.quick(0)
 def test_a_complete_result_is_recovered(tmp_path):
     """The server is killed after the result is in its final folder, but before this is recorded."""
     with Service(tmp_path / "data") as service:

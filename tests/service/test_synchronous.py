@@ -69,6 +69,7 @@ def test_accept_headers(headers, allowed):
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
+@pytest.mark.quick(0)
 def test_the_documented_command_never_overwrites_a_good_container(start, local, tmp_path):
     """A 202 answer once replaced a good scene.zip with the job's status, and curl exited with 0."""
     page = (ROOT / "docs" / "guide" / "service.md").read_text(encoding="utf-8")

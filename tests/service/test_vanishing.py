@@ -248,6 +248,7 @@ def test_files_of_a_replacement_stay_unchanged(tmp_path):
         assert [job["state"] for job in all_jobs(service)] == ["succeeded"]
 
 
+@pytest.mark.quick(0)
 def test_a_locked_database(start):
     service = start()
     with contextlib.closing(sqlite3.connect(service.folder / "jobs.sqlite", isolation_level=None)) as other:

@@ -243,6 +243,7 @@ def test_both_spellings_of_the_metadata_agree():
 
 
 @pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.quick(1)
 def test_sh_bands_of_zeros_cost_next_to_nothing(preset):
     without = random_scene(100, 0)
     zeros = replaced(without, shN=np.zeros((100, 15, 3)))

@@ -217,6 +217,7 @@ def test_aliases_as_dumpers_write_them():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.quick(2)
 def test_the_degree_of_foreign_containers_is_that_of_their_highest_band(degree):
     files = dict(compress(random_scene(30, degree)).files)
     changed = yaml.safe_load(files["container_meta.yaml"])

@@ -244,7 +244,7 @@ def test_what_a_manifest_names_beside_its_containers_is_never_replaced(scene, ta
     assert (target.parent / "mine.txt").read_text() == "mine"
 
 
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_a_streamed_scene_is_replaced_only_if_allowed(scene, target, tmp_path):
     """A scene of the other kind in the same folder is one too."""
     compress_streamed(scene, target, settings=FAST)
@@ -353,7 +353,7 @@ def test_settings_that_do_not_fit_are_refused(scene, tmp_path, changes):
 
 
 @pytest.mark.parametrize("name", ["lod-meta.json", "levels.json"])
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_the_number_of_threads_does_not_matter(scene, tmp_path, name):
     for threads in (1, 3):
         compress_streamed(scene, tmp_path / str(threads) / name, settings=FAST, threads=threads)

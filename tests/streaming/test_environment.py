@@ -117,7 +117,7 @@ class Stop(Exception):
     pass
 
 
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 @pytest.mark.parametrize("name", TARGETS)
 def test_interrupted_work_ends_with_the_same_bytes_and_is_replaced_as_a_whole(scene, tmp_path, name):
     for folder in ("whole", "parts"):
@@ -191,6 +191,7 @@ def test_splat_transform_reads_what_is_not_in_the_environment(scene, tmp_path):
 
 
 @needs_splat_transform
+@pytest.mark.quick(0)
 def test_splat_transform_reads_the_environment(scene, tmp_path):
     """It writes the coarsest level and the environment as another streamed scene, with other steps of positions."""
     target = tmp_path / "city" / "lod-meta.json"

@@ -67,6 +67,7 @@ class Stop(Exception):
     pass
 
 
+@pytest.mark.quick(0)
 def test_the_default_preset_spends_bits_by_sensitivity_and_goes_on_after_its_cameras(tmp_path, monkeypatch):
     small_sizes(monkeypatch, chunk=1600, leaf=400, coarsest=1000)
     monkeypatch.setattr(layout, "CONTEXT", 1500)

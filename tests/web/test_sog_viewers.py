@@ -62,7 +62,7 @@ def reference(splats, camera):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.quick(2)  # two of each viewer
+@pytest.mark.quick(1)  # two of each viewer
 def test_sog_in_a_viewer(viewer, degree):
     scene = scattered(400, degree)
     sog = kissgs.compress(scene, container="sog").to_zip()

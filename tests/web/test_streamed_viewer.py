@@ -76,6 +76,7 @@ def test_the_environment_is_drawn_at_every_level(playcanvas, tmp_path, monkeypat
         assert psnr(whole, without) < 20
 
 
+@pytest.mark.quick(0)
 def test_the_first_image_needs_less_than_a_megabyte(playcanvas, tmp_path):
     """Manifest and coarsest level show the whole scene, with the sizes that users get; finer levels are late."""
     viewer, site = playcanvas

@@ -193,7 +193,7 @@ def test_far_from_the_origin(page):
 
 @pytest.mark.parametrize("beside", [True, False])
 @pytest.mark.parametrize("ending", ["ply", "spz", "splat"])
-@pytest.mark.quick(3)
+@pytest.mark.quick(1)
 def test_a_file_read_by_spark_and_a_decoded_scene_agree(page, ending, beside, tmp_path):
     """Beside the decoded scene, whose frame it takes, or in a frame of its own."""
     path = tmp_path / f"scene.{ending}"

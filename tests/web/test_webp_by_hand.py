@@ -391,6 +391,7 @@ def test_caches_of_invalid_size(bits, tmp_path):
     "lengths", [[], [2], [1, 2], [1, 1, 1], [1, 2, 2, 2], [3] * 7, [3] * 9, [15] * 2, [1, *[15] * 200]]
 )
 @pytest.mark.parametrize("which", range(5))
+@pytest.mark.quick(5)
 def test_incomplete_and_oversubscribed_codes(lengths, which, tmp_path):
     writer = Writer(4, 4)
     writer.put(0, 3)

@@ -223,6 +223,7 @@ def test_large(tmp_path):
     assert_exact(tmp_path, [("4096 x 4096", webp(image, method=0, quality=0), image)])
 
 
+@pytest.mark.quick(0)
 def test_groups_of_codes_and_copies_in_an_image_of_many_tiles(tmp_path):
     image = np.concatenate([image_of(content, 400, 150)[:, :, :3] for content in (quarters, pattern, photograph)])
     cases = [(f"method {method}", webp(image, method=method, quality=90), image) for method in range(7)]
