@@ -20,7 +20,7 @@ from kissgs.cli.arguments import (
     ThreadsOption,
 )
 from kissgs.cli.console import progress_bar
-from kissgs.cli.files import for_each_input, show, source, stdout
+from kissgs.cli.files import for_each_input, say_notes, show, source, stdout
 from kissgs.cli.options import origin_of
 from kissgs.core.errors import InvalidSceneError, OutputError
 
@@ -53,6 +53,7 @@ def convert(
 ) -> None:
     """Convert scenes into .ply, .compressed.ply, .spz, .splat, .glb or .spz.glb; the ending of OUT decides."""
     from kissgs.cli.tables import changes
+    from kissgs.core.origin import in_world
     from kissgs.core.splats import clean
     from kissgs.io.atomic import atomic_file, refuse_existing
     from kissgs.pipeline.read_options import ReadOptions
@@ -77,12 +78,12 @@ def convert(
             refuse_existing(target, overwrite=force)
         with progress_bar(quiet or as_json) as progress:
             splats, cleaned = clean(read_scene(source(scene), reading, threads=threads, progress=progress))
+            splats = splats if origin else in_world(splats)
             with stdout() if piped else atomic_file(target, overwrite=force) as file:
                 stream = sys.stdout.buffer if file is None else file
                 losses = write_scene(stream, splats, kind, raw_axes=raw_axes, progress=progress)
         notes = [*splats.notes, *changes(cleaned.visible), *losses]
-        if notes and not (quiet or as_json):
-            sys.stderr.write(f"kissgs: {target}: {'; '.join(notes)}\n")
+        say_notes(str(target), notes, quiet or as_json)
         if piped:
             return {}
         if not (quiet or as_json):

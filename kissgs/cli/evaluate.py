@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, cast
@@ -24,7 +25,7 @@ from kissgs.cli.arguments import (
     SplitOption,
     ViewsOption,
 )
-from kissgs.cli.files import print_json, show
+from kissgs.cli.files import print_json, say_notes, show
 from kissgs.cli.options import choice, device_of, open_views
 
 
@@ -65,6 +66,7 @@ def evaluate(
 ) -> None:
     """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""
     from kissgs.cli.console import progress_bar
+    from kissgs.core.origin import with_origin
     from kissgs.evaluation.evaluate import evaluate as measure
     from kissgs.evaluation.html import ReportScene, html_report
     from kissgs.evaluation.results import Split
@@ -84,6 +86,7 @@ def evaluate(
             ReportScene(name=path.name, splats=loaded(path, progress=progress), bytes=stored_bytes(path))
             for path in (reference, candidate)
         ]
+        sides[1] = replace(sides[1], splats=with_origin(sides[1].splats, sides[0].splats.origin))
         scenes = sides[0].splats, sides[1].splats
         result = measure(
             *scenes,
@@ -101,6 +104,8 @@ def evaluate(
             page = html_report(result, sides[0], sides[1], device=render_device, threads=threads, progress=progress)
             with atomic_file(html, overwrite=force) as file:
                 file.write(page.encode(errors="replace"))  # file names may be invalid UTF-8
+    for side in sides:
+        say_notes(side.name, side.splats.notes, quiet)
     if scenes[0].antialiased != scenes[1].antialiased and not quiet:
         marked, other = sides if scenes[0].antialiased else sides[::-1]
         sys.stderr.write(

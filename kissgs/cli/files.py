@@ -8,7 +8,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -261,6 +261,12 @@ def write_stdout(data: bytes) -> None:
     """Write bytes to standard output."""
     with stdout():
         sys.stdout.buffer.write(data)
+
+
+def say_notes(name: str, notes: Sequence[str], quiet: bool) -> None:
+    """Print what reading a scene left out or changed on standard error."""
+    if notes and not quiet:
+        sys.stderr.write(f"kissgs: {name}: {'; '.join(notes)}\n")
 
 
 def show(what: RenderableType) -> None:

@@ -22,7 +22,7 @@ from kissgs.cli.arguments import (
     ScaleOption,
     ViewsOption,
 )
-from kissgs.cli.files import for_each_input, names_folder, show, write_stdout
+from kissgs.cli.files import for_each_input, names_folder, say_notes, show, write_stdout
 from kissgs.cli.options import device_of, open_views
 from kissgs.core.errors import UnsupportedError
 
@@ -180,6 +180,7 @@ def render(
             progress("write", 0.0)
             data = _encoded(rendered, suffix, FPS if fps is None else fps, QUALITY if quality is None else quality)
             progress("write", 1.0)
+        say_notes(name, job.splats.notes, quiet)
         _deliver(data, target, force=force)
         x, y, z = job.splats.origin
         world = [view.relative_to((-x, -y, -z)) for view in rendered.views]

@@ -135,7 +135,7 @@ def compaction_table(report: CompactionReport, target: str) -> RenderableType:
         (f"{report.count:,} Gaussians", "bold green"),
         f", {seconds:.1f} s",
     )
-    return Group(head, *_compaction(report))
+    return Group(head, *_compaction(report), *_changes(report.cleaned.as_dict()))
 
 
 def streamed_table(report: StreamedReport, target: str) -> RenderableType:

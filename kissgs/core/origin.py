@@ -16,7 +16,7 @@ import numpy as np
 from kissgs.core.array_types import Float, Float32, Float64
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.signed_log import signed_log
-from kissgs.core.splats import Splats
+from kissgs.core.splats import MEAN_LIMIT, Splats
 
 Origin = tuple[float, float, float]
 
@@ -59,7 +59,28 @@ def centred(splats: Splats) -> Splats:
 
 def middle_of(blocks: Iterable[Splats]) -> Origin:
     """Return the origin of :func:`centred` for a scene in blocks, by every 16th Gaussian."""
-    return _middle(np.concatenate([world_positions(block)[::16] for block in blocks]))
+    return _middle(np.concatenate([np.empty((0, 3)), *(world_positions(block)[::16] for block in blocks)]))
+
+
+def from_world(splats: Splats, positions: Float64[np.ndarray, "N 3"], origin: Origin | None = None) -> Splats:
+    """Return the scene at positions of the world, as float32 relative to an origin.
+
+    A note says if float32 is too coarse for objects so far apart.
+
+    Args:
+        splats: the scene, whose own positions are ignored.
+        positions: ``(N, 3)`` world units.
+        origin: the origin; None for that of :func:`origin_for`.
+    """
+    origin = origin_for(positions, splats.scales) if origin is None else origin
+    relative = positions - np.array(origin)
+    with np.errstate(over="ignore", invalid="ignore"):
+        means = relative.astype(np.float32)
+        share = _rounded_share(relative, splats.scales)
+    notes = splats.notes
+    if share > COARSE_SHARE:
+        notes = (*notes, f"positions are rounded to float32, too coarsely for {share:.0%} of the Gaussians")
+    return replace(splats, means=means, origin=origin, notes=notes)
 
 
 def origin_for(positions: Float64[np.ndarray, "N 3"], scales: Float32[np.ndarray, "N 3"]) -> Origin:
@@ -69,10 +90,15 @@ def origin_for(positions: Float64[np.ndarray, "N 3"], scales: Float32[np.ndarray
         positions: ``(N, 3)`` in the world, world units; NaN and infinities are left out.
         scales: ``(N, 3)`` logarithms of standard deviations.
     """
+    return _middle(positions) if _rounded_share(positions, scales) > COARSE_SHARE else WORLD
+
+
+def _rounded_share(positions: Float64[np.ndarray, "N 3"], scales: Float32[np.ndarray, "N 3"]) -> float:
+    """Return the share of positions that are coarse as float32; those that overflow it are left out."""
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.abs(positions - positions.astype(np.float32)).max(axis=1, initial=0)
     finite = np.isfinite(errors)
-    return _middle(positions) if coarse_share(errors[finite], scales[finite]) > COARSE_SHARE else WORLD
+    return coarse_share(errors[finite], scales[finite])
 
 
 def coarse_share(errors: Float[np.ndarray, " N"], scales: Float32[np.ndarray, "N 3"]) -> float:
@@ -109,7 +135,9 @@ def coarse_note(
     step = float(np.median(steps[chances > 0]))
     near = wide - np.rint(np.median(wide, axis=0))
     moved = coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean() <= COARSE_SHARE
-    remedy = "origin=auto moves the scene there" if moved else "streamed SOG (lod-meta.json) has a range for each chunk"
+    remedy = "origin=auto moves the scene there"
+    if not moved:
+        remedy = "objects far apart need files of their own, or streamed SOG (lod-meta.json) with its many ranges"
     return (
         f"positions have steps of about {step:.2g}, too coarse for {share:.0%} of the Gaussians, because a container "
         f"has fine steps only near the origin: {remedy}"
@@ -135,11 +163,11 @@ def read_origin(document: Mapping[str, Any], name: str) -> Origin:
     own = document.get("kissgs")
     found = own.get("origin", WORLD) if isinstance(own, dict) else WORLD
     try:
-        x, y, z = (float(value) if isinstance(value, int | float) else math.nan for value in found)
+        x, y, z = (float(value) if type(value) in (int, float) else math.nan for value in found)
     except (TypeError, ValueError, OverflowError):
         x = y = z = math.nan
-    if not all(map(math.isfinite, (x, y, z))):
-        raise InvalidContainerError(f"{name}: kissgs.origin is not three finite numbers; export the scene again")
+    if not all(abs(value) <= MEAN_LIMIT for value in (x, y, z)):
+        raise InvalidContainerError(f"{name}: kissgs.origin is not three numbers up to 1e15; export the scene again")
     return x, y, z
 
 
@@ -153,7 +181,8 @@ def coarse_chances(
         sizes: ``(N,)`` those of :func:`visible_sizes`.
         extents: ``(3,)`` extents of the signed logarithms' ranges, per axis.
     """
-    half_steps = np.maximum((1 + np.abs(positions)) * extents / CONTAINER_LEVELS / 2, 1e-300)
+    rounded = np.spacing(np.abs(signed_log(positions)).astype(np.float32))  # of the range's ends, which are float32
+    half_steps = np.maximum((1 + np.abs(positions)) * (extents / CONTAINER_LEVELS + rounded) / 2, 1e-300)
     chances: Float64[np.ndarray, " N"] = 1 - np.minimum(COARSE_ERROR * sizes[:, None] / half_steps, 1).prod(axis=1)
     return chances
 

@@ -119,7 +119,8 @@ def fitting_views(
     samples, source = _samples(views), views.source
     views, fit, note = _best(splats, views, samples, threads)
     problem = _problem(fit, source, len(samples))
-    if samples and not force and fit.quality < LEAST_PSNR:
+    refused = not fit.seen or (fit.psnr < LEAST_PSNR and fit.psnr_inside < USUAL_PSNR)
+    if samples and not force and refused:
         raise InvalidViewsError(
             f"{problem}: give the capture of this scene, with dataparser_transforms.json beside it if nerfstudio "
             "trained the scene, or --force-views (in Python force_views) to use it all the same"

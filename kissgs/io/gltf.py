@@ -16,7 +16,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.core.origin import WORLD, Origin, origin_for
+from kissgs.core.origin import WORLD, from_world, origin_for
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.activations import log_scales, opacity_logits, steps
@@ -126,34 +126,26 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
         refuse_more_than(max_gaussians, count, document.name)
         progress("read", 0.0)
         splats = empty_splats(count, SH_REST_COUNTS[max(primitive.degree for primitive in found)])
-        start, origin = 0, None
+        start, placed = 0, np.empty((count, 3))
         for primitive in found:
-            part = splats.select(slice(start, start + primitive.count))
+            rows = slice(start, start + primitive.count)
+            part = splats.select(rows)
             if primitive.spz is None:
                 _read_attributes(document, primitive, part)
             else:
                 notes |= dict.fromkeys(_read_spz(document, primitive.spz, part))
-            if origin is None:
-                origin = _origin(primitive.matrix, part)
-            matrix = primitive.matrix.copy()  # several primitives may share it
-            matrix[:3, 3] -= origin
-            _apply(document, matrix, part)
+            with np.errstate(all="ignore"):  # numbers that overflow are refused
+                placed[rows] = part.means.astype(np.float64) @ primitive.matrix[:3, :3].T + primitive.matrix[:3, 3]
+            _apply(document, primitive.matrix, part)
             start += primitive.count
             progress("read", start / max(count, 1))
     _turn_to_ply(splats)
     if left_out:
         notes[f"left out: {listed(list(left_out))}"] = None
-    x, y, z = (float(sign * value) + 0.0 for sign, value in zip(TO_PLY, origin or WORLD, strict=True))
-    whole = replace(splats, origin=(x, y, z), notes=tuple(notes))
+    whole = replace(splats, notes=tuple(notes))
+    if (world := placed * TO_PLY).size and origin_for(world, whole.scales) != WORLD:
+        whole = from_world(whole, world)
     return marked(whole, [primitive.antialiased for primitive in found])
-
-
-@np.errstate(all="ignore")  # numbers that overflow are refused where they are used
-def _origin(matrix: Float64[np.ndarray, "4 4"], splats: Splats) -> Origin:
-    """Return the origin that Gaussians need once the transform of their node has moved them."""
-    linear = matrix[:3, :3]
-    growth = np.float32(np.log(np.abs(np.linalg.det(linear))) / 3)
-    return origin_for(splats.means.astype(np.float64) @ linear.T + matrix[:3, 3], splats.scales + growth)
 
 
 def _primitives(document: Document, left_out: dict[str, None]) -> Iterator[_Primitive]:

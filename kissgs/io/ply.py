@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Shaped
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.core.origin import WORLD, in_world, origin_for, world_positions
+from kissgs.core.origin import WORLD, Origin, from_world, in_world, origin_for, world_positions
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats
 from kissgs.io.compressed_ply import PACKED, check_compressed, is_compressed, read_compressed
@@ -26,9 +26,10 @@ _SCALE = ("scale_0", "scale_1", "scale_2")
 _OPACITY = ("opacity",)
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 _RGB = ("red", "green", "blue")
-_FILTER = "filter_3D"
+_FILTER = "filter_3d"
+"""Name of Mip-Splatting's property in lower case; its own spelling is ``filter_3D``."""
 
-_KNOWN = {*_POSITION, *_NORMAL, *_ROTATION, *_SCALE, *_OPACITY, *_COLOUR, *_RGB, "alpha", _FILTER, *PACKED}
+_KNOWN = {*_POSITION, *_NORMAL, *_ROTATION, *_SCALE, *_OPACITY, *_COLOUR, *_RGB, "alpha", *PACKED}
 """Properties that are read or repeat what others say, as ``red`` does beside ``f_dc_0``; INRIA's normals are zero."""
 
 _KNOWN_ELEMENTS = {
@@ -38,8 +39,8 @@ _KNOWN_ELEMENTS = {
 """Elements that are read or say how the scene was taken, as those of PCL and SHARP do."""
 
 _IN_TIME = re.compile(
-    r"(trbf|motion|omega|velocity|rot_r|f_t|f_dc_t|f_rest_t|scale_t|scaling_t|delta_[xyz]|delta_rot)(_\w+)?"
-    r"|t|mu_t|t_scale|time|dt|duration|v[xyz]"
+    r"(trbf|motion|omega|velocity|rot_[rlt]|f_t|f_dc_t|f_rest_t|sh_t|scale_t|scaling_t|opacity_t|cov_t|marginal_t|"
+    r"delta_[xyz]|delta_rot)(_\w+)?|t|mu_t|t_mean|t_scale|time|time_center|dt|duration|lifespan|v[xyz]"
 )
 """Properties that move Gaussians or change them in time, as SpacetimeGaussians, 4DGS and FreeTimeGS name them."""
 
@@ -102,7 +103,7 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
         progress("read", 0.0)
         read = read_compressed if info.compressed else _read_columns
         splats = read(ply, info.sh_degree, progress)
-        return replace(splats, antialiased=info.antialiased, notes=_notes(ply.header))
+        return replace(splats, antialiased=info.antialiased, notes=(*_notes(ply.header), *splats.notes))
 
 
 def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Splats]:
@@ -117,12 +118,14 @@ def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Sp
         if info.compressed:
             yield replace(read_compressed(ply, info.sh_degree, progress), notes=_notes(ply.header))
             return
-        columns, waiting, done = _Columns(ply.header.elements["vertex"], info.sh_degree), [], 0
+        columns, waiting, done = _Columns(ply.header.elements["vertex"], info.encoding, info.sh_degree), [], 0
+        origin = columns.origin(rows(ply, columns.vertex)) if columns.wide else WORLD
         for block in rows(ply, columns.vertex):
-            waiting.append(columns.splats(block))
+            waiting.append(columns.splats(block, origin))
             done += len(block)
             if sum(map(len, waiting)) >= BLOCK or done == info.count:
-                yield replace(concatenate(waiting), antialiased=info.antialiased, notes=_notes(ply.header))
+                notes = dict.fromkeys([*_notes(ply.header), *(note for each in waiting for note in each.notes)])
+                yield replace(concatenate(waiting), antialiased=info.antialiased, notes=tuple(notes))
                 waiting = []
                 progress("read", done / info.count)
 
@@ -208,14 +211,23 @@ def _require_gaussians(header: Header, name: str) -> None:
 def _notes(header: Header) -> tuple[str, ...]:
     """Return what becomes of properties and elements beyond those of 3D Gaussians."""
     names = [p.name for p in header.elements["vertex"].properties]
-    unknown = [name for name in names if name not in _KNOWN and not re.fullmatch(r"f_rest_[0-9]+", name)]
+    unknown = [
+        name
+        for name in names
+        if name not in _KNOWN and name.lower() != _FILTER and not re.fullmatch(r"f_rest_[0-9]+", name)
+    ]
     unknown += [f"element {e.name}" for e in header.elements.values() if e.count and e.name not in _KNOWN_ELEMENTS]
     notes = []
-    if _FILTER in names:
-        notes.append(f"the filters of Mip-Splatting ({_FILTER}) are applied to scales and opacities")
+    if (name := _filter_of(header.elements["vertex"])) is not None:
+        notes.append(f"the filters of Mip-Splatting ({name}) are applied to scales and opacities")
     if unknown:
         notes.append(f"left out: {listed(unknown)}")
     return tuple(notes)
+
+
+def _filter_of(vertex: Element) -> str | None:
+    """Return the name of the property with Mip-Splatting's filters, in any case; None without one."""
+    return next((p.name for p in vertex.properties if p.name.lower() == _FILTER), None)
 
 
 def _has_rgb(vertex: Element) -> bool:
@@ -229,36 +241,39 @@ def _rest(k: int) -> tuple[str, ...]:
 
 
 def _read_columns(ply: PlyFile, degree: int, progress: Progress) -> Splats:
-    columns = _Columns(ply.header.elements["vertex"], degree)
-    count, start = columns.vertex.count, 0
+    columns = _Columns(ply.header.elements["vertex"], ply.header.encoding, degree)
+    count, start, positions = columns.vertex.count, 0, list[np.ndarray]()
     splats = empty_splats(count, SH_REST_COUNTS[degree])
     for block in rows(ply, columns.vertex):
         columns.copy(block, splats.select(slice(start, start + len(block))))
+        positions += [_float64(block, _POSITION)] * columns.wide
         start += len(block)
         progress("read", start / count)
-    return replace(splats, origin=columns.origin)
+    return from_world(splats, np.concatenate(positions)) if positions else splats
 
 
 class _Columns:
     """The properties of a ``.ply`` that each array of a scene is read from."""
 
-    def __init__(self, vertex: Element, degree: int) -> None:
+    def __init__(self, vertex: Element, encoding: Encoding, degree: int) -> None:
         self.vertex = vertex
         self._k = SH_REST_COUNTS[degree]
         self._rgb = _has_rgb(vertex)
-        self._filtered = any(p.name == _FILTER for p in vertex.properties)
-        self._origin: tuple[float, float, float] | None = None
+        self._filter = _filter_of(vertex)
+        self._dtype = vertex.dtype(encoding)
+        types = {p.code for p in vertex.properties if p.name in _POSITION}
+        self.wide = encoding == "ascii" or not types <= {"f4", "f2", "i1", "u1", "i2", "u2"}
 
-    @property
-    def origin(self) -> tuple[float, float, float]:
-        """Origin of the positions, which the first rows decide."""
-        return self._origin or WORLD
+    def origin(self, blocks: Iterable[np.ndarray]) -> Origin:
+        """Return the origin of a scene whose positions may have more digits than float32, by every 16th row."""
+        some = np.concatenate([np.empty(0, self._dtype), *(block[::16] for block in blocks)])
+        return origin_for(_float64(some, _POSITION), self.splats(some, WORLD).scales)
 
-    def splats(self, block: np.ndarray) -> Splats:
-        """Return the Gaussians of some rows."""
+    def splats(self, block: np.ndarray, origin: Origin) -> Splats:
+        """Return the Gaussians of some rows, relative to ``origin``."""
         splats = empty_splats(len(block), self._k)
         self.copy(block, splats)
-        return replace(splats, origin=self.origin)
+        return from_world(splats, _float64(block, _POSITION), origin) if self.wide else splats
 
     def copy(self, block: np.ndarray, out: Splats) -> None:
         """Copy rows to the arrays of ``out``, of the same length."""
@@ -277,14 +292,10 @@ class _Columns:
             for names, array in groups.items():
                 for i, name in enumerate(names):
                     array[:, i] = block[name]
-            if self._origin is None:
-                self._origin = origin_for(_float64(block, _POSITION), out.scales)
-            if self.origin != WORLD:
-                out.means[:] = _float64(block, _POSITION) - np.array(self.origin)
         if self._rgb:
             _colour_to_sh(out.sh0)
-        if self._filtered:
-            _apply_filters(block[_FILTER], out)
+        if self._filter is not None:
+            _apply_filters(block[self._filter], out)
 
 
 @np.errstate(all="ignore")  # values may be any floats; they are not cleaned here

@@ -17,7 +17,7 @@ BLOCK_ALIGNMENT = 256
 """Row count that the blocks of :func:`rows`, except the last, are multiples of in binary files."""
 
 _INFINITY = re.compile(r"(?<!\S)([+-]?)1\.#inf\d*(e[+-]?\d+)?(?!\S)", re.IGNORECASE)
-_NAN = re.compile(r"(?<!\S)[+-]?(nan(\([^\s()]*\)|[qs])|1\.#[a-z]+\d*(e[+-]?\d+)?|1\.\$)(?!\S)", re.IGNORECASE)
+_NAN = re.compile(r"(?<!\S)[+-]?(nan(\([^\s()]*\)|[qs])|[qs]nan|1\.#[a-z]+\d*(e[+-]?\d+)?|1\.\$)(?!\S)", re.IGNORECASE)
 """Infinity and NaN as C libraries print them, and Python does not read them.
 
 ``nan(snan)``, ``-nan(ind)``, ``nan(0x7fc00000)``, ``nanq``; of Visual C++ before 2015 ``1.#INF``, ``-1.#IND``,

@@ -68,6 +68,7 @@ def _facts(
         parts=sizes,
         ranges=ranges([part.container for part in parts]),
         details={
+            "origin": list(manifest.origin),
             "level": level,
             "levels": [manifest.count(one) for one in range(manifest.levels)],
             "environment": parts[-1].count if manifest.environment is not None else 0,

@@ -366,5 +366,6 @@ def _evaluate(
     progress("evaluate", 0.0)
     most = ReadOptions(max_gaussians=max(len(splats), MAX_GAUSSIANS))
     decoded = read_scene(container, most, threads=threads)
-
-    return evaluate(splats, decoded, views, threads=threads, progress=as_stage("evaluate", progress))
+    x, y, z = splats.origin
+    world = None if views is None else views.relative_to((-x, -y, -z))
+    return evaluate(splats, decoded, world, threads=threads, progress=as_stage("evaluate", progress))

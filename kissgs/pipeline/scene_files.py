@@ -118,7 +118,8 @@ def open_scene(
         KissgsError: the scene cannot be read.
     """
     if isinstance(source, Splats):
-        splats, cleaned = clean(centred(source) if reading.origin == "auto" else source)
+        splats = reading.marked(source)
+        splats, cleaned = clean(centred(splats) if reading.origin == "auto" else splats)
         return splats, cleaned, source.nbytes
     progress("read", 0.0)
     scene = source if isinstance(source, bytes) else Path(source)

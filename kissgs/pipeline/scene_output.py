@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from kissgs.core.errors import OutputError
-from kissgs.core.origin import WORLD, relative_to
+from kissgs.core.origin import WORLD, origin_for, relative_to, world_positions
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.io.container_names import ENDINGS
@@ -53,7 +53,9 @@ def write_scene(
     notes = _write_cleaned(file, splats, kind, raw_axes, progress)
     if splats.origin != WORLD:
         kept = "records it as a translation" if kind.endswith("glb") else "does not record it"
-        notes = (*notes, f"{relative_to(splats.origin)}, because float32 would round them; .{kind} {kept}")
+        rounded = origin_for(world_positions(splats), splats.scales) != WORLD
+        reason = ", because float32 would round those of the world" if rounded else ""
+        notes = (*notes, f"{relative_to(splats.origin)}{reason}; .{kind} {kept}")
     return notes
 
 

@@ -113,7 +113,7 @@ def partition(
     antialiased = False
     for block in counted():
         splats, cleaned = clean(block)
-        notes = tuple(reading_notes(splats))
+        notes = tuple(dict.fromkeys([*notes, *reading_notes(splats)]))
         visible = visible_gaussians(splats, settings)
         changed.update({**cleaned.as_dict(), "invisible": len(splats) - len(visible)})
         splats, sh_degree, antialiased = splats.select(visible), splats.sh_degree, splats.antialiased

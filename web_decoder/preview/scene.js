@@ -14,6 +14,9 @@ export const baseColour = (sh0) => 0.5 + SH_CONSTANT * sh0;
 /** Whether a container says that its scene was trained with antialiasing. @param {Scene} scene */
 export const isAntialiased = ({ meta }) => String(meta?.model ?? meta?.asset?.model).toLowerCase() === "antialiased";
 
+/** Point of the world that positions are relative to. @param {Scene} scene @returns {[number, number, number]} */
+export const originOf = ({ meta }) => meta?.kissgs?.origin ?? [0, 0, 0];
+
 /** Stages of decoding, each of which is worth a new rendering. */
 export const STAGES = /** @type {const} */ ({ nothing: 0, coarse: 1, base: 2, whole: 3 });
 

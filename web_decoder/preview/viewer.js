@@ -9,7 +9,7 @@ import { extentOfMesh, extentOfScene } from "./extent.js";
 import { marker } from "./marker.js";
 import { pack } from "./pack.js";
 import { readPixels } from "./pixels.js";
-import { isAntialiased } from "./scene.js";
+import { isAntialiased, originOf } from "./scene.js";
 import { meshOf } from "./streamed_meshes.js";
 
 /**
@@ -36,6 +36,9 @@ export class Viewer {
   #encoding = WIDE_RANGES;
   #requested = 0;
   #disposed = false;
+
+  /** Point of the world that the scene's positions are relative to. @type {number[]} */
+  origin = [0, 0, 0];
 
   /**
    * @param {HTMLCanvasElement} canvas
@@ -90,6 +93,7 @@ export class Viewer {
     const { splats, encoding } = pack(scene, this.#extent.centre, { size: sized ? null : spacing / 2, spherical });
     this.#encoding = encoding;
     this.antialiased = isAntialiased(scene);
+    this.origin = originOf(scene);
     this.#replace(new SplatMesh({ packedSplats: splats, splatEncoding: encoding })); // or the mesh would reset it
   }
 
@@ -109,7 +113,7 @@ export class Viewer {
     this.#shown = null;
     this.antialiased = marked;
     this.#extent = beside?.extent ?? extentOfMesh(mesh, pointsUp(type));
-    const [x, y, z] = this.#extent.centre;
+    const [x, y, z] = this.#extent.centre.map((value, axis) => value + (beside?.origin[axis] ?? 0));
     mesh.position.set(-x, y, z);
     this.#replace(mesh, pointsUp(type));
     return mesh.numSplats;
