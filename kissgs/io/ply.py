@@ -246,7 +246,8 @@ def _read_columns(ply: PlyFile, degree: int, progress: Progress) -> Splats:
     splats = empty_splats(count, SH_REST_COUNTS[degree])
     for block in rows(ply, columns.vertex):
         columns.copy(block, splats.select(slice(start, start + len(block))))
-        positions += [_float64(block, _POSITION)] * columns.wide
+        if columns.wide:
+            positions.append(_float64(block, _POSITION))
         start += len(block)
         progress("read", start / count)
     return from_world(splats, np.concatenate(positions)) if positions else splats
@@ -313,6 +314,7 @@ def _apply_filters(filters: Shaped[np.ndarray, " N"], out: Splats) -> None:
     out.opacities[rows] = log_opacities - np.log(-np.expm1(log_opacities))
 
 
+@np.errstate(invalid="ignore")  # signalling NaN
 def _float64(block: np.ndarray, names: tuple[str, ...]) -> Float64[np.ndarray, "B C"]:
     return np.stack([block[name].astype(np.float64) for name in names], axis=1)
 
