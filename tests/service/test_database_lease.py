@@ -18,6 +18,8 @@ from service.storage import database_lease
 from service.storage.database_health import DatabaseReplacedError
 from service.storage.job_records import Store
 
+pytestmark = pytest.mark.quick(0)
+
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def url(request, tmp_path):
@@ -150,8 +152,6 @@ def test_a_service_whose_lease_was_taken_over(tmp_path, url):
 ACQUIRE = """
 import sys, time
 from service.storage.job_records import Store
-
-pytestmark = pytest.mark.quick(0)
 store = Store(sys.argv[1], time.time)
 print("ready", flush=True)
 sys.stdin.readline()
