@@ -255,7 +255,7 @@ def info_table(info: Info) -> RenderableType:
         whole = f"total of level {info.details['level']}" if streamed else "total"
         blocks.insert(2, parts_table(info.parts, info.count, whole))
     details = info.details
-    if any(details.get("origin", ())):
+    if "origin" in details:
         blocks.append(Text(relative_to(tuple(details["origin"]))))
     if info.kind == "sogxt":
         origin = "unknown"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kissgs.core.origin import recorded
 from kissgs.core.signed_log import signed_exp
 from kissgs.io.packed_files import open_source
 from kissgs.pipeline.container_facts import Facts, stored_size
@@ -29,7 +30,7 @@ def sog_facts(path: Path) -> Facts:
         parts=parts,
         ranges=sog_ranges([layout]),
         details={
-            "origin": list(layout.origin),
+            **recorded(layout.origin),
             "version": layout.version,
             "antialiased": layout.antialiased,
             "model": layout.model,

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.errors import InvalidContainerError
+from kissgs.core.origin import recorded
 from kissgs.core.signed_log import signed_exp
 from kissgs.io.packed_files import Source, open_source
 from kissgs.pipeline.container_facts import Facts
@@ -40,7 +41,7 @@ def sogxt_facts(path: Path) -> Facts:
         ranges=sogxt_ranges([layout]),
         changed=made.changed if made else {},
         details={
-            "origin": list(layout.origin),
+            **recorded(layout.origin),
             "grid_side": layout.grid_side,
             "codebook_side": layout.codebook_side,
             "version": made.version if made else None,

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from kissgs.core.origin import recorded
 from kissgs.io.packed_files import Source
 from kissgs.io.streamed import C, Part, StreamedFormat
 from kissgs.pipeline.container_facts import Facts, stored_size
@@ -68,7 +69,7 @@ def _facts(
         parts=sizes,
         ranges=ranges([part.container for part in parts]),
         details={
-            "origin": list(manifest.origin),
+            **recorded(manifest.origin),
             "level": level,
             "levels": [manifest.count(one) for one in range(manifest.levels)],
             "environment": parts[-1].count if manifest.environment is not None else 0,

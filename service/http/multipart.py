@@ -21,10 +21,8 @@ MAX_PREAMBLE_BYTES = 8192
 _PARAMETER = re.compile(rb';[ \t]*([^\s;="]+)[ \t]*=[ \t]*("(?:[^"\\]|\\.)*"|[^;"]*)')
 """Name and value of a parameter of a header."""
 
-_EXTENDED = re.compile(
-    rb"(utf-?8|iso-8859-1|windows-1252|us-ascii)'[A-Za-z0-9-]*'((?:[^;%\"\x00-\x1f\x7f]|%[0-9A-F]{2})+)", re.IGNORECASE
-)
-"""Value of a parameter with an encoding and percent-escapes, as RFC 8187 has it, and as clients write it."""
+_EXTENDED = re.compile(rb"(utf-?8|iso-8859-1)'[A-Za-z0-9-]*'((?:[!#$&+.^_`|~A-Za-z0-9-]|%[0-9A-F]{2})+)", re.IGNORECASE)
+"""Value of a parameter with an encoding and percent-escapes, as RFC 8187 permits it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,7 +83,7 @@ def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed
             return kissgs.compress(
                 Path(task["source"]),
                 settings=kissgs.Settings.model_validate(task["settings"]),
-                reading=kissgs.ReadOptions(origin=task["origin"]),
+                reading=kissgs.ReadOptions(origin=task.get("origin")),
                 container=task["format"],
                 evaluate=task["evaluate"],
                 checkpoint=checkpoint,
