@@ -79,8 +79,13 @@ def opened(server, preview):  # noqa: F811
 
 def facts(tab):
     """Return what the statistics say, by name, each with its remark."""
-    found = tab.page.locator("#statistics .facts > div").all_inner_texts()
-    return {name: tuple(rest) for name, *rest in (text.split("\n") for text in found)}
+    rows = tab.page.locator("#statistics .facts > div")
+    for _ in range(100):  # texts have lines only once the page has laid them out
+        found = {name: tuple(rest) for name, *rest in (text.split("\n") for text in rows.all_inner_texts())}
+        if all(found.values()):
+            break
+        tab.page.wait_for_timeout(100)
+    return found
 
 
 def asked(tab):
