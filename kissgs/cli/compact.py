@@ -20,7 +20,7 @@ from kissgs.cli.arguments import (
     SetOption,
     ThreadsOption,
 )
-from kissgs.cli.files import for_each_input, show, sibling, source, stdout
+from kissgs.cli.files import for_each_input, say_notes, show, sibling, source, stdout
 from kissgs.cli.options import chosen, count_of, device_of, open_views, refuse_without_training, share_of
 from kissgs.core.errors import UnsupportedError
 
@@ -140,6 +140,7 @@ def compact(
         if piped:
             import sys
 
+            say_notes(scene, (result.report.note, *result.report.cleaned.notes), quiet)
             with stdout():
                 write_ply(sys.stdout.buffer, result.splats)
             delete_checkpoints(result.checkpoint)

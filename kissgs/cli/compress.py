@@ -121,7 +121,7 @@ def compress(
 
     named = None if output is None else Path(output)
     manifest = None if named is None else named_manifest(named)
-    kind = named_container(container, None if manifest else named)
+    kind = named_container(container, None if manifest else output)
     reading = ReadOptions(
         max_gaussians=max_gaussians,
         level=level,

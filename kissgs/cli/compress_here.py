@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from kissgs.cli.compact import CHECKPOINT
 from kissgs.cli.console import progress_bar
-from kissgs.cli.files import show, sibling, source, write_stdout
+from kissgs.cli.files import say_notes, show, sibling, source, write_stdout
 from kissgs.cli.signals import stoppable
 from kissgs.pipeline.pipeline import compress
 from kissgs.pipeline.training_choice import decided
@@ -55,6 +55,7 @@ def compress_here(options: CompressOptions, capture: Views | None, scene: str, t
             progress=progress,
         )
     if piped:
+        say_notes(scene, (result.report.note, *result.report.cleaned.notes), options.quiet)
         write_stdout(result.to_zip())
         delete_checkpoints(*result.checkpoints)
     elif not options.quiet:

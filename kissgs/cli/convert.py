@@ -52,7 +52,6 @@ def convert(
     quiet: QuietOption = False,
 ) -> None:
     """Convert scenes into .ply, .compressed.ply, .spz, .splat, .glb or .spz.glb; the ending of OUT decides."""
-    from kissgs.cli.tables import changes
     from kissgs.core.origin import in_world
     from kissgs.core.splats import clean
     from kissgs.io.atomic import atomic_file, refuse_existing
@@ -82,7 +81,7 @@ def convert(
             with stdout() if piped else atomic_file(target, overwrite=force) as file:
                 stream = sys.stdout.buffer if file is None else file
                 losses = write_scene(stream, splats, kind, raw_axes=raw_axes, progress=progress)
-        notes = [*splats.notes, *changes(cleaned.visible), *losses]
+        notes = [*splats.notes, *cleaned.notes, *losses]
         say_notes(str(target), notes, quiet or as_json)
         if piped:
             return {}

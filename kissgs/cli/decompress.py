@@ -20,7 +20,7 @@ from kissgs.cli.arguments import (
     ThreadsOption,
 )
 from kissgs.cli.console import progress_bar
-from kissgs.cli.files import for_each_input, show, source, stdout
+from kissgs.cli.files import for_each_input, say_notes, show, source, stdout
 from kissgs.core.errors import InvalidContainerError
 
 
@@ -61,6 +61,7 @@ def decompress(
                 threads=threads,
                 progress=progress,
             )
+        say_notes(str(target), splats.notes, quiet or as_json)
         if piped:
             from kissgs.io.ply import write_ply
 
@@ -70,7 +71,7 @@ def decompress(
         if not (quiet or as_json):
             from kissgs.cli.tables import gaussians
 
-            show("\n".join([f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}", *splats.notes]))
+            show(f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}")
         size = target.stat().st_size
         return {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": size, "notes": list(splats.notes)}
 

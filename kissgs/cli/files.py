@@ -118,7 +118,7 @@ def _entry(name: str, target: Path, writes: bool, report: dict[str, Any]) -> dic
 
 def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folder: bool) -> list[Path]:
     """Return the output path of each input: next to it, in the folder ``output``, or the file ``output``."""
-    from kissgs.io.container_names import named_manifest
+    from kissgs.io.container_names import FOLDER_ENDING, named_manifest, names_folder
 
     if "-" in inputs and (len(inputs) > 1 or output is None):
         raise OutputError("standard input has no name and must be the only input; give the output with -o")
@@ -137,7 +137,7 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
         if not stem:
             raise OutputError(f"{name} has no name to derive the output from; give the output with -o")
         folder = output if output is not None else Path(name).parent
-        targets.append(folder / (stem + (suffix or ".container")))
+        targets.append(folder / (stem + (suffix or FOLDER_ENDING)))
     if len(set(targets)) < len(targets):
         raise OutputError("two inputs have the same name and would become one file; process them one by one")
     return targets
@@ -166,8 +166,7 @@ def _refuse_file_name(folder: Path, suffix: str) -> None:
             f"{folder!s:.100} has the ending of another format than {suffix}, which this command writes; use kissgs "
             + ("compress" if ending in ENDINGS else "convert")
         )
-    known = " or ".join(ENDINGS if suffix in ENDINGS else (suffix,))
-    raise OutputError(f"{folder!s:.100} has an unknown ending; end it in {known}, or if it is a folder, in a slash")
+    raise OutputError(f"{folder!s:.100} has an unknown ending; end it in {suffix}, or if it is a folder, in a slash")
 
 
 def _ends_with(path: Path, suffix: str) -> bool:
@@ -198,12 +197,6 @@ def _stem(name: str) -> str:
         return path.name
     ending = next((ending for ending in _DOUBLE_ENDINGS if path.name.lower().endswith(ending)), path.suffix)
     return path.name[: len(path.name) - len(ending)]
-
-
-def names_folder(output: str) -> bool:
-    """Whether an output is a folder: it exists, or ends in a slash, or has no ending, or one of digits (``v1.2``)."""
-    ending = Path(output).suffix[1:]
-    return output.endswith(_SLASHES) or not ending or ending.isdecimal() or is_folder(Path(output))
 
 
 def is_folder(path: Path) -> bool:
@@ -264,9 +257,9 @@ def write_stdout(data: bytes) -> None:
 
 
 def say_notes(name: str, notes: Sequence[str], quiet: bool) -> None:
-    """Print what reading a scene left out or changed on standard error."""
-    if notes and not quiet:
-        sys.stderr.write(f"kissgs: {name}: {'; '.join(notes)}\n")
+    """Print what reading a scene left out or changed on standard error; empty notes count for nothing."""
+    if any(notes) and not quiet:
+        sys.stderr.write(f"kissgs: {name}: {'; '.join(filter(None, notes))}\n")
 
 
 def show(what: RenderableType) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 from kissgs.core.errors import UnsupportedError
-from kissgs.io.container_names import ENDINGS, FILE_ENDINGS
+from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
@@ -101,7 +101,7 @@ def _is_host(word: str) -> bool:
     """
     if word.startswith("-") or not word or glob.has_magic(word) or os.path.lexists(word):
         return False
-    return "://" in word or ("/" not in word and Path(word).suffix.lower() not in (*ENDINGS, *FILE_ENDINGS))
+    return "://" in word or ("/" not in word and Path(word).suffix.lower() not in (*ENDINGS, *SCENE_ENDINGS, ".json"))
 
 
 def _finetune_values(steps: str | None) -> Values:

@@ -92,7 +92,7 @@ def compress(
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
-    kind = named_container(container, None if output is None else Path(output))
+    kind = named_container(container, output)
     settings = chosen(
         preset,
         changes,

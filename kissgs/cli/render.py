@@ -22,7 +22,7 @@ from kissgs.cli.arguments import (
     ScaleOption,
     ViewsOption,
 )
-from kissgs.cli.files import for_each_input, names_folder, say_notes, show, write_stdout
+from kissgs.cli.files import for_each_input, say_notes, show, write_stdout
 from kissgs.cli.options import device_of, open_views
 from kissgs.core.errors import UnsupportedError
 
@@ -209,6 +209,8 @@ def _suffix(file: str, output: str | None) -> str:
     """Return the ending of the output: .png unless ``output`` ends in .webp."""
     if file == "-":
         raise UnsupportedError("kissgs render reads a file, not standard input")
+    from kissgs.io.container_names import names_folder
+
     if output is None or names_folder(output):
         return ".png"
     suffix = Path(output).suffix.lower()

@@ -10,6 +10,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from kissgs.core.origin import relative_to
+from kissgs.core.splats import CLEANED_TEXTS
 from kissgs.evaluation.metric_text import format_metric
 from kissgs.evaluation.results import ImageMetrics
 from kissgs.pipeline.scene_formats import CONTAINER_FORMATS, STREAMED_FORMATS
@@ -27,14 +28,7 @@ CHANGES = {
     "pruned_by_rd": "left out: rate cost above the distortion saved",
     "clipped_colors": "with an outlying base colour: clipped, to keep the quantisation step of all others small",
     "compacted": "removed by compaction",
-    "non_finite": "removed: a value is NaN or infinite",
-    "far_away": "removed: a coordinate is beyond 1e15",
-    "infinite_opacities": "with an infinite opacity logit: set to that of opacity 1e-6 or 1 - 1e-6",
-    "saturated_opacities": "with an opacity logit beyond that of 1e-6 or 1 - 1e-6: clamped",
-    "zero_quats": "with a rotation of length zero: set to the identity",
-    "unnormalised_quats": "with a rotation that is no unit quaternion: normalised",
-    "clamped_scales": "with a log-scale beyond 30: clamped",
-    "clamped_sh": "with an SH coefficient beyond 1e6: clamped",
+    **CLEANED_TEXTS,
 }
 """Text for each kind of removed or changed Gaussians, by key of the report."""
 
@@ -51,11 +45,6 @@ def size(count: float) -> str:
 def gaussians(count: int) -> str:
     """Format a number of Gaussians: "1 Gaussian", "60,000 Gaussians"."""
     return f"{count:,} Gaussian{'' if count == 1 else 's'}"
-
-
-def changes(counts: Mapping[str, int]) -> list[str]:
-    """Return a phrase for each kind of removed or changed Gaussians that occurs, by key of the report."""
-    return [f"{gaussians(count)} {CHANGES[name]}" for name, count in counts.items() if count and name in CHANGES]
 
 
 def report_table(report: Report, target: str) -> RenderableType:
@@ -305,7 +294,9 @@ def _kind(info: Info) -> str:
 
 
 def _changes(changed: Mapping[str, int]) -> list[Text]:
-    return [Text(phrase, style="yellow") for phrase in changes(changed)]
+    """Return a phrase for each kind of removed or changed Gaussians that occurs, by key of the report."""
+    known = ((count, CHANGES[name]) for name, count in changed.items() if count and name in CHANGES)
+    return [Text(f"{gaussians(count)} {text}", style="yellow") for count, text in known]
 
 
 def _right(title: str) -> Column:

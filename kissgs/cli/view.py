@@ -22,7 +22,7 @@ from kissgs.cli.arguments import (
     ThreadsOption,
 )
 from kissgs.cli.console import progress_bar
-from kissgs.cli.files import check_input, show, source
+from kissgs.cli.files import check_input, say_notes, show, source
 from kissgs.cli.interrupts import Interrupted
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 
@@ -102,6 +102,7 @@ def _write(
         chosen = f", level {level} of 0 to {levels - 1}"
     with progress_bar(quiet) as progress:
         container = page_container(content, reading, threads=threads, progress=progress)
+    say_notes(scene, container.notes, quiet)
     page = standalone_page(container)
     with atomic_file(output, overwrite=force) as file:
         file.write(page)
@@ -148,7 +149,9 @@ def _prepare(
             _warn(scene, folder)
         return folder
     with progress_bar(quiet) as progress:
-        return page_scene(content, reading, threads=threads, progress=progress)
+        prepared = page_scene(content, reading, threads=threads, progress=progress)
+    say_notes(scene, prepared.notes, quiet)
+    return prepared
 
 
 def _warn(scene: str, folder: StreamedFolder) -> None:

@@ -114,7 +114,7 @@ class Remote:
             OutputError: ``destination`` cannot be written.
         """
         target = Path(destination)
-        kind = named_container(container, target)
+        kind = named_container(container, destination)
         refuse_existing(target, overwrite=overwrite)
         status = self.submit(
             source, settings=settings, container=kind, evaluate=evaluate, origin=origin, progress=progress

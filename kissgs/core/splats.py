@@ -130,6 +130,18 @@ def empty_splats(count: int, coefficients: int) -> Splats:
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
+CLEANED_TEXTS = {
+    "non_finite": "removed: a value is NaN or infinite",
+    "far_away": "removed: a coordinate is beyond 1e15",
+    "infinite_opacities": "with an infinite opacity logit: set to that of opacity 1e-6 or 1 - 1e-6",
+    "saturated_opacities": "with an opacity logit beyond that of 1e-6 or 1 - 1e-6: clamped",
+    "zero_quats": "with a rotation of length zero: set to the identity",
+    "unnormalised_quats": "with a rotation that is no unit quaternion: normalised",
+    "clamped_scales": "with a log-scale beyond 30: clamped",
+    "clamped_sh": "with an SH coefficient beyond 1e6: clamped",
+}
+"""What follows the number of Gaussians in a sentence, by field of :class:`Cleaned`."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cleaned:
@@ -158,10 +170,11 @@ class Cleaned:
         return self.non_finite + self.far_away
 
     @property
-    def visible(self) -> dict[str, int]:
-        """Counts, by name, of the changes that images can show: renderers draw the others alike."""
+    def notes(self) -> tuple[str, ...]:
+        """One phrase for each kind of change that images can show: renderers draw the others alike."""
         invisible = ("infinite_opacities", "saturated_opacities", "unnormalised_quats")
-        return {name: count for name, count in self.as_dict().items() if name not in invisible}
+        counts = {name: count for name, count in self.as_dict().items() if count and name not in invisible}
+        return tuple(f"{count:,} Gaussian{'s' * (count > 1)} {CLEANED_TEXTS[name]}" for name, count in counts.items())
 
     def as_dict(self) -> dict[str, int]:
         """Return all counts by name."""

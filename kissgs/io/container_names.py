@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from os import PathLike
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -26,21 +28,10 @@ LEVELS_ENDING = ".sogxt"
 SCENE_ENDINGS = (".ply", ".spz", ".splat", ".ksplat", ".glb", ".gltf")
 """Endings of scenes that are no containers."""
 
-FILE_ENDINGS = (
-    *SCENE_ENDINGS,
-    ".json",
-    ".yaml",
-    ".yml",
-    ".webp",
-    ".png",
-    ".jpg",
-    ".html",
-    ".txt",
-    ".npz",
-    ".gz",
-    ".tar",
-)
-"""Endings of files that are no containers: a folder of such a name would not be what was meant."""
+FOLDER_ENDING = ".container"
+"""Ending of folders that the command line names after their scenes."""
+
+_SLASHES = tuple({"/", os.sep})
 
 
 def ending_of(container: ContainerName) -> str:
@@ -48,15 +39,31 @@ def ending_of(container: ContainerName) -> str:
     return next(ending for ending, name in ENDINGS.items() if name == container)
 
 
-def named_container(requested: str | None, destination: Path | None) -> ContainerName:
+def names_folder(destination: str) -> bool:
+    """Whether a name is that of a folder: it exists, or ends in a slash, in no ending or in digits (``v1.2``)."""
+    ending = Path(destination).suffix
+    return (
+        destination.endswith(_SLASHES)
+        or ending in ("", FOLDER_ENDING)
+        or ending[1:].isdecimal()
+        or os.path.isdir(destination)  # noqa: PTH112  Path.is_dir raises where a name is too long
+    )
+
+
+def named_container(requested: str | None, destination: str | PathLike[str] | None) -> ContainerName:
     """Return the container to write: the requested one, else that of the destination's ending, else SOG-XT.
+
+    A destination that ends in neither ``.zip`` nor ``.sog`` is a folder, and must look like one (:func:`names_folder`);
+    :class:`~pathlib.Path` has lost the slash at its end.
 
     Raises:
         UnsupportedError: there is no such container, or the destination has the name of another one, of another format
             or of a streamed scene.
     """
-    ending = "" if destination is None else destination.suffix.lower()
-    if destination is not None and (ending in FILE_ENDINGS or named_manifest(destination) is not None):
+    path = None if destination is None else Path(destination)
+    ending = "" if path is None else path.suffix.lower()
+    manifest = path is not None and named_manifest(path) is not None
+    if manifest or (destination is not None and ending not in ENDINGS and not names_folder(os.fspath(destination))):
         remedy = "end it in .zip or .sog"
         if ending in SCENE_ENDINGS:
             remedy += " (kissgs convert writes other formats)"
@@ -65,6 +72,8 @@ def named_container(requested: str | None, destination: Path | None) -> Containe
                 f"; levels of detail, which kissgs compress and kissgs.compress_streamed write, are FOLDER/{LOD_NAME}, "
                 f"FOLDER/{LEVELS_NAME} or NAME{LEVELS_ENDING}"
             )
+        else:
+            remedy += ", or if it is a folder, in a slash"
         raise UnsupportedError(f"{destination!s:.100} is not the name of a container: {remedy}")
     by_ending = ENDINGS.get(ending)
     if requested is None:

@@ -62,8 +62,11 @@ _LOOKALIKES = {
 MIP_COMMENT = "comment SplatRenderMode: mip"
 """Line that marks a scene as antialiased, as Brush and splat-transform write it."""
 
-_MARK = re.compile(r"(?:splatrendermode\s*[:=]?\s*(\w+)|antialiased\s*[:=]?\s*(\w+))\s*", re.IGNORECASE)
-"""Comments of trainers that say whether a scene is antialiased: Brush's, and Postshot's."""
+_MARK = re.compile(
+    r"(?:(?:splatrendermode|rasteri[sz]e_?mode)\s*[:=]?\s*(\w+)|anti[-_]?alias(?:ed|ing)\s*(?:[:=]?\s*(\w+))?)\s*",
+    re.IGNORECASE,
+)
+"""Comments that say whether a scene is antialiased: Brush's or gsplat's mode, and Postshot's flag."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +203,7 @@ def _marked(comment: str, before: bool) -> bool:
     if found is None:
         return before
     mode, flag = (group and group.lower() for group in found.groups())
-    return mode == "mip" or flag in ("1", "true", "yes")
+    return mode in ("mip", "antialiased") if mode else flag in (None, "1", "true", "yes", "on")
 
 
 def _recognise(head: bytes, name: str) -> None:

@@ -19,7 +19,7 @@ from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io import spz_values
 from kissgs.io.activations import OPACITY_OF_BYTE, look_up
 from kissgs.io.frames import axis_signs, mirror
-from kissgs.io.scene_file import SceneFile, open_scene_file, refuse_more_than
+from kissgs.io.scene_file import SceneFile, listed, open_scene_file, refuse_more_than
 from kissgs.io.spz_streams import inflate, inflate_start, unpack_frame
 
 MAGIC = b"NGSP"
@@ -36,6 +36,9 @@ _COEFFICIENTS = (*SH_REST_COUNTS, 24)
 """Number of SH coefficients beyond the constant one in a file of degree 0 to 4."""
 
 _COORDINATES = 0xADBE0003
+_EXTENSION_NAMES = {0xADBE0002: "the limits of the camera"}
+"""What other known extension records hold."""
+
 _FRAMES = ("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 """Frame of each value of the extension for coordinate systems; the first is unspecified.
 
@@ -112,7 +115,7 @@ def read_spz(
 ) -> Splats:
     """Read a scene without cleaning it, and turn it to the axes of a ``.ply``.
 
-    Of SH degree 4 the highest band is left out, which ``notes`` says.
+    Of SH degree 4 the highest band is left out, as are unknown extension records, which ``notes`` says.
 
     Args:
         source: A file, or the bytes of one.
@@ -132,12 +135,13 @@ def read_spz(
         streams, extensions = _read_frames(opened, info) if info.version == 4 else _read_gzip(opened, info)
         progress("read", 0.5)
         splats = replace(_decode(streams, info), antialiased=info.antialiased)
+        frame, unread = _read_extensions(extensions, opened.name)
         if not raw_axes:
-            mirror(splats, axis_signs(_frame(extensions, opened.name)))
+            mirror(splats, axis_signs(frame))
         progress("read", 1.0)
         if info.stored_degree > info.sh_degree:
-            splats = replace(splats, notes=(f"left out: the SH coefficients of degree {info.stored_degree}",))
-        return splats
+            unread.insert(0, f"the SH coefficients of degree {info.stored_degree}")
+        return replace(splats, notes=(f"left out: {listed(unread)}",)) if unread else splats
 
 
 def largest_spz(count: int) -> int:
@@ -245,9 +249,9 @@ def _decode(streams: dict[str, UInt8[np.ndarray, "N width"]], info: SpzInfo) -> 
     return splats
 
 
-def _frame(extensions: bytes, name: str) -> str:
-    """Return the frame that an extension record names, or else the format's own."""
-    start = 0
+def _read_extensions(extensions: bytes, name: str) -> tuple[str, list[str]]:
+    """Return the frame that an extension record names, or else the format's own, and what other records hold."""
+    start, frame, unread = 0, DEFAULT_FRAME, dict[str, None]()
     while start + _EXTENSION.size <= len(extensions):
         kind, length = _EXTENSION.unpack_from(extensions, start)
         payload = extensions[start + _EXTENSION.size : start + _EXTENSION.size + length]
@@ -259,6 +263,8 @@ def _frame(extensions: bytes, name: str) -> str:
                 raise UnsupportedError(
                     f"{name} names a coordinate system {value}, which is not read; export it with y up or down"
                 )
-            return _FRAMES[value] or DEFAULT_FRAME
+            frame = _FRAMES[value] or DEFAULT_FRAME
+        else:
+            unread[_EXTENSION_NAMES.get(kind, f"the extension record 0x{kind:08X}")] = None
         start += _EXTENSION.size + length
-    return DEFAULT_FRAME
+    return frame, list(unread)

@@ -51,6 +51,10 @@ class Container(Protocol):
     def antialiased(self) -> bool:
         """Whether the scene was trained with antialiasing."""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What reading the container leaves out, one phrase each."""
+
     def decode(self, out: Splats, pool: Workers) -> None:
         """Decode all Gaussians into ``out``, whose SH coefficients above the container's degree become zero."""
 
@@ -189,7 +193,9 @@ class StreamedFormat(Generic[C]):
                 progress("decode", start / max(count, 1))
                 start = part.decode(splats, start, pool)
             progress("decode", 1.0)
-            return marked(replace(splats, origin=manifest.origin), [part.container.antialiased for part in parts])
+            notes = dict.fromkeys(note for part in parts for note in part.container.notes)
+            splats = replace(splats, origin=manifest.origin, notes=tuple(notes))
+            return marked(splats, [part.container.antialiased for part in parts])
 
     def read_manifest(self, files: Source) -> Manifest:
         """Read and check the manifest.

@@ -19,6 +19,7 @@ class Facts:
     ranges: dict[str, tuple[float, float]]
     details: dict[str, Any]
     changed: dict[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def stored_size(files: Source, name: str) -> int:

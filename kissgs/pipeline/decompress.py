@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from kissgs.core.origin import in_world
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import Splats
+from kissgs.core.splats import Splats, clean
 from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import AnyPath, check_ply, read_scene, save_ply
 
@@ -40,7 +41,8 @@ def decompress(
 
     Returns:
         The scene exactly as stored: quaternions are as quantised, so their length is only approximately 1. Positions
-        are those of the world where float32 can hold them, else relative to its ``origin``.
+        are those of the world where float32 can hold them, else relative to its ``origin``. A scene with values that
+        cannot be drawn, such as NaN, is cleaned as by :func:`kissgs.load`, and ``notes`` says so.
 
     Raises:
         InvalidContainerError: the container is damaged.
@@ -57,6 +59,9 @@ def decompress(
         progress=progress,
         only_containers=True,
     )
+    usable, cleaned = clean(splats)
+    if cleaned.notes:
+        splats = replace(usable, notes=(*splats.notes, *cleaned.notes))
     splats = in_world(splats)
     if destination is not None:
         save_ply(splats, destination, overwrite=overwrite, progress=progress)

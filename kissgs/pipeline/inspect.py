@@ -53,7 +53,7 @@ class Info:
             (SOG); the level that is described, and Gaussians per level and of the environment (streamed scenes);
             version and precision of positions (``.spz``); compression level and sections (``.ksplat``);
             primitives and compression (glTF); the origin of positions where it is not the world's.
-        notes: what reading leaves out or changes, one phrase each; empty for containers, whose images are not decoded.
+        notes: what reading leaves out or changes, one phrase each; of containers, what their metadata says.
     """
 
     path: str
@@ -136,6 +136,7 @@ def describe(path: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS) -> Info:
         ranges=facts.ranges,
         changed=facts.changed,
         details=facts.details,
+        notes=facts.notes,
     )
 
 

@@ -29,6 +29,7 @@ def sog_facts(path: Path) -> Facts:
         sh_degree=layout.sh_degree,
         parts=parts,
         ranges=sog_ranges([layout]),
+        notes=layout.notes,
         details={
             **recorded(layout.origin),
             "version": layout.version,

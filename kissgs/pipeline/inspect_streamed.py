@@ -68,6 +68,7 @@ def _facts(
         sh_degree=max((part.container.sh_degree for part in parts), default=0),
         parts=sizes,
         ranges=ranges([part.container for part in parts]),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.container.notes)),
         details={
             **recorded(manifest.origin),
             "level": level,

@@ -66,9 +66,9 @@ class Compressed:
 
         Raises:
             OutputError: the path exists and ``overwrite`` is false, or writing fails.
-            UnsupportedError: the ending is that of another container.
+            UnsupportedError: the ending is unknown, or that of another container.
         """
-        named_container(self.container, Path(path))
+        named_container(self.container, path)
         write_container(self.files, Path(path), overwrite=overwrite, names=FILES)
 
 
@@ -173,7 +173,8 @@ def compress(
     Args:
         source: a scene, or the path or the bytes of a file of any format that :func:`kissgs.load` reads (a container is
             decoded and encoded again).
-        destination: ``.zip``, ``.sog`` or folder to write; by default nothing is written.
+        destination: ``.zip``, ``.sog`` or folder to write; by default nothing is written. A folder exists, or its name
+            has no ending or, as a text, a slash at its end.
         settings: by default those of the preset ``balanced``. If their group ``compact`` has a budget, the scene is
             compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``enabled``, the levels are then
             fine-tuned on the photographs of ``views``, or on renderings of the scene. A goal other than ``psnr`` does
@@ -210,7 +211,7 @@ def compress(
     requested = settings or Settings()
     settings = decided(requested, views, keep_all=sensitivity is not None)
     target = Path(destination) if destination is not None else None
-    kind = named_container(container, target)
+    kind = named_container(container, destination)
     if target is not None:
         check_destination(target, overwrite=overwrite, names=FILES)
     finetune_checkpoint = _check_finetuning(settings, views, checkpoint, device)

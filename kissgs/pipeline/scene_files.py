@@ -6,6 +6,7 @@ The module of a format is loaded when a file of that format is read.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
@@ -55,7 +56,8 @@ def load(
     reading = ReadOptions(
         max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, origin=origin, antialiased=antialiased
     )
-    splats = clean(read_scene(Path(path), reading, threads=threads, progress=progress))[0]
+    splats, cleaned = clean(read_scene(Path(path), reading, threads=threads, progress=progress))
+    splats = replace(splats, notes=(*splats.notes, *cleaned.notes))
     return splats if origin == "auto" else in_world(splats)
 
 

@@ -10,14 +10,13 @@ from pathlib import Path
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.origin import WORLD
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import clean
 from kissgs.io.atomic import reason_of
 from kissgs.io.container_names import CONTAINERS, ending_of
 from kissgs.io.packed_files import open_source
 from kissgs.io.ply import write_ply
 from kissgs.pipeline.pipeline import compress
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.scene_files import read_scene
+from kissgs.pipeline.scene_files import open_scene
 from kissgs.pipeline.scene_formats import recognise, scene_root
 from kissgs.sogxt.container import zip_bytes
 
@@ -33,11 +32,13 @@ class PageScene:
         name: file name, ending in ``.zip``, ``.sog`` or ``.ply``.
         data: content of the file.
         converted: whether the scene came in another format.
+        notes: what reading the scene left out or changed, one phrase each.
     """
 
     name: str
     data: bytes
     converted: bool
+    notes: tuple[str, ...] = ()
 
 
 def page_scene(
@@ -54,14 +55,14 @@ def page_scene(
     Raises:
         KissgsError: the scene cannot be read.
     """
-    read = read_scene(source, reading, threads=threads, progress=progress)
+    splats, cleaned, _ = open_scene(source, reading, threads, progress)
+    notes = (*splats.notes, *cleaned.notes)
     container = _as_container(source, reading)
     if container is not None:
-        return container
-    splats = replace(clean(read)[0], origin=WORLD)  # viewers draw a scene better near the origin
+        return replace(container, notes=notes)
     file = io.BytesIO()
-    write_ply(file, splats, progress=progress)
-    return PageScene(f"{_stem(source)}.ply", file.getvalue(), converted=recognise(source) != "ply")
+    write_ply(file, replace(splats, origin=WORLD), progress=progress)  # viewers draw a scene better near the origin
+    return PageScene(f"{_stem(source)}.ply", file.getvalue(), converted=recognise(source) != "ply", notes=notes)
 
 
 def page_container(
@@ -72,13 +73,12 @@ def page_container(
     The parameters and errors are those of :func:`page_scene`.
     """
     container = _as_container(source, reading)
-    if container is not None:
-        read_scene(
-            source, reading, threads=threads, progress=progress
-        )  # whoever gets the page cannot mend a damaged one
-        return container
+    if container is not None:  # whoever gets the page cannot mend a damaged one
+        splats, cleaned, _ = open_scene(source, reading, threads, progress)
+        return replace(container, notes=(*splats.notes, *cleaned.notes))
     result = compress(source, reading=reading, threads=threads, progress=progress)
-    return PageScene(f"{_stem(source)}.zip", result.to_zip(), converted=True)
+    notes = tuple(filter(None, (result.report.note, *result.report.cleaned.notes)))
+    return PageScene(f"{_stem(source)}.zip", result.to_zip(), converted=True, notes=notes)
 
 
 def _as_container(source: Path | bytes, reading: ReadOptions) -> PageScene | None:

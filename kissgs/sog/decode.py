@@ -46,7 +46,7 @@ def decode(
 
     Raises:
         InvalidContainerError: a part of the container is missing, damaged or invalid.
-        UnsupportedError: another version, or more Gaussians than ``max_gaussians``.
+        UnsupportedError: another version or kind of Gaussians, or more Gaussians than ``max_gaussians``.
     """
     with open_source(source) as files, Workers(threads) as pool:
         layout = read_layout(files)
@@ -55,7 +55,7 @@ def decode(
         splats = empty_splats(layout.count, layout.rest.coefficients if layout.rest else 0)
         decode_files(files, layout, splats, pool)
         progress("decode", 1.0)
-        return replace(splats, origin=layout.origin, antialiased=layout.antialiased)
+        return replace(splats, origin=layout.origin, antialiased=layout.antialiased, notes=layout.notes)
 
 
 def decode_files(files: Source, layout: SogLayout, out: Splats, pool: Workers, folder: str = "") -> None:

@@ -15,6 +15,7 @@ from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.activations import OPACITY_OF_BYTE
 from kissgs.io.json_files import parse_json
 from kissgs.io.packed_files import Source, is_file_name
+from kissgs.io.scene_file import listed
 from kissgs.sog.names import MAX_METADATA_BYTES, META_NAME
 
 ENTRIES_PER_ROW = 64
@@ -30,6 +31,11 @@ _MAX_SIGNED_LOG = 88.7
 """Largest signed logarithm of a position: exp of more exceeds float32."""
 
 _LEVELS = 256
+
+_MODELS = ("antialiased", "3dgs", "classic", "default")
+"""Variants of the renderer that draw 3D Gaussians, all but the first without compensation; None stands for them too."""
+
+_KNOWN = {"version", "count", "asset", "model", "means", "scales", "quats", "sh0", "shN", "antialias", "kissgs"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +74,7 @@ class SogLayout:
         rest: the view-dependent colour; None at degree 0.
         model: variant of the renderer that the scene was made for, such as "antialiased"; None if not stated.
         generator: program that wrote the file; None if not stated.
+        unknown: keys of the file that are not read.
         origin: see :class:`kissgs.Splats`.
     """
 
@@ -83,6 +90,12 @@ class SogLayout:
     model: str | None
     generator: str | None
     origin: Origin
+    unknown: tuple[str, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What reading the container leaves out, one phrase each."""
+        return (f"left out: {listed(self.unknown)}",) if self.unknown else ()
 
     @property
     def antialiased(self) -> bool:
@@ -100,7 +113,7 @@ def read_layout(source: Source, name: str = META_NAME) -> SogLayout:
 
     Raises:
         InvalidContainerError: the metadata is missing, damaged or invalid.
-        UnsupportedError: another version.
+        UnsupportedError: another version, or another kind of Gaussians.
     """
     document = parse_json(source.read(name, MAX_METADATA_BYTES), name)
     if not isinstance(document, dict):
@@ -120,6 +133,14 @@ class _MetadataError(Exception):
 
 def _read_v2(document: dict[str, Any]) -> SogLayout:
     asset = document.get("asset")
+    model = _text(document.get("model")) or (_text(asset.get("model")) if isinstance(asset, dict) else None)
+    if model is None and document.get("antialias") is True:  # as the format's specification spells it
+        model = "antialiased"
+    if model and model.lower() not in _MODELS:
+        raise UnsupportedError(
+            f"{META_NAME} names the model {model[:40]!r}, which is not supported; export 3D Gaussians (known are "
+            f"{', '.join(_MODELS)})"
+        )
     rest = _part(document, "shN") if document.get("shN") is not None else None
     return SogLayout(
         version=2,
@@ -130,10 +151,15 @@ def _read_v2(document: dict[str, Any]) -> SogLayout:
         opacities=OPACITY_OF_BYTE,
         files=_files(document),
         rest=None if rest is None else _rest_v2(document, rest),
-        model=_text(document.get("model")) or (_text(asset.get("model")) if isinstance(asset, dict) else None),
+        model=model,
         generator=_text(asset.get("generator")) if isinstance(asset, dict) else None,
         origin=read_origin(document, META_NAME),
+        unknown=_unknown(document),
     )
+
+
+def _unknown(document: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(key for key in document if key not in _KNOWN)
 
 
 def _rest_v2(document: dict[str, Any], rest: dict[str, Any]) -> Rest:
@@ -169,6 +195,7 @@ def _read_v1(document: dict[str, Any]) -> SogLayout:
         model=None,
         generator=None,
         origin=WORLD,
+        unknown=_unknown(document),
     )
 
 

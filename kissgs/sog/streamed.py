@@ -46,6 +46,11 @@ class SogContainer:
         """See :class:`kissgs.io.streamed.Container`."""
         return self.layout.antialiased
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """See :class:`kissgs.io.streamed.Container`."""
+        return self.layout.notes
+
     def decode(self, out: Splats, pool: Workers) -> None:
         """See :class:`kissgs.io.streamed.Container`."""
         decode_files(self.files, self.layout, out, pool, self.folder)

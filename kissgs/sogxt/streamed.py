@@ -52,6 +52,11 @@ class SogxtContainer:
         """See :class:`kissgs.io.streamed.Container`."""
         return self.layout.antialiased
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """See :class:`kissgs.io.streamed.Container`."""
+        return ()
+
     def decode(self, out: Splats, pool: Workers) -> None:
         """See :class:`kissgs.io.streamed.Container`."""
         decode_files(_zip(self.files, self.name), self.layout, out, pool)

@@ -10,6 +10,7 @@ import pytest
 from helpers.command_line import failure, run
 
 import kissgs
+from kissgs.preview import page_files
 
 
 @pytest.fixture(scope="module")
@@ -131,3 +132,33 @@ def test_errors(scene: Path, tmp_path: Path) -> None:
         "convert", tmp_path / "empty.ply", tmp_path / "b.glb"
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.spz", "empty.ply"]
+
+
+WAYS_TO_READ = {
+    "compress": ("-p", "fast", "-o", "o.zip"),
+    "compress into a pipe": ("-p", "fast", "-o", "-"),
+    "compact": ("--ratio", "0.5", "--method", "merge", "-o", "o.ply"),
+    "compact into a pipe": ("--ratio", "0.5", "--method", "merge", "-o", "-"),
+    "convert": ("o.spz",),
+    "decompress": ("-o", "o.ply"),
+    "decompress into a pipe": ("-o", "-"),
+    "evaluate": ("in.splat",),
+    "render": ("--size", "16x16", "-o", "o.png"),
+    "info": (),
+    "view": ("-o", "o.html"),
+}
+
+
+@pytest.mark.parametrize("way", WAYS_TO_READ)
+def test_every_command_says_what_reading_cleans(way: str, tmp_path: Path) -> None:
+    if way == "view" and not (page_files.ROOT / "web_decoder" / "vendor").exists():
+        pytest.skip("scripts/vendor has not run")
+    kissgs.save(kissgs.sample_scene(50, sh_degree=0), tmp_path / "a.splat")
+    rows = np.frombuffer((tmp_path / "a.splat").read_bytes(), np.uint8).reshape(-1, 32).copy()
+    rows[3, 28:] = 128  # (byte - 128) / 128
+    (tmp_path / "in.splat").write_bytes(rows.tobytes())
+    done = run(way.split(maxsplit=1)[0], "in.splat", *WAYS_TO_READ[way], cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    piped = WAYS_TO_READ[way][-1:] == ("-",)
+    said = b" ".join((b"" if piped else done.stdout).split() + done.stderr.split()).decode()
+    assert "1 Gaussian with a rotation of length zero: set to the identity" in said

@@ -207,6 +207,15 @@ def test_streams_of_a_wrong_size():
             read_spz(data + table + b"".join(frames))
 
 
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_unknown_extensions_are_named(version):
+    records = struct.pack("<IIfff", 0xADBE0002, 12, 0, 1, 2) + struct.pack("<IIH", 0x12345678, 2, 7)
+    axes = struct.pack("<III", 0xADBE0003, 4, 6)
+    found = read_spz(spz_bytes(made_scene(5, 0), version, flags=2, extensions=records + axes))
+    assert found.notes == ("left out: the limits of the camera, the extension record 0x12345678",)
+    assert read_spz(spz_bytes(made_scene(5, 0), version, flags=2, extensions=axes)).notes == ()
+
+
 def test_an_extension_that_is_cut_short():
     for damaged in (extension(0xADBE0003, b"")[:4] + b"\xff\0\0\0", struct.pack("<II", 7, 100)):
         with pytest.raises(InvalidSceneError, match=r"has an extension record that is cut short"):

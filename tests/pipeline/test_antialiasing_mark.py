@@ -43,6 +43,10 @@ SOURCES = {
     "spaces.ply": (ply("  SPLATRENDERMODE:MIP  "), True),
     "postshot.ply": (ply("antialiased 1"), True),
     "capital.ply": (ply("Antialiased:  1"), True),
+    "gsplat.ply": (ply("rasterize_mode: antialiased"), True),
+    "gsplat-classic.ply": (ply("rasterize_mode=classic"), False),
+    "hyphen.ply": (ply("Anti-Aliasing = on"), True),
+    "bare.ply": (ply("antialiased"), True),
     "last.ply": (ply("antialiased 0", "SplatRenderMode: mip"), True),
     "default.ply": (ply("SplatRenderMode: default"), False),
     "zero.ply": (ply("antialiased 0"), False),
@@ -51,7 +55,8 @@ SOURCES = {
     **{f"{v}.spz": (spz_bytes(CLASSIC, v, flags=1), True) for v in (1, 2, 3, 4)},
     "classic.spz": (spz_bytes(CLASSIC, 3), False),
     "model.sog": (sog(model="antialiased"), True),
-    "surfels.sog": (sog(model="2dgs"), False),
+    "spelled.sog": (sog(antialias=True), True),
+    "default.sog": (sog(model="default"), False),
     "classic.sog": (sog(), False),
 }
 

@@ -30,7 +30,7 @@ def test_a_container_is_taken_as_it_is(tmp_path, splats, name):
 
 def test_a_folder_is_packed(tmp_path, splats):
     folder = tmp_path / "scene.of.mine"
-    kissgs.compress(splats, folder, settings=FAST)
+    kissgs.compress(splats, f"{folder}/", settings=FAST)
     (folder / "notes.txt").write_text("private")
     expected = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "notes.txt"}
     for path in (folder, folder / "meta.json"):

@@ -165,6 +165,21 @@ def test_damaged_metadata(message, change):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("change", [{"model": "2dgs"}, {"asset": {"model": "2DGS"}}, {"model": "hexplane"}])
+def test_other_than_3d_gaussians_are_refused(change):
+    files = sog_files(made_scene(20, 0))
+    meta = json.loads(files["meta.json"]) | change
+    with pytest.raises(UnsupportedError, match=r"names the model '(2dgs|2DGS|hexplane)'.*export 3D Gaussians"):
+        decode({**files, "meta.json": json.dumps(meta).encode()})
+
+
+def test_unknown_keys_are_named():
+    files = sog_files(made_scene(20, 0))
+    meta = json.loads(files["meta.json"]) | {"extras": {"author": "x"}, "velocities": {}}
+    assert decode(files).notes == ()
+    assert decode({**files, "meta.json": json.dumps(meta).encode()}).notes == ("left out: extras, velocities",)
+
+
 def test_damaged_files():
     for name, data, message in (
         ("meta.json", b"{", "meta.json is not readable JSON"),
