@@ -41,6 +41,7 @@ const SINGLE_FIELD = /** @type {Record<string, ["sh0" | "opacities" | "scales" |
 });
 const [TILE_ROWS, TILE_COLUMNS] = [3, 5];
 const VARIANT = JSON.stringify(["sog-xt", 3, "direct", "uv-codebook", 15, TILE_ROWS, TILE_COLUMNS]);
+const WORLD = [0, 0, 0];
 const MAX_GRID_SIDE = 13376;
 const MAX_CODEBOOK_SIDE = 256;
 
@@ -85,14 +86,15 @@ const valuesOf = ([lowest, highest], ranges, levels = 256, finish = (value) => v
   });
 
 /**
- * Whether a YAML file beside meta.json states the same numbers, by the word before them, as in kissgs/sogxt/metadata_reader.py.
+ * Whether a YAML file beside meta.json states the same, as in kissgs/sogxt/metadata_reader.py: numbers by the word before
+ * them, and the word after "model".
  * @param {Uint8Array} yaml
- * @param {Record<string, number>} sizes by word; those of the first two must be there
+ * @param {Record<string, number[]>} numbers by word; those of the first two must be there
  * @param {Record<string, Range[]>} ranges by field
  */
-function agrees(yaml, sizes, ranges) {
+function agrees(yaml, numbers, ranges) {
   /** @type {Record<string, number[]>} */
-  const stated = Object.create(null);
+  const stated = Object.assign(Object.create(null), { model: [0] });
   let [field, before, key] = ["", "", ""];
   for (const word of new TextDecoder().decode(yaml).match(/[^ \t\r\n,:"'[\]{}]+/g) ?? []) {
     if (word.length <= 100 && /^[-+]?((0|[1-9]\d*)(\.\d*)?|\.\d+)(e[-+]?\d+)?$/i.test(word)) {
@@ -101,13 +103,15 @@ function agrees(yaml, sizes, ranges) {
       if (before === "input_fields") field = word;
       key = /^m(in|ax)_values$/.test(word) ? `${field} ${word}` : word;
       stated[key] = [];
+      if (before === "model") stated[before] = [Number(/^antialiased$/i.test(word))];
       before = word;
     }
   }
+  if (!stated.origin?.length) stated.origin = WORLD;
   const same = (/** @type {number[]} */ found, /** @type {number[]} */ wanted) =>
     found?.length === wanted.length && wanted.every((value, i) => value === found[i]);
   return (
-    Object.entries(sizes).every(([word, size], i) => same(stated[word] ?? (i < 2 ? [] : [size]), [size])) &&
+    Object.entries(numbers).every(([word, wanted], i) => same(stated[word] ?? (i < 2 ? [] : wanted), wanted)) &&
     Object.entries(ranges).every(([name, channels]) =>
       ["min_values", "max_values"].every((end, i) =>
         same(
@@ -148,9 +152,16 @@ export class Assembly {
       version: encoder,
       sh_degree,
       crc32: checksums = {},
+      origin = WORLD,
     } = (KISSGS in meta ? meta[KISSGS] : OTHER_ENCODER) ?? {};
     if (!/^"[\w.+-]{1,40}"$/.test(JSON.stringify(encoder)))
       fail(`${META}: ${KISSGS}.version is impossible: ${encoder}`);
+    if (!(
+      Array.isArray(origin) &&
+      origin.length === 3 &&
+      origin.every((x) => Number.isFinite(x) && Math.abs(x) <= 1e15)
+    ))
+      fail(`${META}: ${KISSGS}.origin is not three numbers up to 1e15`);
     const isObject = Object.getPrototypeOf(checksums ?? 0) === Object.prototype;
     for (const [name, value, min, max] of [
       ["count", count, 0, gridSide ** 2],
@@ -180,13 +191,16 @@ export class Assembly {
     if (CHECKSUM in meta && checksum !== meta[CHECKSUM]) {
       fail(`${META} is damaged: its numbers do not give its ${CHECKSUM}`);
     }
-    const words = { grid_side: gridSide, f_rest_centroids_side: codebookSide, count, sh_degree: degree };
+    const words = {
+      ...{ grid_side: [gridSide], f_rest_centroids_side: [codebookSide], count: [count], sh_degree: [degree] },
+      ...{ [CHECKSUM]: [checksum], origin, model: [Number(/^"antialiased"$/i.test(JSON.stringify(meta.model)))] },
+    };
     const fields = Object.entries(this.ranges).map(([file, range]) => [
       file === HIGH ? "means" : file.slice(0, -5),
       range,
     ]);
-    if (yaml && !agrees(yaml, { ...words, [CHECKSUM]: checksum }, Object.fromEntries(fields))) {
-      fail(`${YAML} and ${META} do not state the same numbers: one is damaged, or of another scene`);
+    if (yaml && !agrees(yaml, words, Object.fromEntries(fields))) {
+      fail(`${YAML} and ${META} do not state the same: one is damaged, or of another scene`);
     }
     /** @type {Scene} */
     this.scene = {

@@ -12,7 +12,7 @@ import yaml
 from pydantic import ValidationError
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.origin import read_origin
+from kissgs.core.origin import WORLD, read_origin
 from kissgs.io.container_names import LEVELS_NAME, LOD_NAME
 from kissgs.io.json_files import parse_json
 from kissgs.io.packed_files import Source
@@ -102,11 +102,11 @@ def _layout_of(raw: dict[str, Any], name: str) -> Layout:
 
 
 def _compare(data: bytes, layout: Layout) -> None:
-    """Refuse a YAML file whose numbers are not those of ``meta.json``, as ``web_decoder/scene.js`` does.
+    """Refuse a YAML file that states another scene than ``meta.json``, as ``web_decoder/scene.js`` does.
 
-    Numbers are compared by the word before them, so that browsers need no YAML reader.
+    Numbers are compared by the word before them, and the word after "model", so that browsers need no YAML reader.
     """
-    stated: dict[str, list[float]] = {}
+    stated: dict[str, list[float]] = {"model": [False]}
     field = before = key = ""
     for word in _WORD.findall(data.decode("utf-8-sig", "replace")):
         if len(word) <= MAX_NUMBER_LENGTH and _NUMBER.fullmatch(word):
@@ -115,8 +115,12 @@ def _compare(data: bytes, layout: Layout) -> None:
             field = word if before == "input_fields" else field
             key = f"{field} {word}" if word in ("min_values", "max_values") else word
             stated[key] = []
+            if before == "model":
+                stated[before] = [word.lower() == "antialiased"]
             before = word
-    needed = {"grid_side": [layout.grid_side], "f_rest_centroids_side": [layout.codebook_side]}
+    stated["origin"] = stated.get("origin") or [*WORLD]
+    needed: dict[str, list[float]] = {"grid_side": [layout.grid_side], "f_rest_centroids_side": [layout.codebook_side]}
+    needed |= {"origin": [*layout.origin], "model": [layout.antialiased]}
     optional = {"count": [layout.count], "sh_degree": [layout.sh_degree], CHECKSUM: [layout.checksum]}
     same = all(stated.get(key) == value for key, value in needed.items())
     same = same and all(stated.get(key, value) == value for key, value in optional.items())
@@ -127,7 +131,7 @@ def _compare(data: bytes, layout: Layout) -> None:
                 same = same and np.array_equal(found, values)
     if not same:
         raise InvalidContainerError(
-            f"{YAML_NAME} and {JSON_NAME} do not state the same numbers: one is damaged or of another scene; "
+            f"{YAML_NAME} and {JSON_NAME} do not state the same: one is damaged or of another scene; "
             "copy the container again, or remove the wrong one"
         )
 

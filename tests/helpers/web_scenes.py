@@ -75,8 +75,8 @@ def job(source, **more):
     return {"source": {"base64": base64.b64encode(data).decode(), "as": more.pop("as_", "bytes")}, **more}
 
 
-def in_node(*jobs, flags=()):
-    lines = run_node("decode_scenes.mjs", json.dumps(jobs), flags=flags).splitlines()
+def in_node(*jobs):
+    lines = run_node("decode_scenes.mjs", json.dumps(jobs)).splitlines()
     assert len(lines) == len(jobs)
     return [json.loads(line) for line in lines]
 

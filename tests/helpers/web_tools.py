@@ -45,10 +45,10 @@ def node():
     return found
 
 
-def run_node(program, text="", *arguments, timeout=300, flags=()):
+def run_node(program, text="", *arguments, timeout=300):
     """Run a JavaScript program with this standard input and return its standard output."""
     done = subprocess.run(
-        [node(), *flags, str(PROGRAMS / program), *map(str, arguments)],
+        [node(), str(PROGRAMS / program), *map(str, arguments)],
         input=text,
         capture_output=True,
         text=True,

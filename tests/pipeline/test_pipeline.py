@@ -241,7 +241,8 @@ def test_a_full_disk_is_an_output_error_and_leaves_nothing(tmp_path, name):
     """A limit of 3 kB per file simulates a full disk; the error contains the message of the system."""
     program = """
 import resource, sys, kissgs
-files = kissgs.compress(kissgs.sample_scene(1500, sh_degree=1)).files
+scene, settings = kissgs.sample_scene(1500, sh_degree=1), kissgs.Settings(preset="fast")
+files = kissgs.compress(scene, settings=settings).files
 resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
 try:
     if sys.argv[1].endswith(".ply"):

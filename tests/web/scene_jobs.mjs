@@ -3,6 +3,17 @@
 import * as sog from "../../web_decoder/sog.js";
 import * as sogxt from "../../web_decoder/sogxt.js";
 
+let unpacked = 0;
+const Native = globalThis.DecompressionStream;
+/** Counts the bytes that are unpacked. */
+globalThis.DecompressionStream = class {
+  constructor(format) {
+    const { readable, writable } = new Native(format);
+    const transform = (bytes, controller) => ((unpacked += bytes.length), controller.enqueue(bytes));
+    Object.assign(this, { writable, readable: readable.pipeThrough(new TransformStream({ transform })) });
+  }
+};
+
 const FIELDS = ["means", "quats", "scales", "opacities", "sh0", "labels", "centroids", "cells"];
 
 const toBase64 = (array) => {
@@ -29,7 +40,7 @@ export async function perform({ format = "sogxt", source, options = {}, abort, s
   if (abort === "before") stop.abort();
   if (abort === "reason") stop.abort(new RangeError("a reason"));
   if (abort?.after) setTimeout(() => stop.abort(), abort.after);
-  const start = performance.now();
+  const [start, before] = [performance.now(), unpacked];
   try {
     const scene = await decode(sourceOf(source), {
       ...options,
@@ -59,6 +70,7 @@ export async function perform({ format = "sogxt", source, options = {}, abort, s
   report.ms = performance.now() - start;
   report.ended = report.order.length;
   await new Promise((resolve) => setTimeout(resolve, abort ? 50 : 0));
+  report.unpacked = unpacked - before;
   report.later = report.order.length - report.ended;
   return report;
 }

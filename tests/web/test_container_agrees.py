@@ -2,16 +2,23 @@
 
 import io
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.web_scenes import array_of, container, in_node, job, ulps, zipped
+from helpers.web_scenes import array_of, container, in_node, job, scene_of, ulps, zipped
 
-from kissgs import KissgsError, decompress
+from kissgs import KissgsError, Settings, compress, decompress
 from kissgs.sogxt.container import zip_bytes
 
 FILES = container("fast", 1, 20)
 YAML, JSON = "container_meta.yaml", "meta.json"
+MARKED = dict(
+    compress(
+        replace(scene_of(20, 1), antialiased=True, origin=(5000000.0, -2.5, 0.0)),
+        settings=Settings.from_preset("fast"),
+    ).files
+)
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
@@ -51,9 +58,9 @@ def check_agreement(zips):
     return ["error" not in answer for answer in answers]
 
 
-def with_text(name, old, new):
-    assert old in FILES[name]
-    return zip_bytes({**FILES, name: FILES[name].replace(old, new, 1)})
+def with_text(name, old, new, files=FILES):
+    assert old in files[name]
+    return zip_bytes({**files, name: files[name].replace(old, new, 1)})
 
 
 def flagged(data, at, value):
@@ -77,6 +84,9 @@ ACCEPTED = {
     "bytes after the end": ZIP + b"\r\n",
     "no YAML": packed(pair for pair in ENTRIES if pair[0] != YAML),
     "another style of YAML": with_text(YAML, b"input_fields:\n  - means", b"input_fields: ['means']"),
+    "with an origin, antialiased": zip_bytes(MARKED),
+    "the origin of the world written out": with_text(YAML, b"kissgs:", b"kissgs:\n  origin: [0, 0.0, -0.0]"),
+    "another case of the mark": with_text(YAML, b"model: antialiased", b"model: 'Antialiased'", MARKED),
     "another spelling of a number": with_text(YAML, b"grid_side: 8", b"grid_side: 8.0e+0"),
 }
 REFUSED = {
@@ -94,6 +104,16 @@ REFUSED = {
     "another count in the YAML": with_text(YAML, b"  count: ", b"  count: 1"),
     "another range in the YAML": with_text(YAML, b"max_values: ", b"max_values: 1"),
     "another checksum in the YAML": with_text(YAML, b"kissgs_crc32: ", b"kissgs_crc32: 1"),
+    "no origin in the YAML": with_text(YAML, b"  origin:\n  - 5000000.0\n  - -2.5\n  - 0.0\n", b"", MARKED),
+    "another origin in the YAML": with_text(YAML, b"  - 5000000.0\n  - -2.5", b"  - 5000000.0\n  - 2.5", MARKED),
+    "an origin in the YAML alone": with_text(YAML, b"kissgs:", b"kissgs:\n  origin: [0, 0, 1]"),
+    "no mark in the YAML": with_text(YAML, b"model: antialiased\n", b"", MARKED),
+    "another mark in the YAML": with_text(YAML, b"model: antialiased", b"model: 2dgs", MARKED),
+    "a mark in the YAML alone": with_text(YAML, b"kissgs:", b"model: antialiased\nkissgs:"),
+    "no mark in the JSON": with_text(JSON, b'"model":"antialiased",', b"", MARKED),
+    "no point as origin": zip_bytes(
+        {**MARKED, JSON: MARKED[JSON].replace(b'"origin":[5000000.0,-2.5,0.0]', b'"origin":[5000000.0,-2.5]')}
+    ),
     "a cut YAML": zip_bytes({**FILES, YAML: FILES[YAML][:900]}),
     "no YAML inside": zip_bytes({**FILES, YAML: b"\xff\xfe\0"}),
 }

@@ -272,7 +272,6 @@ def test_mutations_decode_as_in_python_or_are_refused(name):
     found = in_node(*map(sog_job, mutants))
     decoded = 0
     for report, some in zip(found, mutants, strict=True):
-        assert report["ms"] < 2000
         if "error" in report:
             assert report["error"]["name"] == "SogError", report["error"]
             continue
