@@ -46,7 +46,10 @@ def main() -> None:
         function = getattr(importlib.import_module(module), name)
         send({"done": function(task["arguments"], Throttle(send))})
     except KissgsError as error:
-        send({"error": {"code": error.code, "message": str(error)}})
+        if isinstance(error.__cause__, MemoryError):  # that of the limit, whatever could not be allocated
+            send({"out_of_memory": True})
+        else:
+            send({"error": {"code": error.code, "message": str(error)}})
     except MemoryError:
         send({"out_of_memory": True})
     except Exception:  # noqa: BLE001  a bug, reported by standard error and the exit status

@@ -94,7 +94,7 @@ class SogLayout:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What reading the container leaves out, one phrase each."""
+        """Phrases about what reading the container leaves out, one phrase each."""
         return (f"left out: {listed(self.unknown)}",) if self.unknown else ()
 
     @property
