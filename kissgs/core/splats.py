@@ -140,7 +140,7 @@ CLEANED_TEXTS = {
     "clamped_scales": "with a log-scale beyond 30: clamped",
     "clamped_sh": "with an SH coefficient beyond 1e6: clamped",
 }
-"""Clause about what follows the number of Gaussians in a sentence, by field of :class:`Cleaned`."""
+"""Words that follow the number of Gaussians in a sentence, by field of :class:`Cleaned`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

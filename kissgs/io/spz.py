@@ -37,7 +37,7 @@ _COEFFICIENTS = (*SH_REST_COUNTS, 24)
 
 _COORDINATES = 0xADBE0003
 _EXTENSION_NAMES = {0xADBE0002: "the limits of the camera"}
-"""Phrases about what other known extension records hold."""
+"""Contents of other known extension records."""
 
 _FRAMES = ("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 """Frame of each value of the extension for coordinate systems; the first is unspecified.

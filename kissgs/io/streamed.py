@@ -53,7 +53,7 @@ class Container(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Phrases about what reading the container leaves out, one phrase each."""
+        """Phrases for what reading the container leaves out, one phrase each."""
 
     def decode(self, out: Splats, pool: Workers) -> None:
         """Decode all Gaussians into ``out``, whose SH coefficients above the container's degree become zero."""

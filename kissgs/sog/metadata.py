@@ -94,7 +94,7 @@ class SogLayout:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Phrases about what reading the container leaves out, one phrase each."""
+        """Phrases for what reading the container leaves out, one phrase each."""
         return (f"left out: {listed(self.unknown)}",) if self.unknown else ()
 
     @property
