@@ -21,6 +21,8 @@ const FIRST_TAG = 252;
 const [MIN_LOGIT, MAX_LOGIT] = [-13.815509796142578, 13.80231761932373];
 /** Number of images of a coarse rendering: high bytes of positions, colours. */
 const COARSE_IMAGES = 2;
+/** Variants of the renderer that draw 3D Gaussians, as in kissgs/sog/metadata.py. */
+const MODELS = ["antialiased", "3dgs", "classic", "default"];
 const BYTES = Array.from({ length: 256 }, (_, i) => i);
 const COMPONENTS = BYTES.map((level) => (level / 255 - 0.5) * Math.SQRT2);
 
@@ -90,6 +92,9 @@ function layoutOf(json) {
   const { version = 1, shN } = meta;
   if (version !== 1 && version !== 2) fail(`${META}: unsupported version ${JSON.stringify(version)}; 1 and 2 are read`);
   const old = version === 1;
+  const model = [meta.model, meta.asset?.model].find((name) => name && typeof name === "string");
+  if (!old && model && !MODELS.includes(model.toLowerCase()))
+    fail(`${META} names the model "${model.slice(0, 40)}", which is not supported`);
   const rest = (shN ?? null) !== null;
   const count = old ? meta.means?.shape?.[0] : meta.count;
   const [low, high] = ["mins", "maxs"].map((end) => numbers(meta.means?.[end], `means.${end}`, 3));

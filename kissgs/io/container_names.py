@@ -41,7 +41,7 @@ def ending_of(container: ContainerName) -> str:
 
 def names_folder(destination: str) -> bool:
     """Whether a name is that of a folder: it exists, or ends in a slash, in no ending or in digits (``v1.2``)."""
-    ending = Path(destination).suffix
+    ending = Path(f"_{Path(destination).name.rstrip('.')}").suffix  # also of ".zip" and "a.zip."
     return (
         destination.endswith(_SLASHES)
         or ending in ("", FOLDER_ENDING)

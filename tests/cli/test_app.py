@@ -191,7 +191,7 @@ def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     """Regression: compress -o a.spz made a folder a.spz, and wrote a SOG-XT container into it."""
     for name in ("a.spz", "a.PLY", "a.glb", "a.webp", "a.Yaml"):
         assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
-    for name in ("x.usdz", "full.ziip", "k.ssog", "out.xyz"):
+    for name in ("x.usdz", "full.ziip", "k.ssog", "out.xyz", ".zip", "a.zip."):
         with pytest.raises(kissgs.UnsupportedError, match=rf"{name} is not the name of .* in \.zip or \.sog, or if"):
             kissgs.compress(scene, tmp_path / name)
         assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)

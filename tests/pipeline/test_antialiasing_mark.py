@@ -1,5 +1,6 @@
 """The mark of antialiased scenes in every format; oracle: the bytes that other tools look for, and files by hand."""
 
+import base64
 import gzip
 import io
 import json
@@ -15,6 +16,7 @@ from helpers.format_scenes import made_scene
 from helpers.reference_ply import assert_identical, header_bytes, names
 from helpers.reference_sog import sog_files, zip_of
 from helpers.reference_spz import spz_bytes
+from helpers.web_tools import run_node
 
 import kissgs
 from kissgs import Settings
@@ -70,6 +72,12 @@ def test_marks_of_other_tools_are_read(name, tmp_path):
     assert kissgs.decompress(tmp_path / name, antialiased=True).antialiased if not name.endswith(".ply") else True
     assert describe(tmp_path / name).details["antialiased"] == marked
     assert open_scene(tmp_path / name, ReadOptions(antialiased=not marked), 1, lambda *_: None)[0].antialiased != marked
+
+
+def test_the_page_reads_the_same_marks():
+    files = [[name, base64.b64encode(data).decode()] for name, (data, _) in SOURCES.items()]
+    said = run_node("read_marks.mjs", json.dumps(files)).split()
+    assert dict(zip(SOURCES, said, strict=True)) == {name: str(marked).lower() for name, (_, marked) in SOURCES.items()}
 
 
 def read(path):

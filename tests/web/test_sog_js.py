@@ -203,6 +203,8 @@ REFUSED = [
     ({**GOOD, "meta.json": b"null"}, "meta.json is not the metadata of a SOG container"),
     ({**GOOD, "meta.json": b"[]"}, "meta.json is not the metadata of a SOG container"),
     *((put("version", value), "meta.json: unsupported version") for value in (3, "2", 0, None, True)),
+    *((put("model", value), f'meta.json names the model "{value}"') for value in ("2dgs", "2DGS", "hexplane")),
+    (put("asset", {"model": "2dgs"}), 'meta.json names the model "2dgs"'),
     *((put("count", value), "meta.json: count is not a whole number") for value in (-1, 1.5, "65", None, "del", 2**40)),
     (put("count", 66 * 9), "means_u.webp: 9 x 8 pixels are too few for 594 Gaussians"),
     *((put("means.mins", value), "means.mins are not 3 numbers") for value in ([0, 0], "x", "del", [0, 0, "1"])),

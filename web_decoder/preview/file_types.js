@@ -14,8 +14,9 @@ export const fileTypeOf = (name) => FILE_TYPES.find((type) => name.toLowerCase()
 /** Return the type of a format by the service's name of it; of a container, none. @param {string} format */
 export const fileTypeOfFormat = (format) => FILE_TYPES.find((type) => type === format);
 
-/** Comments of trainers in a `.ply` that say whether the scene is antialiased: Brush's, and Postshot's. */
-const MARK = /^(?:comment|obj_info)\s+(?:splatrendermode\s*[:=]?\s*(\w+)|antialiased\s*[:=]?\s*(\w+))\s*$/i;
+/** Comments in a `.ply` that say whether the scene is antialiased, as in kissgs/io/ply_header.py. */
+const MARK =
+  /^(?:comment|obj_info)\s+(?:(?:splatrendermode|rasteri[sz]e_?mode)\s*[:=]?\s*(\w+)|anti[-_]?alias(?:ed|ing)\s*(?:[:=]?\s*(\w+))?)\s*$/i;
 /** Largest header that is searched for a mark. */
 const MAX_HEADER_BYTES = 1 << 20;
 /** Byte of a `.spz` header with flags, of which the first is that of antialiased scenes. */
@@ -35,8 +36,10 @@ export async function isMarked(type, bytes) {
 function isMarkedPly(text) {
   const end = text.search(/^end_header/m);
   const comments = text.slice(0, Math.max(end, 0)).split(/\r?\n/);
-  const [, mode, flag] = comments.map((line) => line.match(MARK)).findLast((found) => found !== null) ?? [];
-  return mode?.toLowerCase() === "mip" || ["1", "true", "yes"].includes(flag?.toLowerCase());
+  const found = comments.map((line) => line.match(MARK)).findLast((match) => match !== null);
+  if (!found) return false;
+  const [, mode, flag = "yes"] = found;
+  return mode ? /^(mip|antialiased)$/i.test(mode) : /^(1|true|yes|on)$/i.test(flag);
 }
 
 /** Return the first bytes of a `.spz`, which is gzip up to version 3. @param {Uint8Array} bytes */

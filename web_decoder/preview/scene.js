@@ -12,7 +12,9 @@ export const sigmoid = (logit) => 1 / (1 + Math.exp(-logit));
 export const baseColour = (sh0) => 0.5 + SH_CONSTANT * sh0;
 
 /** Whether a container says that its scene was trained with antialiasing. @param {Scene} scene */
-export const isAntialiased = ({ meta }) => String(meta?.model ?? meta?.asset?.model).toLowerCase() === "antialiased";
+export const isAntialiased = ({ meta }) =>
+  String(meta?.model || meta?.asset?.model || (meta?.antialias === true && "antialiased")).toLowerCase() ===
+  "antialiased";
 
 /** Point of the world that positions are relative to. @param {Scene} scene @returns {[number, number, number]} */
 export const originOf = ({ meta }) => meta?.kissgs?.origin ?? [0, 0, 0];
