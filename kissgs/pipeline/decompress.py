@@ -11,6 +11,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import AnyPath, check_ply, read_scene, save_ply
+from kissgs.pipeline.scene_formats import CONTAINER_FORMATS, recognise
 
 
 def decompress(
@@ -40,9 +41,10 @@ def decompress(
         progress: receives events.
 
     Returns:
-        The scene exactly as stored: quaternions are as quantised, so their length is only approximately 1. Positions
-        are those of the world where float32 can hold them, else relative to its ``origin``. A scene with values that
-        cannot be drawn, such as NaN, is cleaned as by :func:`kissgs.load`, and ``notes`` says so.
+        The scene exactly as stored: quaternions are as quantised, so their length is only approximately 1. Only
+        formats other than containers can hold values that cannot be drawn, such as NaN: such a scene is cleaned as by
+        :func:`kissgs.load`, and ``notes`` says so. Positions are those of the world where float32 can hold them, else
+        relative to its ``origin``.
 
     Raises:
         InvalidContainerError: the container is damaged.
@@ -52,16 +54,18 @@ def decompress(
     """
     if destination is not None:
         check_ply(Path(destination), overwrite=overwrite)
+    scene = source if isinstance(source, bytes | Mapping) else Path(source)
     splats = read_scene(
-        source if isinstance(source, bytes | Mapping) else Path(source),
+        scene,
         ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased),
         threads=threads,
         progress=progress,
         only_containers=True,
     )
-    usable, cleaned = clean(splats)
-    if cleaned.notes:
-        splats = replace(usable, notes=(*splats.notes, *cleaned.notes))
+    if recognise(scene) not in CONTAINER_FORMATS:
+        usable, cleaned = clean(splats)
+        if cleaned.notes:
+            splats = replace(usable, notes=(*splats.notes, *cleaned.notes))
     splats = in_world(splats)
     if destination is not None:
         save_ply(splats, destination, overwrite=overwrite, progress=progress)
