@@ -10,7 +10,9 @@ import logging
 import resource
 import socket
 import time
+from collections import Counter
 from types import FrameType
+from typing import cast
 
 import h11
 import uvicorn
@@ -20,6 +22,7 @@ from ..core.problems import MEDIA_TYPE, problem
 from ..core.settings import ServiceSettings, SettingsError
 from ..jobs.container import ServiceContainer
 from .middleware import SECURITY_HEADERS
+from .submission import address_of
 
 log = logging.getLogger("kissgs.service")
 
@@ -43,6 +46,8 @@ MAX_PARSE_DEBT_SECONDS = 0.1
 """CPU seconds beyond the allowance after which a connection is closed."""
 
 MAX_CONNECTIONS = 1000
+"""Maximum number of connections. Beyond it, the address with the most loses one, so that no address, by event streams
+or slow requests, shuts out the others; a proxy, whose address is that of all clients, may still have all."""
 
 OTHER_DESCRIPTORS = 256
 """File descriptors reserved for other uses than connections: uploads, downloads, the database, jobs."""
@@ -73,20 +78,33 @@ class TimeoutProtocol(H11Protocol):
     _listening: asyncio.TimerHandle | None = None
     _watching: asyncio.TimerHandle | None = None
     most_connections = MAX_CONNECTIONS
+    address = ""
     _debt = 0.0
     _unsent = 0
     _taken = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Start the timers of the connection, or abort it if there are too many."""
+        """Start the timers of the connection; if there are too many, abort it or one of the address with the most."""
         self.conn = StrictConnection(h11.SERVER, MAX_HEADER_BYTES)
         super().connection_made(transport)  # type: ignore[arg-type]
-        if len(self.connections) > self.most_connections:
-            self.transport.abort()
-            return
+        self.address = address_of(self.client)
+        if len(self.connections) > self.most_connections and (excess := self._excess()) is not None:
+            excess.transport.abort()
+            if excess is self:
+                return
         self.transport.max_size = READ_BYTES  # type: ignore[attr-defined]
         self._listening = self.loop.call_later(HEADER_SECONDS, self.transport.close)
         self._watching = self.loop.call_later(READ_SECONDS, self._watch)
+
+    def _excess(self) -> TimeoutProtocol | None:
+        """Return the connection to abort: this one, unless another address has more; None if enough are closing."""
+        others = cast("set[TimeoutProtocol]", self.connections)
+        open_ones = [one for one in others if not one.transport.is_closing()]
+        if len(open_ones) <= self.most_connections:
+            return None
+        counts = Counter(one.address for one in open_ones)
+        most = max(counts, key=counts.__getitem__)
+        return next(one for one in open_ones if one.address == most) if counts[most] > counts[self.address] else self
 
     def data_received(self, data: bytes) -> None:
         """Parse a piece of a request, and close connections whose requests take too much CPU time to parse."""

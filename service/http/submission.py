@@ -81,7 +81,7 @@ async def submit(
     if known is None:
         await run_sync(context.admission.check, owner)
     parsed = parse_options(options) if options is not None else None
-    with context.admission.slot(owner or _address(request)):
+    with context.admission.slot(owner or address_of(request.client)):
         path = context.storage.new_upload()
         kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         _check_headers(request, kind)
@@ -134,9 +134,9 @@ def parse_options(text: str | bytes) -> JobOptions:
     return options
 
 
-def _address(request: Request) -> str:
-    """Return the address of a client; of IPv6 the network, of which a client has all addresses."""
-    host = request.client.host if request.client else ""
+def address_of(client: tuple[str, int] | None) -> str:
+    """Return the address of a client, given with its port; of IPv6 the network, of which a client has all addresses."""
+    host = client[0] if client else ""
     try:
         return str(ipaddress.ip_network(f"{host.partition('%')[0]}/64", strict=False)) if ":" in host else host
     except ValueError:

@@ -17,6 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from ..core.models import Base, Meta
+from .data_folder import RESERVE_BYTES
 from .replicas import hold
 
 WAIT_SECONDS = 2.0
@@ -44,9 +45,10 @@ def sqlite_file(url: sa.URL) -> Path | None:
 
 
 def error_text(error: BaseException) -> str:
-    """Return the first line of a database driver's message."""
+    """Return the first line of a database driver's message, and for a full disk what to do."""
     lines = str(getattr(error, "orig", None) or error).strip().splitlines()
-    return lines[0].strip() if lines else type(error).__name__
+    reason = lines[0].strip() if lines else type(error).__name__
+    return f"{reason}; free {RESERVE_BYTES:,} bytes there" if reason == "database or disk is full" else reason
 
 
 def is_full(error: BaseException) -> bool:

@@ -14,6 +14,7 @@ from sqlalchemy.exc import OperationalError
 import kissgs
 from service.http.server import config_of
 from service.jobs.completion import JobCompletion
+from service.storage.data_folder import RESERVE_BYTES
 
 BIG = scene_bytes(20_000, 3)
 MEDIUM = scene_bytes(6_000, 2)
@@ -135,6 +136,23 @@ def test_a_full_disk_prevents_neither_deletion_nor_a_start(tiny_disk):
             assert service.http.delete(job["links"]["self"]).status_code == 204
         (tiny_disk / "filler").unlink()
         assert service.ended(others[2])["state"] == "succeeded"
+
+
+def test_a_full_disk_without_a_reserve_says_how_much_to_free(tiny_disk):
+    """A reserve that was used up by a former start, or removed by hand; oracle: the service starts with that space."""
+    service = Service(tiny_disk / "data")
+    service.log = tiny_disk.parent / "log"
+    with service:
+        ended = service.ended(service.submit())
+        service.kill(signal.SIGKILL)
+        (tiny_disk / "data" / "reserve").unlink()
+        fill(tiny_disk)
+        with pytest.raises(AssertionError, match=f"full; free {RESERVE_BYTES:,} bytes there\\n$"):
+            service.restart()
+        os.truncate(tiny_disk / "filler", (tiny_disk / "filler").stat().st_size - RESERVE_BYTES)
+        service.restart()
+        fill(tiny_disk)
+        assert service.http.delete(ended["links"]["self"]).status_code == 204
 
 
 class FullDisk:

@@ -14,14 +14,15 @@ import time
 import uuid
 
 import pytest
+import uvicorn
 from helpers.running import wait_until
 from helpers.service import SLOW, SMALL, events, problem, read_response, scene_bytes
-from starlette.requests import Request
 
 from kissgs.benchmark import service_load
 from service.core.problems import ProblemError
 from service.core.settings import ServiceSettings
-from service.http.submission import _address
+from service.http.server import TimeoutProtocol, config_of
+from service.http.submission import address_of
 from service.jobs.admission import Admission
 
 BIG = scene_bytes(20_000, 3)
@@ -428,7 +429,53 @@ def test_an_address_has_a_quarter_of_the_upload_slots():
 )
 def test_an_ipv6_client_counts_by_its_network(host, counted):
     """Oracle: RFC 6177, by which a site has at least a /64."""
-    assert _address(Request({"type": "http", "client": (host, 1), "headers": []})) == counted
+    assert address_of((host, 1)) == counted
+
+
+def test_one_address_does_not_take_all_connections(monkeypatch):
+    """Event streams of one client once filled all connections, and others were closed. Oracle: the counts by hand."""
+
+    async def application(scope, receive, send):
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b"x", "more_body": True})
+        await receive()  # the request
+        await receive()  # the end of the connection
+
+    def connect(host):
+        connection = socket.create_connection(listener.getsockname(), timeout=60, source_address=(host, 0))
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        answered = False
+        with contextlib.suppress(ConnectionError):
+            answered = connection.recv(1000).startswith(b"HTTP/1.1 200")
+        return connection, answered
+
+    def is_open(connection):
+        connection.settimeout(0.2)
+        try:
+            while connection.recv(1000):
+                pass
+        except TimeoutError:
+            return True
+        except ConnectionError:
+            pass
+        return False
+
+    monkeypatch.setattr(TimeoutProtocol, "most_connections", 6)
+    listener = socket.create_server(("127.0.0.1", 0))
+    server = uvicorn.Server(config_of(application))
+    serving = threading.Thread(target=server.run, args=([listener],))
+    serving.start()
+    try:
+        greedy = [connect("127.0.0.2") for _ in range(8)]
+        assert [answered for _, answered in greedy] == [True] * 6 + [False] * 2
+        others = [connect("127.0.0.1") for _ in range(4)]
+        assert [answered for _, answered in others] == [True] * 3 + [False]
+        assert sum(is_open(connection) for connection, _ in greedy) == 3
+    finally:
+        for connection, _ in [*greedy, *others]:
+            connection.close()
+        server.should_exit = True
+        serving.join(60)
 
 
 def _bearer(key):
