@@ -35,9 +35,9 @@ HEAD_BYTES = 512
 """Bytes from which a format is recognised."""
 
 GAUSSIANS_PER_BYTE = 2
-"""Largest number of Gaussians per byte of an upload. Real files have up to 0.12 (presets ``fast`` and ``small``, SH degree
-0; `.spz` 0.06, `.splat` 0.03); a position alone takes more than 4 bits. Images of equal pixels hold millions in 4 kB, which
-keep a worker for hours: all of them cover the same pixels, and each takes 2 ms. No setting, as no real file comes near."""
+"""Largest number of Gaussians per byte of an upload. Real files have up to 0.12 (``fast``), and 0.23 at the lowest quality
+of all; a position alone takes more than 4 bits. Images of equal pixels hold millions in 4 kB, which keep a worker for
+hours: all of them cover the same pixels, and each takes 2 ms. No setting, because no real file comes near it."""
 
 FREE_GAUSSIANS = 1 << 16
 """Number of Gaussians that an upload of any size may have."""
