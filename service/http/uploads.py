@@ -35,8 +35,8 @@ HEAD_BYTES = 512
 """Bytes from which a format is recognised."""
 
 GAUSSIANS_PER_BYTE = 2
-"""Largest number of Gaussians per byte of an upload. Real files have up to 0.12 (``fast``), and 0.23 at the lowest quality
-of all; a position alone takes more than 4 bits. Images of equal pixels hold millions in 4 kB, which keep a worker for
+"""Largest number of Gaussians per byte of an upload. Real files have up to 0.12 (``fast``), and 0.23 at the lowest
+quality; a position alone takes more than 4 bits. Images of equal pixels hold millions in 4 kB, which keep a worker for
 hours: all of them cover the same pixels, and each takes 2 ms. No setting, because no real file comes near it."""
 
 FREE_GAUSSIANS = 1 << 16
