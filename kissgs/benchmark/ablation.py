@@ -20,6 +20,7 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import clean
 from kissgs.evaluation.cameras import evaluation_views
+from kissgs.evaluation.capture_fit import in_scene_frame
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Comparison
 from kissgs.pipeline.scene_files import load
@@ -217,6 +218,7 @@ class _Ablation:
         if not len(splats):
             raise InvalidSceneError(f"{self.scene} has no usable Gaussian")
         views = self.views or evaluation_views(splats, threads=self.threads, progress=self.progress)
+        views = in_scene_frame(splats, views, threads=self.threads)
 
         def row(name: str, parts: paper_ablation.EncodedParts, **published: float | None) -> AblationRow:
             mean = compare_images(splats, parts.decoded, views, threads=self.threads).mean

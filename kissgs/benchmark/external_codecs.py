@@ -19,6 +19,7 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors, sigmoid
 from kissgs.evaluation.cameras import evaluation_views
+from kissgs.evaluation.capture_fit import in_scene_frame
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.matching import match_gaussians
 from kissgs.evaluation.results import Evaluation
@@ -116,6 +117,10 @@ def measure_external(
         decoding = _convert(command, encoded, decoded, [])
         size = encoded.stat().st_size
         candidate, _ = clean(read_ply(decoded))
+    evaluation = None
+    if evaluate:
+        views = in_scene_frame(reference, views or evaluation_views(reference))
+        evaluation = compare_images(reference, candidate, views)
     return ExternalResult(
         format=format,
         gaussians=len(reference),
@@ -128,7 +133,7 @@ def measure_external(
         decode_cpu_seconds=decoding.cpu,
         peak_memory=max(encoding.memory, decoding.memory),
         errors=_errors_of_visible(reference, candidate) if errors else None,
-        evaluation=compare_images(reference, candidate, views or evaluation_views(reference)) if evaluate else None,
+        evaluation=evaluation,
     )
 
 

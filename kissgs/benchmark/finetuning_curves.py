@@ -13,6 +13,7 @@ from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import evaluation_views
+from kissgs.evaluation.capture_fit import in_scene_frame
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.pipeline.decompress import decompress
 from kissgs.pipeline.pipeline import compact, compress
@@ -95,6 +96,7 @@ def rate_curves(
             "--ratio"
         )
     evaluated = views or evaluation_views(splats, threads=threads, progress=progress)
+    evaluated = in_scene_frame(splats, evaluated, threads=threads)
     training = None if views is None or supervision == "scene" else views.for_training(supervision)
     points = []
     shares: list[float | None] = [*ratios] or [None]

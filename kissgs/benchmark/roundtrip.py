@@ -15,6 +15,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
 from kissgs.evaluation.cameras import evaluation_views
+from kissgs.evaluation.capture_fit import in_scene_frame
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
 from kissgs.io.container_names import ContainerName
@@ -116,6 +117,7 @@ def roundtrip(
 
 def _evaluation(scene: Splats, decoded: Splats, views: Views | None, threads: int, progress: Progress) -> Evaluation:
     views = views or evaluation_views(scene, threads=threads, progress=progress)
+    views = in_scene_frame(scene, views, threads=threads)
     return compare_images(scene, decoded, views, threads=threads, progress=progress)
 
 

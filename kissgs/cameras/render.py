@@ -35,7 +35,7 @@ class RenderedImages:
 
     Attributes:
         images: uint8 ``(height, width, 3)`` each: one image or contact sheet, or the frames of an animation.
-        views: the views that were rendered; for a contact sheet, those of all its cells.
+        views: the views that were rendered, in the world's coordinates; for a contact sheet, those of all its cells.
         description: description of the views, for people.
     """
 
@@ -68,7 +68,7 @@ class RenderJob:
         """Render a single image, by default at the camera's size.
 
         Args:
-            capture: views that ``which`` selects from; None for virtual views.
+            capture: views that ``which`` selects from, in the scene's coordinates; None for virtual views.
             which: number or name of a view, or a camera file; None for the first view of the capture, or the best
                 virtual view.
 
@@ -89,7 +89,7 @@ class RenderJob:
             view, source = pick_view(virtual.all, which, virtual.source), virtual.source
         if self.size is not None:
             view = View(view.name, reframed(view.camera, *self.size))
-        return RenderedImages(self._render([view.camera], capture), [view], f"{view.name} ({source})")
+        return RenderedImages(self._render([view.camera], capture), self._in_world([view]), f"{view.name} ({source})")
 
     def animation(self, frames: int | None = None) -> RenderedImages:
         """Render an orbit around the scene, as the frames of an animation that loops."""
@@ -97,9 +97,8 @@ class RenderJob:
         width, height = self.size or FRAME_SIZE
         orbit = find_orbit(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
         cameras = orbit.loop_cameras(frames or ANIMATION_FRAMES, width, height)
-        return RenderedImages(
-            self._render(cameras, None), _numbered(cameras), f"{len(cameras)} frames, {orbit.description}"
-        )
+        views = self._in_world(_numbered(cameras))
+        return RenderedImages(self._render(cameras, None), views, f"{len(cameras)} frames, {orbit.description}")
 
     def orbit_sheet(self, frames: int | None = None) -> RenderedImages:
         """Render an orbit around the scene, as one contact sheet."""
@@ -108,7 +107,8 @@ class RenderJob:
         orbit = find_orbit(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
         cameras = orbit.sheet_cameras(frames or SHEET_FRAMES, width, height)
         sheet = contact_sheet(self._render(cameras, None))
-        return RenderedImages([sheet], _numbered(cameras), f"{len(cameras)} images, {orbit.description}")
+        views = self._in_world(_numbered(cameras))
+        return RenderedImages([sheet], views, f"{len(cameras)} images, {orbit.description}")
 
     def view_sheet(self, capture: Views | None) -> RenderedImages:
         """Render a contact sheet of the capture's views, else of the virtual views, with names and held-out marks."""
@@ -121,7 +121,12 @@ class RenderJob:
         held_out = {view.name for view in views.test}
         labels = [Label(f"{view.name}{HELD_OUT * (view.name in held_out)}", view.name in held_out) for view in shown]
         sheet = contact_sheet(self._render([view.camera for view in shown], capture), labels)
-        return RenderedImages([sheet], shown, f"{len(shown)} views, {len(views.test)} held out ({views.source})")
+        description = f"{len(shown)} views, {len(views.test)} held out ({views.source})"
+        return RenderedImages([sheet], self._in_world(shown), description)
+
+    def _in_world(self, views: Sequence[View]) -> list[View]:
+        x, y, z = self.splats.origin
+        return [view.relative_to((-x, -y, -z)) for view in views]
 
     def _virtual(self, size: tuple[int, int]) -> Views:
         return virtual_views(self.splats, width=size[0], height=size[1], threads=self.threads, progress=self.progress)

@@ -81,6 +81,8 @@ class View:
 
     def relative_to(self, origin: Origin) -> View:
         """Return the view in coordinates relative to ``origin``, world units."""
+        if origin == WORLD:
+            return self
         target = None if self.target is None else self.target - origin
         return replace(self, camera=self.camera.relative_to(origin), target=target)
 
@@ -149,6 +151,7 @@ class Views:
         note: clause about an unexpected property of the capture, for messages; empty if there is none.
         similarities: from the cameras' coordinates to others that the scene may have, according to the capture's files;
             which of them are the scene's, its renderings tell (:func:`kissgs.evaluation.capture_fit.in_scene_frame`).
+        origin: point of the world at which the cameras' coordinates are zero, as for :class:`kissgs.Splats`.
     """
 
     train: tuple[View, ...]
@@ -157,18 +160,12 @@ class Views:
     source: str
     note: str = ""
     similarities: tuple[Similarity, ...] = ()
+    origin: Origin = WORLD
 
     @property
     def all(self) -> tuple[View, ...]:
         """Training and held-out views, sorted by name."""
         return tuple(sorted(self.train + self.test, key=lambda view: view.name))
-
-    def relative_to(self, origin: Origin) -> Views:
-        """Return the views in coordinates relative to ``origin``, world units, as those of a scene with that origin."""
-        if origin == WORLD:
-            return self
-        train, test = (tuple(view.relative_to(origin) for view in part) for part in (self.train, self.test))
-        return replace(self, train=train, test=test)
 
     def for_training(self, source: TargetSource) -> Views:
         """Return views whose training part suits ``source``; evaluation uses the held-out views, or all if none is."""

@@ -33,7 +33,7 @@ from kissgs.cli.arguments import (
     TimeOption,
 )
 from kissgs.cli.files import for_each_input
-from kissgs.cli.options import budget_of, chosen, device_of, open_views, origin_of, refuse_without_training
+from kissgs.cli.options import budget_of, chosen, device_of, open_views, reading_options, refuse_without_training
 
 CompactOption = Annotated[
     str | None,
@@ -116,19 +116,12 @@ def compress(
     """Compress each scene into a SOG-XT container, into SOG, or into a folder with levels of detail."""
     from kissgs.cli.compress_options import CompressOptions
     from kissgs.io.container_names import ending_of, named_container, named_manifest
-    from kissgs.pipeline.read_options import ReadOptions
     from kissgs.pipeline.training_choice import decided
 
     named = None if output is None else Path(output)
     manifest = None if named is None else named_manifest(named)
     kind = named_container(container, None if manifest else output)
-    reading = ReadOptions(
-        max_gaussians=max_gaussians,
-        level=level,
-        raw_axes=raw_axes,
-        origin=origin_of(origin),
-        antialiased=antialiased,
-    )
+    reading = reading_options(max_gaussians, level, raw_axes, origin, antialiased)
     settings = chosen(
         preset,
         changes,

@@ -21,7 +21,7 @@ from kissgs.cli.arguments import (
 )
 from kissgs.cli.console import progress_bar
 from kissgs.cli.files import for_each_input, say_notes, show, source, stdout
-from kissgs.cli.options import origin_of
+from kissgs.cli.options import reading_options
 from kissgs.core.errors import InvalidSceneError, OutputError
 
 if TYPE_CHECKING:
@@ -55,7 +55,6 @@ def convert(
     from kissgs.core.origin import in_world
     from kissgs.core.splats import clean
     from kissgs.io.atomic import atomic_file, refuse_existing
-    from kissgs.pipeline.read_options import ReadOptions
     from kissgs.pipeline.scene_files import read_scene
     from kissgs.pipeline.scene_output import write_scene
 
@@ -63,13 +62,7 @@ def convert(
     if not inputs:
         raise OutputError("convert needs an input and an output: kissgs convert IN OUT")
     kind = _output_format(output, to)
-    reading = ReadOptions(
-        max_gaussians=max_gaussians,
-        level=level,
-        raw_axes=raw_axes,
-        origin=origin_of(origin),
-        antialiased=antialiased,
-    )
+    reading = reading_options(max_gaussians, level, raw_axes, origin, antialiased)
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"

@@ -13,6 +13,7 @@ from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
+    from kissgs.pipeline.read_options import ReadOptions
     from kissgs.settings import Settings
 
 Values = dict[str, Any]
@@ -187,6 +188,21 @@ def device_of(name: str) -> Literal["cpu", "cuda"]:
 def origin_of(name: str | None) -> Literal["auto"] | None:
     """Check the value of ``--origin``."""
     return None if name is None else cast(Literal["auto"], choice("--origin", name, Literal["auto"]))
+
+
+def reading_options(
+    max_gaussians: int | None, level: int, raw_axes: bool, origin: str | None, antialiased: bool | None
+) -> ReadOptions:
+    """Return the options of reading scenes, with the value of ``--origin`` checked."""
+    from kissgs.pipeline.read_options import ReadOptions
+
+    return ReadOptions(
+        max_gaussians=max_gaussians,
+        level=level,
+        raw_axes=raw_axes,
+        origin=origin_of(origin),
+        antialiased=antialiased,
+    )
 
 
 def refuse_without_training(settings: Settings, *, checkpoint: bool, device: str) -> None:

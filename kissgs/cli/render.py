@@ -28,7 +28,6 @@ from kissgs.core.errors import UnsupportedError
 
 if TYPE_CHECKING:
     from kissgs.cameras.render import RenderedImages
-    from kissgs.cameras.views import View
 
 FPS, QUALITY = 12, 85
 COLOURS = {"black": "#000000", "white": "#ffffff"}
@@ -171,8 +170,7 @@ def render(
             )
             fitting = None
             if capture is not None:
-                seen = capture.relative_to(job.splats.origin)
-                fitting = in_scene_frame(job.splats, seen, threads=threads, progress=progress)
+                fitting = in_scene_frame(job.splats, capture, threads=threads, progress=progress)
             if orbit:
                 rendered = job.animation(frames) if animated else job.orbit_sheet(frames)
             else:
@@ -182,11 +180,9 @@ def render(
             progress("write", 1.0)
         say_notes(name, job.splats.notes, quiet)
         _deliver(data, target, force=force)
-        x, y, z = job.splats.origin
-        world = [view.relative_to((-x, -y, -z)) for view in rendered.views]
         if save_camera is not None:
-            write_camera(save_camera, world[0].camera, overwrite=force)
-        report = _report(rendered, world, len(data))
+            write_camera(save_camera, rendered.views[0].camera, overwrite=force)
+        report = _report(rendered, len(data))
         if not (quiet or as_json or piped):
             saved = "" if save_camera is None else f"; {save_camera}"
             show(f"{target}  {report['width']}x{report['height']}, {rendered.description}{saved}")
@@ -251,9 +247,9 @@ def _encoded(rendered: RenderedImages, suffix: str, fps: int, quality: int) -> b
     return png(rendered.images[0]) if suffix == ".png" else animated_webp(rendered.images, fps=fps, quality=quality)
 
 
-def _report(rendered: RenderedImages, views: list[View], size: int) -> dict[str, Any]:
+def _report(rendered: RenderedImages, size: int) -> dict[str, Any]:
     from kissgs.cameras.captures.camera_json import camera_as_dict
 
     height, width = rendered.images[0].shape[:2]
-    cameras = [{"name": view.name, **camera_as_dict(view.camera)} for view in views]
+    cameras = [{"name": view.name, **camera_as_dict(view.camera)} for view in rendered.views]
     return {"width": width, "height": height, "frames": len(rendered.images), "bytes": size, "cameras": cameras}

@@ -16,7 +16,7 @@ import numpy as np
 from kissgs.core.array_types import Float, Float32, Float64
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.signed_log import signed_log
-from kissgs.core.splats import MEAN_LIMIT, Splats
+from kissgs.core.splats import MEAN_LIMIT, Splats, sampled_rows
 
 Origin = tuple[float, float, float]
 
@@ -31,6 +31,11 @@ COARSE_SHARE = 0.01
 
 CONTAINER_LEVELS = (1 << 16) - 1
 """Steps between the smallest and the largest signed logarithm of a container's positions."""
+
+STREAMED_REMEDY = (
+    "no origin helps here, but compressing into FOLDER/lod-meta.json does, whose parts have steps of their own"
+)
+"""Remedy for coarse positions where no origin helps: streamed SOG."""
 
 
 def world_positions(splats: Splats) -> Float64[np.ndarray, "N 3"]:
@@ -53,13 +58,16 @@ def in_world(splats: Splats) -> Splats:
 
 
 def centred(splats: Splats) -> Splats:
-    """Return the scene with its origin at the whole numbers nearest to the middle of its Gaussians (their median)."""
-    return with_origin(splats, _middle(world_positions(splats)))
+    """Return the scene with its origin in its middle, that of :func:`middle_of`."""
+    return with_origin(splats, middle_of([world_positions(splats)], len(splats)))
 
 
-def middle_of(blocks: Iterable[Splats]) -> Origin:
-    """Return the origin of :func:`centred` for a scene in blocks, by every 16th Gaussian."""
-    return _middle(np.concatenate([np.empty((0, 3)), *(world_positions(block)[::16] for block in blocks)]))
+def middle_of(blocks: Iterable[Float64[np.ndarray, "n 3"]], count: int) -> Origin:
+    """Return the whole numbers nearest to the median of :func:`sampled_rows` of ``count`` positions that are finite."""
+    some = sampled_rows(blocks, count)[:, :3]
+    some = some[np.isfinite(some).all(axis=1)]
+    x, y, z = np.rint(np.median(some, axis=0)) + 0.0 if len(some) else WORLD
+    return float(x), float(y), float(z)
 
 
 def from_world(splats: Splats, positions: Float64[np.ndarray, "N 3"], origin: Origin | None = None) -> Splats:
@@ -90,7 +98,7 @@ def origin_for(positions: Float64[np.ndarray, "N 3"], scales: Float32[np.ndarray
         positions: ``(N, 3)`` in the world, world units; NaN and infinities are left out.
         scales: ``(N, 3)`` logarithms of standard deviations.
     """
-    return _middle(positions) if _rounded_share(positions, scales) > COARSE_SHARE else WORLD
+    return middle_of([positions], len(positions)) if _rounded_share(positions, scales) > COARSE_SHARE else WORLD
 
 
 def _rounded_share(positions: Float64[np.ndarray, "N 3"], scales: Float32[np.ndarray, "N 3"]) -> float:
@@ -119,6 +127,8 @@ def coarse_note(
 ) -> str:
     """Return a sentence with the remedy if a container's finest steps are too coarse for a scene, else an empty string.
 
+    The planner's own steps may be coarser for small Gaussians, where it chooses so: that is no loss by distance.
+
     Args:
         means: ``(N, 3)`` positions, world units.
         scales: ``(N, 3)`` logarithms of standard deviations.
@@ -131,13 +141,12 @@ def coarse_note(
     share = float(chances.mean()) if len(chances) else 0.0
     if share <= COARSE_SHARE:
         return ""
-    steps = ((1 + np.abs(wide)) * extents).max(axis=1) / CONTAINER_LEVELS
-    step = float(np.median(steps[chances > 0]))
+    step = float(np.median(container_steps(wide, extents).max(axis=1)[chances > 0]))
     near = wide - np.rint(np.median(wide, axis=0))
     moved = coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean() <= COARSE_SHARE
     remedy = "origin=auto moves the scene there"
     if not moved:
-        remedy = "objects far apart need files of their own, or streamed SOG (lod-meta.json) with its many ranges"
+        remedy = STREAMED_REMEDY
     return (
         f"positions have steps of about {step:.2g}, too coarse for {share:.0%} of the Gaussians, because a container "
         f"has fine steps only near the origin: {remedy}"
@@ -181,10 +190,21 @@ def coarse_chances(
         sizes: ``(N,)`` those of :func:`visible_sizes`.
         extents: ``(3,)`` extents of the signed logarithms' ranges, per axis.
     """
-    rounded = np.spacing(np.abs(signed_log(positions)).astype(np.float32))  # of the range's ends, which are float32
-    half_steps = np.maximum((1 + np.abs(positions)) * (extents / CONTAINER_LEVELS + rounded) / 2, 1e-300)
+    half_steps = np.maximum(container_steps(positions, extents) / 2, 1e-300)
     chances: Float64[np.ndarray, " N"] = 1 - np.minimum(COARSE_ERROR * sizes[:, None] / half_steps, 1).prod(axis=1)
     return chances
+
+
+def container_steps(
+    positions: Float64[np.ndarray, "N 3"], extents: Float64[np.ndarray, " 3"]
+) -> Float64[np.ndarray, "N 3"]:
+    """Return a container's finest steps at positions, world units, with the rounding of the range's ends to float32.
+
+    Arguments are those of :func:`coarse_chances`.
+    """
+    rounded = np.spacing(np.abs(signed_log(positions)).astype(np.float32))
+    steps: Float64[np.ndarray, "N 3"] = (1 + np.abs(positions)) * (extents / CONTAINER_LEVELS + rounded)
+    return steps
 
 
 def visible_sizes(scales: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
@@ -194,9 +214,3 @@ def visible_sizes(scales: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N
     """
     sizes: Float64[np.ndarray, " N"] = np.exp(np.sort(scales, axis=1)[:, 1].astype(np.float64))
     return sizes
-
-
-def _middle(positions: Float64[np.ndarray, "N 3"]) -> Origin:
-    finite = positions[np.isfinite(positions).all(axis=1)]
-    x, y, z = np.rint(np.median(finite, axis=0)) + 0.0 if len(finite) else WORLD
-    return float(x), float(y), float(z)

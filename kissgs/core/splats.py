@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float32, Float64, Int
+from kissgs.core.array_types import Bool, Float, Float32, Float64, Int
 from kissgs.core.errors import InvalidSceneError
 
 SH_REST_COUNTS = (0, 3, 8, 15)
@@ -29,6 +29,9 @@ SH_LIMIT = 1e6
 
 BLOCK = 1 << 16
 """Gaussians that are checked at a time."""
+
+SAMPLED = 1 << 20
+"""Largest number of rows of :func:`sampled_rows`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,6 +112,15 @@ def concatenate(scenes: Sequence[Splats]) -> Splats:
     """
     arrays: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in scenes]) for name in ATTRIBUTES}
     return replace(scenes[0], **arrays)
+
+
+def sampled_rows(blocks: Iterable[Float[np.ndarray, "n C"]], count: int) -> Float[np.ndarray, "S C"]:
+    """Return every k-th of ``count`` rows that come in blocks, at most :data:`SAMPLED`; no blocks give no rows."""
+    stride, first, found = max(1, -(-count // SAMPLED)), 0, []
+    for block in blocks:
+        found.append(block[first::stride].copy())
+        first = (first - len(block)) % stride
+    return np.concatenate(found) if found else np.empty((0, 4), np.float32)
 
 
 def float32_bytes(count: int, sh_degree: int) -> int:

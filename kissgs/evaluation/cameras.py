@@ -115,7 +115,7 @@ def evaluation_views(
         View(f"{n:0{digits}} part", one.camera, background=_grey(one.background), target=one.target, added=True)
         for n, one in enumerate(added, count)
     ]
-    return Views((), tuple(views), _grey(0.5), f"drawn over the whole scene, seed {seed}")
+    return Views((), tuple(views), _grey(0.5), f"drawn over the whole scene, seed {seed}", origin=splats.origin)
 
 
 def farther(views: Views, distance: float) -> Views:

@@ -15,6 +15,7 @@ import numpy as np
 from kissgs.cameras.views import Similarity, View, Views
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import InvalidViewsError, KissgsError
+from kissgs.core.origin import Origin
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.prominence import drawn_opacities
@@ -82,12 +83,12 @@ def in_scene_frame(splats: Splats, views: Views, *, threads: int = 0, progress: 
 
     Args:
         splats: the scene, finite.
-        views: a capture, with cameras in the coordinates of its files.
+        views: a capture, with cameras in the coordinates of its files, or what this function returned for it.
         threads: number of threads; 0 means one per processor.
         progress: receives the stages ``"kernels"`` and ``"cameras"``.
     """
     if not views.similarities or not views.all:
-        return views
+        return _moved(views, None, splats.origin)
     load_kernels(progress)
     progress("cameras", 0.0)
     moved, _, note = _best(splats, views, _samples(views), threads)
@@ -113,7 +114,7 @@ def fitting_views(
         InvalidViewsError: the photographs do not show the scene, and ``force`` is false.
     """
     if not views.all or not drawn_opacities(splats).any():
-        return replace(views, similarities=()), ""
+        return _moved(views, None, splats.origin), ""
     load_kernels(progress)
     progress("cameras", 0.0)
     samples, source = _samples(views), views.source
@@ -143,13 +144,13 @@ def _problem(fit: _Fit, source: str, count: int) -> str:
 
 def _best(splats: Splats, views: Views, samples: Sequence[_Sample], threads: int) -> tuple[Views, _Fit, str]:
     """Return the views in the coordinates that fit best, how well they fit, and a note if there was a choice."""
-    bare = [] if samples else _spread(views.train or views.test, CAMERAS)
+    shown = tuple(view for view, _ in samples) or _spread(views.train or views.test, CAMERAS)
 
     def fit(similarity: Similarity | None) -> _Fit:
-        move = (lambda view: view) if similarity is None else similarity.moved
-        if bare:
-            return _fit_of_cameras(splats, [move(view) for view in bare], threads)
-        return _fit_to_photos(splats, [(move(view), photo) for view, photo in samples], threads)
+        moved = _moved(replace(views, train=tuple(shown), test=()), similarity, splats.origin).train
+        if not samples:
+            return _fit_of_cameras(splats, moved, threads)
+        return _fit_to_photos(splats, [(view, photo) for view, (_, photo) in zip(moved, samples, strict=True)], threads)
 
     given = best = fit(None)
     chosen = None
@@ -158,13 +159,21 @@ def _best(splats: Splats, views: Views, samples: Sequence[_Sample], threads: int
         if found.quality > best.quality:
             best, chosen = found, similarity
     files = ", ".join(dict.fromkeys(similarity.source for similarity in views.similarities))
-    views = replace(views, similarities=())
+    views = _moved(views, chosen, splats.origin)
     if chosen is None:
         unused = f"the cameras fit the scene as they are ({given}), so {files} is not applied"
         return views, best, unused if ".json" in files else ""
-    train, test = (tuple(chosen.moved(view) for view in part) for part in (views.train, views.test))
-    note = f"the cameras are moved by {chosen.source} to fit the scene: {best} instead of {given}"
-    return replace(views, train=train, test=test), best, note
+    return views, best, f"the cameras are moved by {chosen.source} to fit the scene: {best} instead of {given}"
+
+
+def _moved(views: Views, similarity: Similarity | None, origin: Origin) -> Views:
+    """Return the views moved by a similarity of the world, in coordinates relative to ``origin``."""
+    x, y, z = (new - old for new, old in zip(origin, views.origin, strict=True))
+
+    def moved(part: tuple[View, ...]) -> tuple[View, ...]:
+        return tuple((similarity.moved(view) if similarity else view).relative_to((x, y, z)) for view in part)
+
+    return replace(views, train=moved(views.train), test=moved(views.test), similarities=(), origin=origin)
 
 
 def _fit_to_photos(splats: Splats, samples: Sequence[_Sample], threads: int) -> _Fit:

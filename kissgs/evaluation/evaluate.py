@@ -82,7 +82,7 @@ def evaluate(
     measure = _measure(flip, lpips, device)
     if views is not None:
         _select_split(views, split)  # refused before any work
-        views = in_scene_frame(reference, views.relative_to(reference.origin), threads=threads, progress=progress)
+        views = in_scene_frame(reference, views, threads=threads, progress=progress)
     given = [] if views is None else [_select_split(views, split)]
     load_kernels(progress)
     drawn = farther(evaluation_views(reference, seed=seed, threads=threads, progress=progress), distance)
@@ -121,7 +121,7 @@ def compare_images(
     Args:
         reference: the original scene.
         candidate: the scene to evaluate.
-        views: the views.
+        views: the views, in the coordinates of the reference.
         device: see :func:`evaluate`.
         threads: see :func:`evaluate`.
         reference_images: cache of the reference's renderings by view name, read and filled; for comparisons of many
@@ -133,7 +133,6 @@ def compare_images(
         UnsupportedError: see :func:`evaluate`.
     """
     reference, candidate = clean(reference)[0], clean(candidate)[0]
-    views = in_scene_frame(reference, views, threads=threads, progress=progress)
     group = _select_split(views, "test")
     if device == "cpu":
         load_kernels(progress)
@@ -186,7 +185,8 @@ def _compare_views(
         other = render_clamped(candidate, view.camera, background, device, threads)
         blank = blank and bool((image == np.clip(background, 0, 1)).all())
         photo = view.load_photo() if group.photographed else None
-        compared.append(ViewComparison(view=view, comparison=_compare(image, other, photo, measure)))
+        comparison = _compare(image, other, photo, measure)
+        compared.append(ViewComparison(view=view, comparison=comparison, origin=reference.origin))
     return Evaluation(
         against="photos" if group.photographed else "renderings",
         split=group.split,

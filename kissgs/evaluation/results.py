@@ -11,6 +11,7 @@ import numpy as np
 
 from kissgs.cameras.views import View
 from kissgs.core.array_types import Float32, Float64
+from kissgs.core.origin import WORLD, Origin
 from kissgs.evaluation.metric_text import format_metric
 
 Split = Literal["test", "train", "all"]
@@ -99,10 +100,11 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewComparison:
-    """A view and the metrics of its images."""
+    """A view and the metrics of its images; ``origin``: where the view's coordinates are zero in the world."""
 
     view: View
     comparison: Comparison
+    origin: Origin = WORLD
 
     @property
     def ranking_psnr(self) -> float:
@@ -112,25 +114,34 @@ class ViewComparison:
 
     @property
     def pose(self) -> str:
-        """Position of the camera, and its target or direction, in the scene's coordinates, as text."""
-        camera = self.view.camera
-        if self.view.target is not None:
-            return f"at {_point(camera.position)} looking at {_point(self.view.target)}"
-        return f"at {_point(camera.position)} looking along {_point(camera.viewmat[2, :3])}"
+        """Position of the camera, and its target or direction, in the world, as text."""
+        position, target, direction = self._pose
+        if target is not None:
+            return f"at {_point(position)} looking at {_point(target)}"
+        return f"at {_point(position)} looking along {_point(direction)}"
 
     def pose_as_dict(self) -> dict[str, Any]:
         """Return the view's name, its PSNR of the candidate to the reference, and the camera's pose, for JSON.
 
-        ``position``, ``target`` (None if unknown) and the unit vector ``direction`` are in the scene's coordinates.
+        ``position``, ``target`` (None if unknown) and the unit vector ``direction`` are in the world's coordinates.
         """
-        camera, target = self.view.camera, self.view.target
+        position, target, direction = self._pose
         return {
             "name": self.view.name,
             "psnr": as_json(self.comparison.candidate_vs_reference.psnr),
-            "position": camera.position.tolist(),
+            "position": position.tolist(),
             "target": None if target is None else target.tolist(),
-            "direction": camera.viewmat[2, :3].tolist(),
+            "direction": direction.tolist(),
         }
+
+    @property
+    def _pose(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"] | None, Float64[np.ndarray, "3"]]:
+        camera, target = self.view.camera, self.view.target
+        return (
+            camera.position + self.origin,
+            None if target is None else target + self.origin,
+            camera.viewmat[2, :3],
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return name, size in pixels and metrics, for JSON."""
@@ -273,7 +284,7 @@ def _mean_decibels(values: Sequence[float]) -> float:
 
 
 def _point(point: Float64[np.ndarray, "3"]) -> str:
-    return f"({', '.join(f'{value:.4g}' for value in point)})"
+    return f"({', '.join(f'{value:.4g}' if abs(value) < 1000 else f'{value:.1f}' for value in point)})"
 
 
 def as_json(value: float) -> float | str | None:

@@ -13,7 +13,7 @@ from kissgs.core.array_types import Float32, Float64, Shaped
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.origin import WORLD, Origin, from_world, in_world, origin_for, world_positions
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats
+from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats, sampled_rows
 from kissgs.io.compressed_ply import PACKED, check_compressed, is_compressed, read_compressed
 from kissgs.io.ply_body import check_complete, rows
 from kissgs.io.ply_header import MIP_COMMENT, Element, Encoding, Header, PlyFile, open_ply, sh_degree
@@ -261,14 +261,14 @@ class _Columns:
         self._k = SH_REST_COUNTS[degree]
         self._rgb = _has_rgb(vertex)
         self._filter = _filter_of(vertex)
-        self._dtype = vertex.dtype(encoding)
         types = {p.code for p in vertex.properties if p.name in _POSITION}
         self.wide = encoding == "ascii" or not types <= {"f4", "f2", "i1", "u1", "i2", "u2"}
 
     def origin(self, blocks: Iterable[np.ndarray]) -> Origin:
-        """Return the origin of a scene whose positions may have more digits than float32, by every 16th row."""
-        some = np.concatenate([np.empty(0, self._dtype), *(block[::16] for block in blocks)])
-        return origin_for(_float64(some, _POSITION), self.splats(some, WORLD).scales)
+        """Return the origin of a scene whose positions may have more digits than float32."""
+        each = (np.column_stack([_float64(block, _POSITION), self.splats(block, WORLD).scales]) for block in blocks)
+        some = sampled_rows(each, self.vertex.count)
+        return origin_for(some[:, :3], some[:, 3:6].astype(np.float32))
 
     def splats(self, block: np.ndarray, origin: Origin) -> Splats:
         """Return the Gaussians of some rows, relative to ``origin``."""

@@ -119,7 +119,6 @@ def compact(
         check_ply(target, overwrite=overwrite)
     clock = StageTimer(progress)
     splats, cleaned, _ = open_scene(source, reading, threads, clock)
-    views = None if views is None else views.relative_to(splats.origin)
     views, note = _fitting(splats, views, force_views, threads, clock)
     result = compact_scene(
         splats,
@@ -218,7 +217,6 @@ def compress(
     deadline = None if settings.time_limit is None else Deadline.after(settings.time_limit)
     clock = StageTimer(progress)
     original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
-    views = None if views is None else views.relative_to(original.origin)
     source_count, sh_degree = len(original) + cleaned.removed, original.sh_degree
     keep_all = sensitivity is not None
     views_note = ""
@@ -367,6 +365,4 @@ def _evaluate(
     progress("evaluate", 0.0)
     most = ReadOptions(max_gaussians=max(len(splats), MAX_GAUSSIANS))
     decoded = read_scene(container, most, threads=threads)
-    x, y, z = splats.origin
-    world = None if views is None else views.relative_to((-x, -y, -z))
-    return evaluate(splats, decoded, world, threads=threads, progress=as_stage("evaluate", progress))
+    return evaluate(splats, decoded, views, threads=threads, progress=as_stage("evaluate", progress))

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt16
-from kissgs.core.origin import WORLD, visible_sizes
+from kissgs.core.origin import STREAMED_REMEDY, WORLD, visible_sizes
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import Splats, clean, concatenate
+from kissgs.core.splats import Splats, clean, concatenate, sampled_rows
 from kissgs.io.atomic import atomic_file
 from kissgs.io.container_names import ContainerName
 from kissgs.pipeline.containers import MODELS, write_files
@@ -44,7 +44,7 @@ from kissgs.streaming.layout import (
 )
 from kissgs.streaming.levels import chunk_levels, level_count
 from kissgs.streaming.manifest import Leaf, manifest
-from kissgs.streaming.partition import Cuts, chunk_depth, cuts_without_coarse, sampled_rows
+from kissgs.streaming.partition import Cuts, chunk_depth, cuts_without_coarse
 from kissgs.streaming.rows import append_rows, from_rows, read_rows, row_bytes, sync, to_rows, write_rows
 from kissgs.streaming.sensitivities import cameras_json, cameras_of, choose_cameras, measure_file
 
@@ -282,7 +282,8 @@ def _encode(
 def coarse_note(work: Path, layout: Layout) -> str:
     """Return the note of the first file of the finest level whose positions are coarse; else an empty string."""
     notes = (json.loads(rows_file(work, *each).read_bytes())["note"] for each in layout.files() if each[0] == 0)
-    return next(filter(None, notes), "")
+    note = next(filter(None, notes), "")
+    return note.removesuffix(f": {STREAMED_REMEDY}") if layout.container == "sog" else note
 
 
 def environment_count(work: Path) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 
 from kissgs._version import __version__
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
-from kissgs.core.origin import middle_of, with_origin
+from kissgs.core.origin import middle_of, with_origin, world_positions
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import BLOCK, Splats
 from kissgs.io.atomic import atomic_file, reason_of
@@ -192,7 +192,9 @@ def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, i
     if recognise(source) == "ply":
         info = read_ply_info(source)
         if not info.compressed:
-            origin = middle_of(read_ply_blocks(source)) if reading.origin == "auto" else None
+            origin = None
+            if reading.origin == "auto":
+                origin = middle_of(map(world_positions, read_ply_blocks(source)), info.count)
 
             def blocks() -> Iterator[Splats]:
                 return (with_origin(reading.marked(block), origin) for block in read_ply_blocks(source))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +13,6 @@ from kissgs.core.signed_log import signed_log
 
 LEAST = 512
 """Number of Gaussians in a chunk up to which it is not cut further."""
-
-SAMPLED = 1 << 20
-"""Largest number of positions that choose the cuts between chunks."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,15 +54,6 @@ class Cuts:
         for _ in range(self.depth):
             node = 2 * node + (means[rows, self.axes[node]] >= self.values[node])
         return (node - self.chunks).astype(np.uint16)
-
-
-def sampled_rows(blocks: Iterable[Float32[np.ndarray, "n 4"]], count: int) -> Float32[np.ndarray, "S 4"]:
-    """Return every k-th of ``count`` rows, position and size, that come in blocks, at most :data:`SAMPLED`."""
-    stride, first, found = max(1, -(-count // SAMPLED)), 0, []
-    for block in blocks:
-        found.append(block[first::stride].copy())
-        first = (first - len(block)) % stride
-    return np.concatenate(found) if found else np.zeros((0, 4), np.float32)
 
 
 def coarse_in_chunks(rows: Float32[np.ndarray, "S 4"], cuts: Cuts) -> bool:

@@ -109,7 +109,7 @@ def test_cameras_stay_where_the_scene_is_in_their_coordinates(tmp_path):
     write_dataparser(tmp_path)
     views = kissgs.load_views(tmp_path)
     found, note = fitting_views(SCENE, views)
-    assert found.train is views.train
+    assert found.train == views.train  # the same objects
     assert "dataparser_transforms.json is not applied" in note
 
 

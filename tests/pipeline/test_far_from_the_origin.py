@@ -2,8 +2,10 @@
 
 import base64
 import json
+import re
 import struct
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +13,9 @@ from helpers import reference_ply
 from helpers.command_line import run
 
 import kissgs
-from kissgs.cameras.views import View, Views, black
+from kissgs.cameras.views import Similarity, View, Views, black
 from kissgs.core.origin import coarse_share
+from kissgs.evaluation.capture_fit import in_scene_frame
 from kissgs.rendering.camera import look_at
 from kissgs.sogxt.names import JSON_NAME, YAML_NAME
 
@@ -29,6 +32,15 @@ OFFSETS = {
 }
 MAP = (452_345.25, 4_512_345.75, 120.0)
 """Projected coordinates, whose steps in float32 are half a metre."""
+
+
+EYE = (452_345.25, 4_512_345.75, 114.0)
+"""Position of a camera that looks at ``MAP``."""
+
+
+def view_from(eye, target=MAP):
+    camera = look_at(np.array(eye), np.array(target), np.array([0.0, -1, 0]), fov=1.0, width=64, height=48)
+    return Views((), (View("a", camera),), black(), "a test")
 
 
 def columns(positions, size=SIZE):
@@ -84,6 +96,46 @@ def test_coarse_steps_are_named_and_an_origin_mends_them(offset, ending, tmp_pat
     assert "steps" not in moved.report.note
     assert "positions are relative to the point" in moved.report.note
     assert largest_error(wanted, positions_of(decoded)) < SIZE / 8
+
+
+def test_the_step_that_is_named_includes_the_rounding_of_the_range(tmp_path):
+    """The ends of a range are float32: at 1e6, that is coarser than 65,535 steps between them."""
+    scene = write(tmp_path / "a.ply", around((1e6, 1e6, 0)))
+    note = kissgs.compress(scene, tmp_path / "a.sog", settings=FAST).report.note
+    step = float(re.search("steps of about ([0-9.e+-]+)", note)[1])
+    wanted, found = around((1e6, 1e6, 0)).astype(np.float32), kissgs.load(tmp_path / "a.sog").means
+    assert step / 20 < largest_error(wanted.astype(float), found.astype(float)) < step
+
+
+def test_small_gaussians_among_large_ones_are_no_matter_of_distance(tmp_path):
+    """One in ten is small: fast gives all the bits that the median Gaussian needs, which is no loss by distance."""
+    sizes = np.where(np.arange(1000) % 10, 0.1, 0.0005)
+    scene = kissgs.load(write(tmp_path / "a.ply", around((0, 0, 0), 1000) / 4, size=sizes))
+
+    def coarse(**settings):
+        found = kissgs.compress(scene, settings=kissgs.Settings.from_preset("fast", **settings))
+        assert found.report.note == ""
+        errors = np.abs(kissgs.decompress(found.files).means - scene.means[found.order]).max(axis=1)
+        return coarse_share(errors, scene.scales[found.order])
+
+    assert coarse() > 0.05
+    assert coarse(means_bits=16) < 0.01
+
+
+def test_streamed_sog_is_no_remedy_for_itself(tmp_path):
+    scene = write(tmp_path / "a.ply", 1000 * around((0, 0, 0), 1000), size=1e-7)
+    assert "FOLDER/lod-meta.json" in kissgs.compress(scene, settings=FAST).report.note
+    note = kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST).note
+    assert "positions have steps of" in note
+    assert "lod-meta.json" not in note
+
+
+def test_a_scene_in_blocks_has_the_origin_of_the_whole_scene(tmp_path):
+    scene = write(tmp_path / "a.ply", 1000 * around((3, 0, 0), 2000))
+    kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST, reading=AUTO)
+    origin = json.loads((tmp_path / "tree" / "lod-meta.json").read_bytes())["kissgs"]["origin"]
+    assert tuple(origin) == kissgs.load(scene, origin="auto").origin
+    assert origin == np.rint(np.median(1000 * around((3, 0, 0), 2000), axis=0)).tolist()
 
 
 def test_a_scene_near_the_origin_is_not_moved():
@@ -151,13 +203,41 @@ def test_convert_writes_the_world_where_a_format_can(tmp_path):
 
 def test_a_compression_is_evaluated_with_its_capture(tmp_path):
     scene = write(tmp_path / "a.ply", around(MAP), "double")
-    eye = look_at(
-        np.array(MAP) - np.array([0, 0, 6]), np.array(MAP), np.array([0.0, -1, 0]), fov=1.0, width=64, height=48
-    )
-    views = Views((), (View("a", eye),), black(), "a test")
-    report = kissgs.compress(scene, settings=FAST, evaluate=True, views=views).report
+    report = kissgs.compress(scene, settings=FAST, evaluate=True, views=view_from(EYE)).report
     assert report.evaluation.mean.candidate_vs_reference.psnr > 35
     assert report.evaluation.shown > 0.5
+    assert np.allclose(report.evaluation.worst.pose_as_dict()["position"], EYE, rtol=0, atol=1e-6)
+
+
+def test_evaluations_name_cameras_in_the_world(tmp_path):
+    scene = kissgs.load(write(tmp_path / "a.ply", around(MAP), "double"))
+    found = kissgs.evaluate(scene, scene, view_from(EYE))
+    assert np.allclose(found.as_dict()["worst"]["position"], EYE, rtol=0, atol=1e-6)
+    assert "at (452345.2, 4512345.8, 114) looking along (0, 0, 1)" in found.extremes
+    drawn = found.surroundings.as_dict()["worst"]
+    assert max(np.abs(np.subtract(drawn[name], MAP)).max() for name in ("position", "target")) < 100
+
+
+def test_rendered_images_name_cameras_in_the_world(tmp_path):
+    scene, camera = write(tmp_path / "a.ply", around(MAP), "double"), tmp_path / "camera.json"
+    options = ("--size", "64x48", "--json")
+    first = run("render", scene, "-o", tmp_path / "a.png", "--save-camera", camera, *options)
+    again = run("render", scene, "-o", tmp_path / "b.png", "--view", camera, *options)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    for out in (first, again):
+        viewmat = np.array(json.loads(out.stdout)["cameras"][0]["viewmat"])
+        assert np.abs(-viewmat[:3, :3].T @ viewmat[:3, 3] - MAP).max() < 100
+
+
+def test_a_capture_that_its_files_move_to_a_map_fits(tmp_path):
+    """Cameras near zero, and a similarity from there to the world of the scene, which is relative to its origin."""
+    scene, to_map = kissgs.load(write(tmp_path / "a.ply", around(MAP), "double")), np.eye(4)
+    to_map[:3, 3] = MAP
+    near = replace(view_from(np.array(EYE) - MAP, (0, 0, 0)), similarities=(Similarity("a.json", to_map),))
+    found = in_scene_frame(scene, near)
+    assert "moved by a.json" in found.note
+    assert np.allclose(found.test[0].camera.position + scene.origin, EYE, rtol=0, atol=1e-6)
+    assert in_scene_frame(scene, found).test[0].camera is found.test[0].camera
 
 
 def test_no_gaussians(tmp_path):
@@ -192,11 +272,7 @@ def test_scenes_of_two_origins_and_a_capture_are_compared_in_one_world(tmp_path)
         means=means,
         origin=tuple(map(float, origin)),
     )
-    eye = look_at(
-        np.array(MAP) - np.array([0, 0, 6]), np.array(MAP), np.array([0.0, -1, 0]), fov=1.0, width=64, height=48
-    )
-    views = Views((), (View("a", eye),), black(), "a test")
-    found = kissgs.evaluate(reference, other, views)
+    found = kissgs.evaluate(reference, other, view_from(EYE))
     assert found.mean.candidate_vs_reference.psnr > 35
     assert found.shown > 0.5
 
@@ -209,7 +285,7 @@ def test_objects_far_apart_are_kept_by_streamed_sog(tmp_path):
     scene = write(tmp_path / "a.ply", positions, size=sizes)
     note = kissgs.compress(scene, settings=FAST, reading=AUTO).report.note
     assert "positions have steps of" in note
-    assert "lod-meta.json" in note
+    assert "compressing into FOLDER/lod-meta.json" in note
     report = kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST)
     assert report.note == ""
     found = kissgs.load(tmp_path / "tree").means.astype(float)

@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from kissgs.streaming.partition import Cuts, chunk_depth, leaf_groups, sampled_rows
+from kissgs.core.splats import sampled_rows
+from kissgs.streaming.partition import Cuts, chunk_depth, leaf_groups
 
 
 def positions(count, seed=0):
@@ -39,7 +40,7 @@ def test_positions_at_one_place_are_all_in_one_chunk():
 
 @pytest.mark.parametrize("sizes", [(10,), (3, 1, 6), (1,) * 9])
 def test_a_sample_has_every_kth_position_whatever_the_blocks(sizes, monkeypatch):
-    monkeypatch.setattr("kissgs.streaming.partition.SAMPLED", 4)
+    monkeypatch.setattr("kissgs.core.splats.SAMPLED", 4)
     means = positions(sum(sizes))
     blocks = np.split(means, np.cumsum(sizes)[:-1])
     found = sampled_rows(blocks, sum(sizes))

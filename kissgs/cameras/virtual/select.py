@@ -6,6 +6,8 @@ the good ones lie on the side that was captured. Among these, cameras far from e
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from kissgs.cameras.views import View, Views, black
@@ -57,7 +59,8 @@ def virtual_views(
         InvalidViewsError: ``count``, ``width`` or ``height`` is less than 1.
     """
     candidates, selected = _select(splats, (width, height), count, threads, progress)
-    return split_views(with_size([candidates.cameras[n] for n in selected], width, height))
+    views = split_views(with_size([candidates.cameras[n] for n in selected], width, height))
+    return replace(views, origin=splats.origin)
 
 
 def best_view(
