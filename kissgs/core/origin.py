@@ -32,9 +32,7 @@ COARSE_SHARE = 0.01
 CONTAINER_LEVELS = (1 << 16) - 1
 """Steps between the smallest and the largest signed logarithm of a container's positions."""
 
-STREAMED_REMEDY = (
-    "no origin helps here, but compressing into FOLDER/lod-meta.json does, whose parts have steps of their own"
-)
+STREAMED_REMEDY = "no origin helps here, but compressing into FOLDER/lod-meta.json does, whose parts have fine steps"
 """Remedy for coarse positions where no origin helps: streamed SOG."""
 
 
@@ -142,11 +140,14 @@ def coarse_note(
     if share <= COARSE_SHARE:
         return ""
     step = float(np.median(container_steps(wide, extents).max(axis=1)[chances > 0]))
-    near = wide - np.rint(np.median(wide, axis=0))
-    moved = coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean() <= COARSE_SHARE
-    remedy = "origin=auto moves the scene there"
-    if not moved:
-        remedy = STREAMED_REMEDY
+    near, small = wide - np.rint(np.median(wide, axis=0)), np.zeros(3)
+    remedies = {
+        "origin=auto moves the scene there": (near, np.ptp(signed_log(near)).repeat(3)),
+        STREAMED_REMEDY: (wide, small),
+        "compressing into FOLDER/lod-meta.json with origin=auto gives its parts fine steps": (near, small),
+    }
+    helpful = (name for name, (at, span) in remedies.items() if coarse_chances(at, sizes, span).mean() <= COARSE_SHARE)
+    remedy = next(helpful, "compress objects so far apart into files of their own, with origin=auto")
     return (
         f"positions have steps of about {step:.2g}, too coarse for {share:.0%} of the Gaussians, because a container "
         f"has fine steps only near the origin: {remedy}"

@@ -56,8 +56,8 @@ class Cuts:
         return (node - self.chunks).astype(np.uint16)
 
 
-def coarse_in_chunks(rows: Float32[np.ndarray, "S 4"], cuts: Cuts) -> bool:
-    """Return whether too many positions are coarse in containers with a range of each axis, one for each chunk.
+def coarse_in_chunks(rows: Float32[np.ndarray, "S 4"], cuts: Cuts) -> float:
+    """Return the share of positions that are coarse in containers with a range of each axis, one for each chunk.
 
     ``rows`` are positions and visible sizes.
     """
@@ -66,23 +66,25 @@ def coarse_in_chunks(rows: Float32[np.ndarray, "S 4"], cuts: Cuts) -> bool:
         part = rows[chunks == chunk].astype(np.float64)
         extents = np.ptp(signed_log(part[:, :3]), axis=0)
         coarse += float(coarse_chances(part[:, :3], part[:, 3], extents).sum())
-    return coarse > COARSE_SHARE * len(rows)
+    return coarse / max(len(rows), 1)
 
 
 def cuts_without_coarse(sample: Float32[np.ndarray, "S 4"], cuts: Cuts, count: int) -> Cuts:
-    """Return deeper cuts if positions are coarse in the chunks of ``cuts``, unless they are coarse in small chunks too.
+    """Return deeper cuts if positions are coarse in the chunks of ``cuts``, unless about as many are in small chunks.
 
     Args:
         sample: positions and visible sizes.
         cuts: the fewest cuts.
         count: number of Gaussians of the scene.
     """
-    deeper = cuts
-    while coarse_in_chunks(sample, deeper):
-        if count >> deeper.depth <= LEAST:
-            return cuts
-        deeper = Cuts.of(sample[:, :3], deeper.depth + 1)
-    return deeper
+    tried = [(coarse_in_chunks(sample, cuts), cuts)]
+    while tried[-1][0] > COARSE_SHARE and count >> tried[-1][1].depth > LEAST:
+        deeper = Cuts.of(sample[:, :3], tried[-1][1].depth + 1)
+        tried.append((coarse_in_chunks(sample, deeper), deeper))
+    if tried[-1][0] <= COARSE_SHARE:
+        return tried[-1][1]
+    most = 1.1 * min(share for share, _ in tried)
+    return next(each for share, each in tried if share <= most)
 
 
 def chunk_depth(count: int, chunk: int) -> int:
