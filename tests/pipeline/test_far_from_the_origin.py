@@ -126,7 +126,7 @@ def test_small_gaussians_among_large_ones_are_no_matter_of_distance(tmp_path):
     ("size", "reading"), [(0.0015, kissgs.ReadOptions()), (0.0007, AUTO)], ids=["parts", "parts and origin"]
 )
 def test_the_remedy_that_is_named_helps(size, reading, tmp_path):
-    """At 1,000 units, ends of ranges in float32 are too coarse for the smaller size; near an origin they are not."""
+    """Ends of ranges in float32 are too coarse for the smaller size 1,000 units away; near an origin they are not."""
     rng = np.random.default_rng(1)
     far = 0.02 * rng.normal(size=(1500, 3)) + (1000, 0, 0)
     positions, sizes = np.concatenate([rng.normal(size=(1500, 3)), far]), np.repeat([0.05, size], 1500)
