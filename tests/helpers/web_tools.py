@@ -60,7 +60,7 @@ def run_node(program, text="", *arguments, timeout=300):
 
 
 def decode_all(folder, files, **options):
-    """Decode files with ``decodeWebP``; return dicts of width, height, sha256 and ms, or of name and error."""
+    """Decode files with ``decodeWebP``; return dicts of width, height and sha256, or of name and error."""
     blob = folder / "files.bin"
     blob.write_bytes(b"".join(files))
     job = {"sizes": [len(data) for data in files], **options}

@@ -162,7 +162,7 @@ def test_aborting(site):
     """Aborted before, during and while waiting: the signal's reason is thrown, and no callback follows."""
     files = container()
     address = site.put("slow", files)
-    site.late["/slow/f_dc.webp"] = 1.0
+    site.late["/slow/f_dc.webp"] = 20
     found = in_node(
         job(files, abort="before"),
         job(address, abort="before"),
@@ -174,7 +174,7 @@ def test_aborting(site):
     names = [report["error"]["name"] for report in found]
     assert names == ["AbortError", "AbortError", "RangeError", "AbortError", "AbortError", "AbortError"]
     assert all(report["later"] == 0 for report in found)
-    assert all(report["ms"] < 900 for report in found)
+    assert all(report["ms"] < 15_000 for report in found)  # none waited for the file
     assert [report["order"] for report in found[:3]] == [[], [], []]
 
 
