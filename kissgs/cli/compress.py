@@ -120,7 +120,7 @@ def compress(
 
     named = None if output is None else Path(output)
     manifest = None if named is None else named_manifest(named)
-    kind = named_container(container, None if manifest else output)
+    kind = named_container(container, None if manifest or output == "-" else output)
     reading = reading_options(max_gaussians, level, raw_axes, origin, antialiased)
     settings = chosen(
         preset,

@@ -159,6 +159,9 @@ def _refuse_file_name(folder: Path, suffix: str) -> None:
     from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS
 
     ending = folder.suffix.lower()
+    if not ending:
+        file = f", or in {suffix}" if suffix else ""
+        raise OutputError(f"there is no folder {folder!s:.100}; end it in a slash to make it{file}")
     if not suffix:
         raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; end it in a slash")
     if ending in (*ENDINGS, *SCENE_ENDINGS):

@@ -228,5 +228,7 @@ def choice(option: str, value: str, allowed: Any) -> str:  # noqa: ANN401  a Lit
     """Check that the value of an option is one of ``allowed``, a Literal."""
     names = get_args(allowed)
     if value not in names:
-        raise UnsupportedError(f"{option} {value}: choose {', '.join(names[:-1])} or {names[-1]}")
+        others = ", ".join(names[:-1])
+        known = f"{others} or {names[-1]}" if others else names[-1]
+        raise UnsupportedError(f"{option} {value}: choose {known}")
     return value

@@ -39,22 +39,25 @@ def ending_of(container: ContainerName) -> str:
     return next(ending for ending, name in ENDINGS.items() if name == container)
 
 
-def names_folder(destination: str) -> bool:
-    """Whether a name is that of a folder: it exists, or ends in a slash, in no ending or in digits (``v1.2``)."""
-    ending = Path(f"_{Path(destination).name.rstrip('.')}").suffix  # also of ".zip" and "a.zip."
+def names_folder(destination: str | PathLike[str]) -> bool:
+    """Whether a name is that of a folder: one that exists, or ends in a slash or in ``.container``.
+
+    A Path keeps no slash: one without an ending is a folder.
+    """
+    name = os.fspath(destination)
+    ending = Path(f"_{Path(name).name.rstrip('.')}").suffix  # also of ".zip" and "a.zip."
     return (
-        destination.endswith(_SLASHES)
-        or ending in ("", FOLDER_ENDING)
-        or ending[1:].isdecimal()
-        or os.path.isdir(destination)  # noqa: PTH112  Path.is_dir raises where a name is too long
+        name.endswith(_SLASHES)
+        or ending == FOLDER_ENDING
+        or (not ending and not isinstance(destination, str))
+        or os.path.isdir(name)  # noqa: PTH112  Path.is_dir raises where a name is too long
     )
 
 
 def named_container(requested: str | None, destination: str | PathLike[str] | None) -> ContainerName:
     """Return the container to write: the requested one, else that of the destination's ending, else SOG-XT.
 
-    A destination that ends in neither ``.zip`` nor ``.sog`` is a folder, and must look like one (:func:`names_folder`);
-    :class:`~pathlib.Path` has lost the slash at its end.
+    A destination that ends in neither ``.zip`` nor ``.sog`` is a folder, and must look like one (:func:`names_folder`).
 
     Raises:
         UnsupportedError: there is no such container, or the destination has the name of another one, of another format
@@ -63,7 +66,7 @@ def named_container(requested: str | None, destination: str | PathLike[str] | No
     path = None if destination is None else Path(destination)
     ending = "" if path is None else path.suffix.lower()
     manifest = path is not None and named_manifest(path) is not None
-    if manifest or (destination is not None and ending not in ENDINGS and not names_folder(os.fspath(destination))):
+    if manifest or (destination is not None and ending not in ENDINGS and not names_folder(destination)):
         remedy = "end it in .zip or .sog"
         if ending in SCENE_ENDINGS:
             remedy += " (kissgs convert writes other formats)"

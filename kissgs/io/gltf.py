@@ -42,6 +42,9 @@ _KNOWN_ATTRIBUTES = re.compile(
 )
 """Attributes that are read or repeat what others say, as ``COLOR_0`` does."""
 
+_USUAL = {"projection": "perspective", "sortingMethod": "cameraDistance"}
+"""Ways to draw that kissgs has no other of, by key of the extension."""
+
 _MAX_INSTANCES = 1000
 """Largest number of nodes, and of primitives, each counted at every node and instance that shows it."""
 
@@ -157,6 +160,9 @@ def _primitives(document: Document, left_out: dict[str, None]) -> Iterator[_Prim
     """
     _check_required(document)
     left_out |= dict.fromkeys(key for key in ("animations", "skins") if document.items(key))
+    left_out |= dict.fromkeys(f"extension {name[:60]}" for name in _extensions(document, "extensionsUsed"))
+    if len(document.items("scenes")) > 1:
+        left_out["other scenes"] = None
     seen, number = 0, 0
     for mesh, matrix in _instances(document, left_out):
         primitives = document.items("primitives", mesh)
@@ -170,29 +176,50 @@ def _primitives(document: Document, left_out: dict[str, None]) -> Iterator[_Prim
                 found = _primitive(document, primitive, splatting, matrix)
                 unread = [str(key) for key in ("indices", "targets") if key in primitive]
                 unread += [
+                    f"{key} {str(splatting[key])[:40]!r}"
+                    for key, usual in _USUAL.items()
+                    if splatting.get(key, usual) != usual
+                ]
+                unread += [
                     key for key in found.attributes if found.spz is None and not _KNOWN_ATTRIBUTES.fullmatch(key)
                 ]
                 left_out |= dict.fromkeys(unread)
                 yield found
             else:
                 left_out["meshes without Gaussians"] = None
-    if not number:
+    if number:
+        return
+    meshes = (primitive for mesh in document.items("meshes") for primitive in document.items("primitives", mesh))
+    if any(EXTENSION in document.child(primitive, "extensions") for primitive in meshes):
         raise InvalidSceneError(
-            f"{document.name} has no Gaussians: none of its meshes uses {EXTENSION}; name a 3DGS scene"
+            f"{document.name} shows none of its Gaussians: no visible node of its scene has them; export them visible"
         )
+    raise InvalidSceneError(f"{document.name} has no Gaussians: none of its meshes uses {EXTENSION}; name a 3DGS scene")
 
 
 def _check_required(document: Document) -> None:
-    required = document.root.get("extensionsRequired", [])
-    if not isinstance(required, list) or not all(isinstance(name, str) for name in required):
-        raise document.invalid("extensionsRequired is not a list of names")
-    for name in required:
+    asset = document.child(document.root, "asset")
+    if (version := str(asset.get("minVersion", asset.get("version", "2.0")))) != "2.0":
+        raise UnsupportedError(f"{document.name} is glTF of version {version[:20]!r}; export it as glTF 2.0")
+    for name in _names(document, "extensionsRequired"):
         if name in _COMPRESSIONS:
             raise UnsupportedError(f"{document.name} is compressed by {name!r}; export it without or with .spz")
-        if name not in _READ and not _OF_SURFACES.fullmatch(name):
-            raise UnsupportedError(
-                f"{document.name} requires the extension {name[:60]!r}, which is not read; export it without"
-            )
+    for name in _extensions(document, "extensionsRequired"):
+        raise UnsupportedError(
+            f"{document.name} requires the extension {name[:60]!r}, which is not read; export it without"
+        )
+
+
+def _extensions(document: Document, key: str) -> list[str]:
+    """Return the extensions in a list of the file that may matter to Gaussians and are not read."""
+    return [name for name in _names(document, key) if name not in _READ and not _OF_SURFACES.fullmatch(name)]
+
+
+def _names(document: Document, key: str) -> list[str]:
+    found = document.root.get(key, [])
+    if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
+        raise document.invalid(f"{key} is not a list of names")
+    return found
 
 
 def _instances(
@@ -279,6 +306,9 @@ def _primitive(
                 raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
             return _Primitive(attributes, matrix, header.count, header.sh_degree, view, header.antialiased)
         raise UnsupportedError(f"{document.name} is compressed by {str(name)[:60]!r}; export it without or with .spz")
+    for name in document.child(primitive, "extensions"):
+        if name in _COMPRESSIONS:
+            raise UnsupportedError(f"{document.name} is compressed by {name!r}; export it without or with .spz")
     if "POSITION" not in attributes:
         raise document.invalid("a primitive has no POSITION")
     return _Primitive(attributes, matrix, document.count(attributes["POSITION"]), _degree(document, attributes), None)

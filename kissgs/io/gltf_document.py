@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import struct
+import unicodedata
 import urllib.parse
 from pathlib import Path
 from typing import Any
@@ -157,8 +158,16 @@ class Document:
             raise UnsupportedError(f"{self.name} names a buffer outside its folder; put the file beside it")
         if self._folder is None:
             raise UnsupportedError(f"{self.name} needs the file {path[:80]!r} beside it; give the path, or a .glb")
-        with open_scene_file(self._folder / path, "put the buffer there") as opened:
+        with open_scene_file(_beside(self._folder / path), "put the buffer there") as opened:
             return opened.read(0, opened.size)
+
+
+def _beside(path: Path) -> Path:
+    """Return the file of this name, or else the one whose name differs in its Unicode form only."""
+    if path.exists() or not path.parent.is_dir():
+        return path
+    name = unicodedata.normalize("NFC", path.name)
+    return next((entry for entry in path.parent.iterdir() if unicodedata.normalize("NFC", entry.name) == name), path)
 
 
 def _split(opened: SceneFile) -> tuple[bytes, tuple[int, int] | None]:

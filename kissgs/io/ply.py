@@ -40,9 +40,10 @@ _KNOWN_ELEMENTS = {
 
 _IN_TIME = re.compile(
     r"(trbf|motion|omega|velocity|rot_[rlt]|f_t|f_dc_t|f_rest_t|sh_t|scale_t|scaling_t|opacity_t|cov_t|marginal_t|"
-    r"delta_[xyz]|delta_rot)(_\w+)?|t|mu_t|t_mean|t_scale|time|time_center|dt|duration|lifespan|v[xyz]"
+    r"delta_[xyz]|delta_rot|temporal|vel)(_\w+)?|(mu|sigma|center|scaling)_t|t_(mean|sigma|center|scale)|t|tscale|time|"
+    r"(time|start|end)_(center|time)|dt|duration|lifespan|birth|death|v[xyz]|scale_3|rot_[4-7]|xyz_motion_\d+"
 )
-"""Properties that move Gaussians or change them in time, as SpacetimeGaussians, 4DGS and FreeTimeGS name them."""
+"""Properties that move or change Gaussians in time, of SpacetimeGaussians, 4DGS, 4D-Rotor and FreeTimeGS."""
 
 _WRITE_ROWS = 4096
 

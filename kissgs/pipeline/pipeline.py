@@ -173,7 +173,7 @@ def compress(
         source: a scene, or the path or the bytes of a file of any format that :func:`kissgs.load` reads (a container is
             decoded and encoded again).
         destination: ``.zip``, ``.sog`` or folder to write; by default nothing is written. A folder exists, or its name
-            has no ending or, as a text, a slash at its end.
+            has a slash at its end; a Path, which keeps no slash, has no ending.
         settings: by default those of the preset ``balanced``. If their group ``compact`` has a budget, the scene is
             compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``enabled``, the levels are then
             fine-tuned on the photographs of ``views``, or on renderings of the scene. A goal other than ``psnr`` does

@@ -55,7 +55,7 @@ def test_pipes(scene: Path) -> None:
 def test_several_files_and_patterns(scene: Path, tmp_path: Path) -> None:
     for name in ("one.ply", "two.ply"):
         (tmp_path / name).write_bytes(scene.read_bytes())
-    done = run("compress", tmp_path / "*.ply", "-o", tmp_path / "out", "--json", "-p", "fast")
+    done = run("compress", tmp_path / "*.ply", "-o", f"{tmp_path}/out/", "--json", "-p", "fast")
     reports = json.loads(done.stdout)
     assert [Path(report["output"]).name for report in reports] == ["one.zip", "two.zip"]
     assert all(Path(report["output"]).stat().st_size == report["container_bytes"] for report in reports)
@@ -172,7 +172,7 @@ def test_one_bad_file_of_several_does_not_stop_the_others(scene: Path, tmp_path:
     for name in ("a.ply", "c.ply"):
         (tmp_path / name).write_bytes(scene.read_bytes())
     (tmp_path / "b.ply").write_text("not a scene")
-    done = run("compress", tmp_path / "*.ply", "-o", tmp_path / "out", "--json", "-p", "fast")
+    done = run("compress", tmp_path / "*.ply", "-o", f"{tmp_path}/out/", "--json", "-p", "fast")
     assert done.returncode == 2
     first, second, third = json.loads(done.stdout)
     assert second["error"]["code"] == "invalid-scene"
@@ -181,7 +181,8 @@ def test_one_bad_file_of_several_does_not_stop_the_others(scene: Path, tmp_path:
 
 
 def test_a_folder_as_output_means_into_it_for_one_file_as_for_many(scene: Path, tmp_path: Path) -> None:
-    assert run("compress", scene, "-o", tmp_path / "new", "-q").returncode == 0
+    assert "there is no folder new; end it in a slash" in failure("decompress", scene, "-o", "new", cwd=tmp_path)
+    assert run("compress", scene, "-o", f"{tmp_path}/new/", "-q").returncode == 0
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["scene.zip"]
     assert run("compress", scene, "-o", tmp_path / "new", "-q", "--unpacked").returncode == 0
     assert len(kissgs.load(tmp_path / "new" / "scene.container")) > 0
@@ -191,7 +192,7 @@ def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     """Regression: compress -o a.spz made a folder a.spz, and wrote a SOG-XT container into it."""
     for name in ("a.spz", "a.PLY", "a.glb", "a.webp", "a.Yaml"):
         assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
-    for name in ("x.usdz", "full.ziip", "k.ssog", "out.xyz", ".zip", "a.zip."):
+    for name in ("x.usdz", "full.ziip", "k.ssog", "out.xyz", ".zip", "a.zip.", "v1.2"):
         with pytest.raises(kissgs.UnsupportedError, match=rf"{name} is not the name of .* in \.zip or \.sog, or if"):
             kissgs.compress(scene, tmp_path / name)
         assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
@@ -215,7 +216,9 @@ def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     assert "a.sog is the name of a file, but --unpacked" in failure(
         "compress", scene, "-o", "a.sog", "--unpacked", cwd=tmp_path
     )
-    assert "would become one file" in failure("compress", scene, scene, "-o", "new", cwd=tmp_path)
+    assert "would become one file" in failure("compress", scene, scene, "-o", "new/", cwd=tmp_path)
+    for name in ("new", "new/room"):
+        assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == []
     (tmp_path / "c.sog").mkdir()
     assert run("compress", scene, "-o", tmp_path / "c.sog", "-p", "fast", "-q", "--unpacked").returncode == 0
@@ -284,7 +287,7 @@ def test_a_disk_that_fills_up_leaves_no_file(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    words = ["compress", scene, "-p", "fast", "-o", tmp_path / "new", option]
+    words = ["compress", scene, "-p", "fast", "-o", f"{tmp_path}/new/", option]
     assert "no space left on device" in failure(*words)
     assert sorted(tmp_path.rglob("*")) == [tmp_path / "new"]
 

@@ -70,6 +70,10 @@ def test_json_with_a_buffer_inside_or_beside(tmp_path):
         (tmp_path / "scene.gltf").write_text(json.dumps(root))
         with pytest.raises(UnsupportedError, match=r"names a buffer outside its folder; put the file beside it"):
             read_gltf(tmp_path / "scene.gltf")
+    (tmp_path / "Schlo\u0308\u00df.bin").write_bytes(buffer)
+    root["buffers"][0]["uri"] = "Schl\u00f6\u00df.bin"  # as archives of macOS change names
+    (tmp_path / "scene.gltf").write_text(json.dumps(root))
+    assert len(read_gltf(tmp_path / "scene.gltf")) == 20
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -177,6 +181,15 @@ def instanced(root, buffer, **columns):
     return root, buffer
 
 
+def test_what_is_drawn_otherwise_is_named():
+    root, buffer = document(attributes(made_scene(4, 0, extremes=False)))
+    root["scenes"].append({"nodes": [0]})
+    root["extensionsUsed"] = [NAME, "CESIUM_RTC", "KHR_materials_unlit"]
+    splatting(root)["projection"] = "orthographic"
+    found = read_gltf(glb_bytes(root, buffer))
+    assert found.notes == ("left out: extension CESIUM_RTC, other scenes, projection 'orthographic'",)
+
+
 @pytest.mark.parametrize("required", [True, False])
 def test_instances_are_nodes_below_their_node(required):
     """Expected is what a file with a child node for each instance gives."""
@@ -255,6 +268,13 @@ CHANGES = {
         lambda r: r.update(extensionsRequired=["KHR_meshopt_compression"])
     ),
     "is compressed by 'EXT_meshopt_compression'; export it without": changed(meshopt),
+    "is compressed by 'KHR_draco_mesh_compression'; export it without or": changed(
+        lambda r: primitive(r)["extensions"].update(KHR_draco_mesh_compression={"bufferView": 0})
+    ),
+    "is glTF of version '2.1'; export it as glTF 2.0": changed(
+        lambda r: r.update(asset={"version": "2.0", "minVersion": "2.1"})
+    ),
+    "shows none of its Gaussians: no visible node of its scene": changed(lambda r: r["scenes"][0].update(nodes=[])),
     "is compressed by 'KHR_draco_mesh_compression'; export it without": changed(
         lambda r: r.update(extensionsRequired=["KHR_draco_mesh_compression"])
     ),

@@ -154,7 +154,9 @@ IN_TIME = {
     "4DGS": ["t", "scale_t_0", "rot_r_0"],
     "a 4DGS converter": ["mu_t", "t_scale"],
     "FreeTimeGS": ["motion_0", "t_scale"],
-    "velocities": ["vx", "vy", "vz", "time", "duration"],
+    "4D-Rotor": ["scale_3", "rot_4", "rot_7"],
+    "a centre in time": ["t_sigma", "center_t", "time_center", "start_time", "temporal_scale", "birth"],
+    "velocities": ["vx", "vy", "vz", "vel_x", "time", "duration"],
     "deltas": ["delta_x_t0", "delta_rot_0_t1"],
 }
 

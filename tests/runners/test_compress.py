@@ -116,7 +116,7 @@ def test_a_scene_whose_node_is_killed_has_the_same_bytes(cluster, scenes, tmp_pa
 @pytest.mark.parametrize("moment", range(10))
 def test_a_node_is_killed_at_any_moment(cluster, scenes, whole, tmp_path, moment):
     inputs = [scenes / "b.ply", scenes / "c.ply"]
-    words = [KISSGS, "compress", *inputs, "-p", "fast", "-o", tmp_path / "out", "-q", "--ray", cluster.address]
+    words = [KISSGS, "compress", *inputs, "-p", "fast", "-o", f"{tmp_path}/out/", "-q", "--ray", cluster.address]
     with subprocess.Popen(words) as command:
         node, pid = working(cluster)
         wait_until(lambda: cpu_seconds(pid) >= moment / 10 * whole)

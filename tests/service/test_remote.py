@@ -329,7 +329,7 @@ def test_the_ending_chooses_the_container(service, scene, tmp_path):
     done = kissgs_command("compress", scene, "-p", "fast", "-o", tmp_path / "a.sog", KISSGS_SERVER=service.url)
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "a.sog").read_bytes() == expected
-    folder = ("-o", tmp_path / "out", "--container", "sog", "--json")
+    folder = ("-o", f"{tmp_path}/out/", "--container", "sog", "--json")
     done = kissgs_command("compress", scene, "-p", "fast", *folder, KISSGS_SERVER=service.url)
     assert (tmp_path / "out" / "Schloß 1.sog").read_bytes() == expected
     job = json.loads(done.stdout)["id"]

@@ -242,7 +242,7 @@ def test_the_command_line_writes_sog_by_ending_or_by_name(tmp_path):
     kissgs.save(random_scene(30), tmp_path / "a.ply")
     kissgs.save(random_scene(20), tmp_path / "b.ply")
     assert run("compress", tmp_path / "a.ply", "-p", "fast", "-q", "-o", tmp_path / "one.sog").returncode == 0
-    both = run("compress", tmp_path / "*.ply", "-p", "fast", "-q", "--container", "sog", "-o", tmp_path / "all")
+    both = run("compress", tmp_path / "*.ply", "-p", "fast", "-q", "--container", "sog", "-o", f"{tmp_path}/all/")
     assert both.returncode == 0
     assert [len(kissgs.load(tmp_path / name)) for name in ("one.sog", "all/a.sog", "all/b.sog")] == [30, 30, 20]
     assert (tmp_path / "one.sog").read_bytes() == (tmp_path / "all/a.sog").read_bytes()
