@@ -46,7 +46,8 @@ others are decoded whole. Pillow warns above this number."""
 BAND_PIXELS = 1 << 22
 """Number of pixels that are converted to RGB at a time where that needs numbers larger than a byte."""
 
-_QUARTER_TURNS = (5, 6, 7, 8)  # values of EXIF's orientation that exchange width and height
+QUARTER_TURNS = (5, 6, 7, 8)
+"""Values of EXIF's orientation that exchange width and height."""
 
 _ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
 
@@ -83,14 +84,15 @@ def read_photo_header(path: Path) -> PhotoHeader:
         return PhotoHeader(image.width, image.height, _is_transparent(image))
 
 
-def is_turned(path: Path) -> bool:
-    """Whether the photograph's EXIF orientation, which is ignored, exchanges width and height.
+def orientation(path: Path) -> int:
+    """Return the photograph's EXIF orientation, which is ignored, 1 to 8; 1 is upright.
 
     Raises:
         InvalidViewsError: as for :func:`read_photo_header`; a PNG file is read whole.
     """
     with _opened(path) as image:
-        return image.getexif().get(Base.Orientation) in _QUARTER_TURNS
+        found = image.getexif().get(Base.Orientation)
+        return found if isinstance(found, int) and 1 <= found <= 8 else 1
 
 
 def read_photo(

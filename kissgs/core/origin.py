@@ -13,27 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from kissgs.core.array_types import Float, Float32, Float64
+from kissgs.core.array_types import Float32, Float64
+from kissgs.core.coarse_positions import COARSE_SHARE, coarse_share
 from kissgs.core.errors import InvalidContainerError
-from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import MEAN_LIMIT, Splats, sampled_rows
 
 Origin = tuple[float, float, float]
 
 WORLD: Origin = (0.0, 0.0, 0.0)
 """Origin of a scene whose positions are those of the world."""
-
-COARSE_ERROR = 0.25
-"""Error of a position, in units of the Gaussian's size, above which it is coarse."""
-
-COARSE_SHARE = 0.01
-"""Share of coarse positions above which a scene has lost something."""
-
-CONTAINER_LEVELS = (1 << 16) - 1
-"""Steps between the smallest and the largest signed logarithm of a container's positions."""
-
-STREAMED_REMEDY = "no origin helps here, but compressing into FOLDER/lod-meta.json does, whose parts have fine steps"
-"""Remedy for coarse positions where no origin helps: streamed SOG."""
 
 
 def world_positions(splats: Splats) -> Float64[np.ndarray, "N 3"]:
@@ -107,53 +95,6 @@ def _rounded_share(positions: Float64[np.ndarray, "N 3"], scales: Float32[np.nda
     return coarse_share(errors[finite], scales[finite])
 
 
-def coarse_share(errors: Float[np.ndarray, " N"], scales: Float32[np.ndarray, "N 3"]) -> float:
-    """Return the share of Gaussians whose position is off by more than a quarter of their visible size.
-
-    Args:
-        errors: ``(N,)`` largest error of a coordinate, world units.
-        scales: ``(N, 3)`` logarithms of standard deviations.
-    """
-    return float((errors > COARSE_ERROR * visible_sizes(scales)).mean()) if len(errors) else 0.0
-
-
-def coarse_note(
-    means: Float32[np.ndarray, "N 3"],
-    scales: Float32[np.ndarray, "N 3"],
-    low: Float32[np.ndarray, " 3"],
-    high: Float32[np.ndarray, " 3"],
-) -> str:
-    """Return a sentence with the remedy if a container's finest steps are too coarse for a scene, else an empty string.
-
-    The planner's own steps may be coarser for small Gaussians, where it chooses so: that is no loss by distance.
-
-    Args:
-        means: ``(N, 3)`` positions, world units.
-        scales: ``(N, 3)`` logarithms of standard deviations.
-        low: ``(3,)`` smallest signed logarithm of the positions in the container, per axis.
-        high: ``(3,)`` largest one.
-    """
-    wide = means.astype(np.float64)
-    extents, sizes = high.astype(np.float64) - low, visible_sizes(scales)
-    chances = coarse_chances(wide, sizes, extents)
-    share = float(chances.mean()) if len(chances) else 0.0
-    if share <= COARSE_SHARE:
-        return ""
-    step = float(np.median(container_steps(wide, extents).max(axis=1)[chances > 0]))
-    near, small = wide - np.rint(np.median(wide, axis=0)), np.zeros(3)
-    remedies = {
-        "origin=auto moves the scene there": (near, np.ptp(signed_log(near)).repeat(3)),
-        STREAMED_REMEDY: (wide, small),
-        "compressing into FOLDER/lod-meta.json with origin=auto gives its parts fine steps": (near, small),
-    }
-    helpful = (name for name, (at, span) in remedies.items() if coarse_chances(at, sizes, span).mean() <= COARSE_SHARE)
-    remedy = next(helpful, "compress objects so far apart into files of their own, with origin=auto")
-    return (
-        f"positions have steps of about {step:.2g}, too coarse for {share:.0%} of the Gaussians, because a container "
-        f"has fine steps only near the origin: {remedy}"
-    )
-
-
 def relative_to(origin: Origin) -> str:
     """Return the clause that says where the positions of a scene are."""
     return "positions are relative to the point ({:,.0f}, {:,.0f}, {:,.0f})".format(*origin)
@@ -179,39 +120,3 @@ def read_origin(document: Mapping[str, Any], name: str) -> Origin:
     if not all(abs(value) <= MEAN_LIMIT for value in (x, y, z)):
         raise InvalidContainerError(f"{name}: kissgs.origin is not three numbers up to 1e15; export the scene again")
     return x, y, z
-
-
-def coarse_chances(
-    positions: Float64[np.ndarray, "N 3"], sizes: Float64[np.ndarray, " N"], extents: Float64[np.ndarray, " 3"]
-) -> Float64[np.ndarray, " N"]:
-    """Return the chance of each position to be coarse in a container: errors are even, up to half a step of each axis.
-
-    Args:
-        positions: ``(N, 3)`` world units.
-        sizes: ``(N,)`` those of :func:`visible_sizes`.
-        extents: ``(3,)`` extents of the signed logarithms' ranges, per axis.
-    """
-    half_steps = np.maximum(container_steps(positions, extents) / 2, 1e-300)
-    chances: Float64[np.ndarray, " N"] = 1 - np.minimum(COARSE_ERROR * sizes[:, None] / half_steps, 1).prod(axis=1)
-    return chances
-
-
-def container_steps(
-    positions: Float64[np.ndarray, "N 3"], extents: Float64[np.ndarray, " 3"]
-) -> Float64[np.ndarray, "N 3"]:
-    """Return a container's finest steps at positions, world units, with the rounding of the range's ends to float32.
-
-    Arguments are those of :func:`coarse_chances`.
-    """
-    rounded = np.spacing(np.abs(signed_log(positions)).astype(np.float32))
-    steps: Float64[np.ndarray, "N 3"] = (1 + np.abs(positions)) * (extents / CONTAINER_LEVELS + rounded)
-    return steps
-
-
-def visible_sizes(scales: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-    """Return the second of the three standard deviations: the smaller one that a flat Gaussian shows from its front.
-
-    ``scales`` are logarithms of standard deviations; the sizes are in world units.
-    """
-    sizes: Float64[np.ndarray, " N"] = np.exp(np.sort(scales, axis=1)[:, 1].astype(np.float64))
-    return sizes

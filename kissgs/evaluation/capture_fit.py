@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kissgs.cameras.pixels import orientation
 from kissgs.cameras.views import Similarity, View, Views
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import InvalidViewsError, KissgsError
@@ -119,7 +120,7 @@ def fitting_views(
     progress("cameras", 0.0)
     samples, source = _samples(views), views.source
     views, fit, note = _best(splats, views, samples, threads)
-    problem = _problem(fit, source, len(samples))
+    problem = _problem(fit, source, samples)
     refused = not fit.seen or (fit.psnr < LEAST_PSNR and fit.psnr_inside < USUAL_PSNR)
     if samples and not force and refused:
         raise InvalidViewsError(
@@ -129,16 +130,19 @@ def fitting_views(
     return views, "; ".join(filter(None, [note, problem]))
 
 
-def _problem(fit: _Fit, source: str, count: int) -> str:
+def _problem(fit: _Fit, source: str, samples: Sequence[_Sample]) -> str:
     if not fit.seen:
         return f"no rendering from the cameras of the capture ({source}) shows any of the scene"
-    if not count:
+    if not samples:
         return NOT_COMPARED
     if fit.psnr >= USUAL_PSNR:
         return ""
+    paths = [view.photo for view, _ in samples if view.photo is not None]
+    turned = "; their EXIF orientation is ignored here: turn the pixels ('mogrify -auto-orient')"
+    turned = turned if any(orientation(path) != 1 for path in paths) else ""
     return (
         f"the photographs of the capture ({source}) differ much from renderings of the scene: PSNR {fit.psnr:.1f} dB, "
-        f"the median of {count}, where more than {USUAL_PSNR:g} are usual"
+        f"the median of {len(samples)}, where more than {USUAL_PSNR:g} are usual{turned}"
     )
 
 

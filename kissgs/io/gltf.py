@@ -199,8 +199,10 @@ def _primitives(document: Document, left_out: dict[str, None]) -> Iterator[_Prim
 
 def _check_required(document: Document) -> None:
     asset = document.child(document.root, "asset")
-    if (version := str(asset.get("minVersion", asset.get("version", "2.0")))) != "2.0":
-        raise UnsupportedError(f"{document.name} is glTF of version {version[:20]!r}; export it as glTF 2.0")
+    version, least = (str(asset.get(key, "2.0")) for key in ("version", "minVersion"))
+    if not version.startswith("2.") or least != "2.0":
+        wanted = least if version.startswith("2.") else version
+        raise UnsupportedError(f"{document.name} is glTF of version {wanted[:20]!r}; export it as glTF 2.0")
     for name in _names(document, "extensionsRequired"):
         if name in _COMPRESSIONS:
             raise UnsupportedError(f"{document.name} is compressed by {name!r}; export it without or with .spz")
@@ -271,7 +273,10 @@ def _placements(document: Document, instancing: dict[str, Any]) -> Iterator[Floa
         if name in widths
     }
     if "rotation" in columns:  # of integers they are not quite of unit length
-        columns["rotation"] /= np.linalg.norm(columns["rotation"], axis=1, keepdims=True)
+        lengths = np.linalg.norm(columns["rotation"], axis=1, keepdims=True)
+        if not lengths.all():
+            raise document.invalid("an instance has a rotation of length zero")
+        columns["rotation"] /= lengths
     for row in range(count):
         yield node_matrix(document, {name: values[row].tolist() for name, values in columns.items()})
 

@@ -133,7 +133,9 @@ class Document:
         uri = buffer.get("uri")
         inside = self._binary if uri is None and number == 0 else None
         if inside is None and number not in self._buffers:
-            self._buffers[number] = self._load(uri, number, self.child(buffer, "extensions"))
+            self._buffers[number] = self._load(
+                uri, number, self.child(buffer, "extensions") | self.child(view, "extensions")
+            )
         if offset + size > (len(self._buffers[number]) if inside is None else inside[1]):
             raise self.invalid("a buffer view reaches beyond its buffer")
         if inside is None:

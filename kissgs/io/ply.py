@@ -39,9 +39,9 @@ _KNOWN_ELEMENTS = {
 """Elements that are read or say how the scene was taken, as those of PCL and SHARP do."""
 
 _IN_TIME = re.compile(
-    r"(trbf|motion|omega|velocity|rot_[rlt]|f_t|f_dc_t|f_rest_t|sh_t|scale_t|scaling_t|opacity_t|cov_t|marginal_t|"
-    r"delta_[xyz]|delta_rot|temporal|vel)(_\w+)?|(mu|sigma|center|scaling)_t|t_(mean|sigma|center|scale)|t|tscale|time|"
-    r"(time|start|end)_(center|time)|dt|duration|lifespan|birth|death|v[xyz]|scale_3|rot_[4-7]|xyz_motion_\d+"
+    r"(\w+_)?(t|dt|tscale|time|temporal|trbf|motion|omega|vel|velocity|speed|dynamics|duration|lifespan|birth|death)(_\w+)?"
+    r"|delta_([xyz]|rot)(_\w+)?|rot_[rl](_\w+)?|v[xyz]|scale_3|rot_[4-7]",
+    re.IGNORECASE,
 )
 """Properties that move or change Gaussians in time, of SpacetimeGaussians, 4DGS, 4D-Rotor and FreeTimeGS."""
 
@@ -196,7 +196,7 @@ def _require_gaussians(header: Header, name: str) -> None:
             f"{name} is a point cloud or a mesh, not a trained 3DGS scene: it has no {', '.join(missing)}; "
             "name the output of a 3DGS trainer"
         )
-    moving = [p.name for p in vertex.properties if _IN_TIME.fullmatch(p.name)]
+    moving = [p.name for p in vertex.properties if _IN_TIME.fullmatch(p.name) and p.name != "gps_time"]
     moving += [element for element in header.elements if element.startswith("delta_vertex")]
     if moving:
         raise UnsupportedError(

@@ -63,8 +63,8 @@ MIP_COMMENT = "comment SplatRenderMode: mip"
 """Line that marks a scene as antialiased, as Brush and splat-transform write it."""
 
 _MARK = re.compile(
-    r"(?:(?:splat_?render_?mode|rasteri[sz]e[-_ ]?mode)\s*[:=]?\s*(\w+)|"
-    r"(?:trained with )?anti[-_ ]?alias(?:ed|ing)?\s*(?:[:=]?\s*([\w.]+))?)\s*",
+    r"(?:(?:splat_?render_?mode|rasteri[sz]e[-_ ]?mode)\s*[:=]?\s*([\w-]+)|"
+    r"(?:trained with )?(?:anti[-_ ]?alias(?:ed|ing)?|mip[-_ ]?splatting)\s*(?:[:=]?\s*([\w.]+))?)\s*",
     re.IGNORECASE,
 )
 """Comments that say whether a scene is antialiased: Brush's or gsplat's mode, and Postshot's flag."""
@@ -204,7 +204,9 @@ def _marked(comment: str, before: bool) -> bool:
     if found is None:
         return before
     mode, flag = (group and group.lower() for group in found.groups())
-    return mode in ("mip", "antialiased") if mode else flag in (None, "1", "1.0", "true", "yes", "on", "enabled")
+    if mode:
+        return mode in ("mip", "mip-splatting", "antialiased")
+    return flag in (None, "1", "1.0", "true", "yes", "on", "enabled")
 
 
 def _recognise(head: bytes, name: str) -> None:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from kissgs.core.array_types import Int32, UInt16
+from kissgs.core.coarse_positions import coarse_note
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.origin import coarse_note
 from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
@@ -96,7 +96,7 @@ def _coarse(splats: Splats, plan: EncodingPlan) -> str:
     """Return the sentence about coarse positions, by at most :data:`SAMPLED` Gaussians."""
     order, means = plan.grid.cells[plan.grid.mask], plan.fields["means"]
     some = order[:: 1 + len(order) // SAMPLED]
-    return coarse_note(splats.means[some], splats.scales[some], means.low, means.high)
+    return coarse_note(splats.means[some], splats.scales[some], means.low, means.high, len(order))
 
 
 def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndarray, " K"]:

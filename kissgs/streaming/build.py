@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt16
-from kissgs.core.origin import STREAMED_REMEDY, WORLD, visible_sizes
+from kissgs.core.coarse_positions import STREAMED_REMEDY, Cuts, cuts_without_coarse, visible_sizes
+from kissgs.core.origin import WORLD
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean, concatenate, sampled_rows
 from kissgs.io.atomic import atomic_file
@@ -44,7 +45,7 @@ from kissgs.streaming.layout import (
 )
 from kissgs.streaming.levels import chunk_levels, level_count
 from kissgs.streaming.manifest import Leaf, manifest
-from kissgs.streaming.partition import Cuts, chunk_depth, cuts_without_coarse
+from kissgs.streaming.partition import chunk_depth
 from kissgs.streaming.rows import append_rows, from_rows, read_rows, row_bytes, sync, to_rows, write_rows
 from kissgs.streaming.sensitivities import cameras_json, cameras_of, choose_cameras, measure_file
 

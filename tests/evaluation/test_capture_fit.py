@@ -41,11 +41,11 @@ def rendered(scene, found):
     return np.clip(render(scene, found)[0], 0, 1)
 
 
-def write_photos(folder, change=lambda image: image):
+def write_photos(folder, change=lambda image: image, **options):
     folder.mkdir(parents=True)
     for n, each in enumerate(CAMERAS):
         image = np.rint(255 * np.clip(change(rendered(SCENE, each)), 0, 1)).astype(np.uint8)
-        Image.fromarray(image).save(folder / f"{n}.png")
+        Image.fromarray(image).save(folder / f"{n}.png", **options)
 
 
 def write_transforms(folder, applied=None):
@@ -189,6 +189,17 @@ def test_a_capture_of_another_scene_is_refused_before_any_work(tmp_path, change)
     found, note = fitting_views(SCENE, views, force=True)
     assert found.train == views.train
     assert "differ much" in note
+
+
+def test_photographs_that_exif_turns_upright_are_named(tmp_path):
+    """They have the size of the camera, so that only their content shows it."""
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    write_photos(tmp_path / "images", lambda image: image[::-1, ::-1], exif=exif)
+    write_transforms(tmp_path)
+    _, note = fitting_views(SCENE, kissgs.load_views(tmp_path), force=True)
+    assert "differ much" in note
+    assert "EXIF orientation is ignored here: turn the pixels" in note
 
 
 def away():

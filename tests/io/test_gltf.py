@@ -184,6 +184,7 @@ def instanced(root, buffer, **columns):
 def test_what_is_drawn_otherwise_is_named():
     root, buffer = document(attributes(made_scene(4, 0, extremes=False)))
     root["scenes"].append({"nodes": [0]})
+    root["asset"] = {"version": "2.1"}
     root["extensionsUsed"] = [NAME, "CESIUM_RTC", "KHR_materials_unlit"]
     splatting(root)["projection"] = "orthographic"
     found = read_gltf(glb_bytes(root, buffer))
@@ -240,6 +241,12 @@ def meshopt(root):
     root["buffers"].append({"byteLength": len(BUFFER), "extensions": {"EXT_meshopt_compression": {"fallback": True}}})
 
 
+def optional_meshopt(root):
+    for view in root["bufferViews"]:
+        view |= {"buffer": 1, "extensions": {"EXT_meshopt_compression": {"buffer": 0}}}
+    root["buffers"].append({"byteLength": len(BUFFER)})
+
+
 SCENE = made_scene(4, 2, extremes=False)
 ROOT, BUFFER = document(attributes(SCENE))
 
@@ -268,9 +275,11 @@ CHANGES = {
         lambda r: r.update(extensionsRequired=["KHR_meshopt_compression"])
     ),
     "is compressed by 'EXT_meshopt_compression'; export it without": changed(meshopt),
+    "is compressed by 'EXT_meshopt_compression'; export": changed(optional_meshopt),
     "is compressed by 'KHR_draco_mesh_compression'; export it without or": changed(
         lambda r: primitive(r)["extensions"].update(KHR_draco_mesh_compression={"bufferView": 0})
     ),
+    "is glTF of version '1.0'; export it as glTF 2.0": changed(lambda r: r.update(asset={"version": "1.0"})),
     "is glTF of version '2.1'; export it as glTF 2.0": changed(
         lambda r: r.update(asset={"version": "2.0", "minVersion": "2.1"})
     ),

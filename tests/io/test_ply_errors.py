@@ -155,8 +155,8 @@ IN_TIME = {
     "a 4DGS converter": ["mu_t", "t_scale"],
     "FreeTimeGS": ["motion_0", "t_scale"],
     "4D-Rotor": ["scale_3", "rot_4", "rot_7"],
-    "a centre in time": ["t_sigma", "center_t", "time_center", "start_time", "temporal_scale", "birth"],
-    "velocities": ["vx", "vy", "vz", "vel_x", "time", "duration"],
+    "a centre in time": ["t_sigma", "center_t", "time_center", "begin_time", "temporal_scale", "birth", "T"],
+    "velocities": ["vx", "vy", "vz", "vel_x", "speed_x", "time", "duration"],
     "deltas": ["delta_x_t0", "delta_rot_0_t1"],
 }
 

@@ -51,6 +51,8 @@ SOURCES = {
     "enabled.ply": (ply("antialiasing enabled"), True),
     "decimal.ply": (ply("antialias: 1.0"), True),
     "sentence.ply": (ply("Trained with antialiasing"), True),
+    "mip-splatting.ply": (ply("mip_splatting: true", "SplatRenderMode mip-splatting"), True),
+    "no-mip.ply": (ply("mip_splatting: false"), False),
     "bare.ply": (ply("antialiased"), True),
     "last.ply": (ply("antialiased 0", "SplatRenderMode: mip"), True),
     "default.ply": (ply("SplatRenderMode: default"), False),

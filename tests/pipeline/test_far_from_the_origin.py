@@ -14,7 +14,7 @@ from helpers.command_line import run
 
 import kissgs
 from kissgs.cameras.views import Similarity, View, Views, black
-from kissgs.core.origin import coarse_share
+from kissgs.core.coarse_positions import coarse_share
 from kissgs.evaluation.capture_fit import in_scene_frame
 from kissgs.rendering.camera import look_at
 from kissgs.sogxt.names import JSON_NAME, YAML_NAME
@@ -136,6 +136,18 @@ def test_the_remedy_that_is_named_helps(size, reading, tmp_path):
     assert ("with origin=auto" in note) == (reading == AUTO)
     report = kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST, reading=reading)
     assert "positions have steps of" not in report.note
+
+
+def test_few_gaussians_far_apart_get_parts_of_their_own(tmp_path):
+    rng = np.random.default_rng(1)
+    positions = rng.normal(size=(400, 3)) + np.repeat([(0, 0, 0), (1000, 0, 0)], 200, axis=0)
+    scene = write(tmp_path / "a.ply", positions, size=np.repeat([0.03, 0.01], 200))
+    assert "into FOLDER/lod-meta.json does" in kissgs.compress(scene, settings=FAST).report.note
+    report = kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST)
+    assert "positions have steps of" not in report.note
+    found = kissgs.load(tmp_path / "tree" / "lod-meta.json").means
+    nearest = np.linalg.norm(found[:, None] - positions, axis=2).min(axis=1)
+    assert nearest.max() < 0.003
 
 
 def test_streamed_sog_is_no_remedy_for_itself(tmp_path):

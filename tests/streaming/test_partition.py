@@ -5,8 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
+from kissgs.core.coarse_positions import Cuts
 from kissgs.core.splats import sampled_rows
-from kissgs.streaming.partition import Cuts, chunk_depth, leaf_groups
+from kissgs.streaming.partition import chunk_depth, leaf_groups
 
 
 def positions(count, seed=0):

@@ -16,7 +16,7 @@ export const fileTypeOfFormat = (format) => FILE_TYPES.find((type) => type === f
 
 /** Comments in a `.ply` that say whether the scene is antialiased, as in kissgs/io/ply_header.py. */
 const MARK =
-  /^(?:comment|obj_info)\s+(?:(?:splat_?render_?mode|rasteri[sz]e[-_ ]?mode)\s*[:=]?\s*(\w+)|(?:trained with )?anti[-_ ]?alias(?:ed|ing)?\s*(?:[:=]?\s*([\w.]+))?)\s*$/i;
+  /^(?:comment|obj_info)\s+(?:(?:splat_?render_?mode|rasteri[sz]e[-_ ]?mode)\s*[:=]?\s*([\w-]+)|(?:trained with )?(?:anti[-_ ]?alias(?:ed|ing)?|mip[-_ ]?splatting)\s*(?:[:=]?\s*([\w.]+))?)\s*$/i;
 /** Largest header that is searched for a mark. */
 const MAX_HEADER_BYTES = 1 << 20;
 /** Byte of a `.spz` header with flags, of which the first is that of antialiased scenes. */
@@ -39,7 +39,7 @@ function isMarkedPly(text) {
   const found = comments.map((line) => line.match(MARK)).findLast((match) => match !== null);
   if (!found) return false;
   const [, mode, flag = "yes"] = found;
-  return mode ? /^(mip|antialiased)$/i.test(mode) : /^(1|1\.0|true|yes|on|enabled)$/i.test(flag);
+  return mode ? /^(mip|mip-splatting|antialiased)$/i.test(mode) : /^(1|1\.0|true|yes|on|enabled)$/i.test(flag);
 }
 
 /** Return the first bytes of a `.spz`, which is gzip up to version 3. @param {Uint8Array} bytes */

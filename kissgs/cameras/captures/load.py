@@ -12,7 +12,7 @@ from kissgs.cameras.captures.colmap import MODEL_FOLDERS, find_colmap, missing_p
 from kissgs.cameras.captures.photos import FoundPhoto, find_photos, searched_folders
 from kissgs.cameras.captures.posed_image import Capture, PosedImage
 from kissgs.cameras.captures.transforms_json import read_split_transforms, read_transforms, similarities
-from kissgs.cameras.pixels import PhotoHeader, is_turned, read_photo_header
+from kissgs.cameras.pixels import QUARTER_TURNS, PhotoHeader, orientation, read_photo_header
 from kissgs.cameras.undistort import full_window
 from kissgs.cameras.views import UndistortionSpec, View, Views
 from kissgs.core.array_types import Float32
@@ -172,7 +172,7 @@ def _sizes(posed: PosedImage, photo: _Photo | None, scale: int) -> tuple[tuple[i
     size = (photo.header.width, photo.header.height)
     nominal = (width or size[0] * photo.found.factor, height or size[1] * photo.found.factor)
     if not _fits(size, nominal):
-        if _fits(size[::-1], nominal) and is_turned(photo.found.path):
+        if _fits(size[::-1], nominal) and orientation(photo.found.path) in QUARTER_TURNS:
             raise InvalidViewsError(
                 f"{photo.found.path} has {size[0]}x{size[1]} pixels, which its EXIF orientation turns upright, and its "
                 f"camera ({posed.where}) is for {nominal[0]}x{nominal[1]}; orientation is ignored here, so turn the "
