@@ -20,7 +20,7 @@ from kissgs.cli.main import main
 PLACES = [
     "compress BAD",
     "compress BAD -o out.zip",
-    "compress BAD other.ply -o out",
+    "compress BAD other.ply -o out/",
     "compress BAD --cache",
     "compress BAD --checkpoint --compact 20%",
     "compress scene.ply -p fast -o BAD",
@@ -151,7 +151,7 @@ def test_invalid_paths_give_one_line(
             assert sorted(folder.iterdir()) == before, place
 
 
-@pytest.mark.parametrize("words", ["compress BAD", "compress BAD other.ply -o out", "decompress BAD", "render BAD"])
+@pytest.mark.parametrize("words", ["compress BAD", "compress BAD other.ply -o out/", "decompress BAD", "render BAD"])
 @pytest.mark.parametrize("kind", ["too long", "a folder that is too long", "within a file", "missing/inner"])
 @pytest.mark.usefixtures("process")
 @pytest.mark.quick(4)
