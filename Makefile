@@ -1,7 +1,7 @@
 # make demo               a service is started, compresses a sample scene, and is stopped; the result is compared
 # make demo SCENE=x.ply   the same with your own
 # make serve              the service, with its page, on http://127.0.0.1:8000 (KISSGS_PORT=… and others: docs/guide/service.md)
-# make bench              bytes, time, memory and errors of all presets (SCENE=x.ply for your own)
+# make bench              bytes, seconds, memory and quality of all presets and of limited times (SCENE=x.ply for your own)
 # make test               tests of everything, about ten minutes (SIXTH=COMMIT: a sixth of the others too)
 # make test-all           the same with all examples, parameters, trainings and faults; three quarters of an hour
 # make lint               format, lint, types, import contract; of the JavaScript, format and types
@@ -44,7 +44,7 @@ lint: setup-dev
 bench: setup
 	@mkdir -p demo-out
 	@test -n "$(SCENE)" || $(KISSGS) sample demo-out/sample.ply --force
-	@$(KISSGS) bench codecs --evaluate "$(if $(SCENE),$(SCENE),demo-out/sample.ply)"
+	@$(KISSGS) bench "$(if $(SCENE),$(SCENE),demo-out/sample.ply)"
 
 docs: setup-dev
 	@.venv/bin/python docs/generate.py
@@ -61,4 +61,4 @@ setup-s3:
 clean:
 	@rm -rf .venv .venv-s3 demo-out build dist web_decoder/vendor web_decoder/.vendor-* web_decoder/node_modules
 	@rm -rf .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache .schemathesis
-	@find kissgs service tests docs scripts -name __pycache__ -prune -exec rm -rf {} +
+	@find kissgs service bench tests docs scripts -name __pycache__ -prune -exec rm -rf {} +

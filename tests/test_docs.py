@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import argparse
+import importlib
 import re
 import runpy
 import shlex
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import typer.main
 
 from kissgs import Preset
-from kissgs.cli.bench import app as bench
+from kissgs.cli.app import app
 from kissgs.sogxt.names import FILES
 from service.core.presets import presets
 
 ROOT = Path(__file__).parents[1]
 GENERATED = runpy.run_path(str(ROOT / "docs" / "generate.py"))["PAGES"]
-FOLDERS = ("kissgs/", "service/", "web_decoder/", "tests/", "docs/", "scripts/", "docker/", ".ci/")
+FOLDERS = ("kissgs/", "service/", "bench/", "web_decoder/", "tests/", "docs/", "scripts/", "docker/", ".ci/")
 
 
 def pages() -> list[Path]:
@@ -82,22 +85,41 @@ def test_commands_of_the_readme_can_be_repeated() -> None:
 
 
 def documented_measurements() -> list[list[str]]:
-    """The words of every ``kissgs bench`` command with arguments, in code blocks and in running text."""
+    """The words of every ``kissgs bench`` and ``python bench/…`` command, in code blocks and in running text."""
     found = []
     for page in pages():
         text = page.read_text(encoding="utf-8")
-        lines = re.findall(r"^(?:\$ )?kissgs (bench .*)$", text, re.MULTILINE)
-        inline = re.findall(r"`kissgs (bench [^`]*)`", prose(page))
+        lines = re.findall(r"^(?:\$ )?(kissgs bench .*|python bench/.*)$", text, re.MULTILINE)
+        inline = re.findall(r"`(kissgs bench [^`]*|python bench/[^`]*)`", prose(page))
         found += [shlex.split(line, comments=True) for line in lines + inline]
-    return [words for words in found if len(words) > 2]
+    return found
 
 
-def test_documented_measurements_are_accepted() -> None:
-    commands = typer.main.get_group(bench).commands
-    found = documented_measurements()
-    assert {command for _, command, *_ in found} == set(commands)
-    for _, command, *arguments in found:
-        commands[command].make_context(command, arguments)
+def test_documented_measurements_are_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every study is documented."""
+
+    class Parsed(Exception):
+        pass
+
+    def parse(parser: argparse.ArgumentParser) -> None:
+        parse_known(parser, sys.argv[1:])
+        raise Parsed
+
+    parse_known = argparse.ArgumentParser.parse_args
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse)
+    monkeypatch.setattr("bench.common.load_views", lambda path: None)
+    studies = set()
+    for command, target, *words in documented_measurements():
+        if command == "kissgs":
+            typer.main.get_command(app).commands["bench"].make_context("bench", words)  # type: ignore[attr-defined]
+            continue
+        study = importlib.import_module(target.removesuffix(".py").replace("/", "."))
+        studies.add(Path(target).stem)
+        monkeypatch.setattr(sys, "argv", [target, *words])
+        with pytest.raises(Parsed):
+            study.main()
+    shared = {"__init__", "common", "external", "paper_parts"}
+    assert studies == {path.stem for path in ROOT.glob("bench/*.py")} - shared
 
 
 def test_links_and_anchors_lead_somewhere() -> None:

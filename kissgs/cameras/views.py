@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -134,11 +133,6 @@ class Similarity:
         return replace(view, camera=replace(view.camera, viewmat=viewmat), target=target)
 
 
-TargetSource = Literal["photos", "cameras", "scene"]
-"""Source of training targets: a capture's photographs; renderings of the original scene from the capture's cameras; or
-renderings from virtual cameras."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
     """Views for training and evaluation, each sorted by name.
@@ -166,10 +160,3 @@ class Views:
     def all(self) -> tuple[View, ...]:
         """Training and held-out views, sorted by name."""
         return tuple(sorted(self.train + self.test, key=lambda view: view.name))
-
-    def for_training(self, source: TargetSource) -> Views:
-        """Return views whose training part suits ``source``; evaluation uses the held-out views, or all if none is."""
-        if source == "photos":
-            return self
-        bare = tuple(replace(view, photo=None) for view in self.train) if source == "cameras" else ()
-        return replace(self, train=bare, test=self.test or self.train)

@@ -13,7 +13,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from kissgs._version import __version__
-from kissgs.cli.bench import app as bench
+from kissgs.cli.bench import bench
 from kissgs.cli.compact import compact
 from kissgs.cli.compress import compress
 from kissgs.cli.convert import convert
@@ -63,10 +63,9 @@ def _run() -> None:
         _fail(UnsupportedError(f"cannot use {error.filename!s:.100}: {(error.strerror or str(error)).lower()}"))
 
 
-for command in (compress, decompress, convert, compact, render, view, evaluate, info, sample, warmup):
+for command in (compress, decompress, convert, compact, render, view, evaluate, info, sample, bench, warmup):
     app.command()(command)
-for group in (bench, remote):
-    app.add_typer(group)
+app.add_typer(remote)
 
 
 @app.callback(invoke_without_command=True)

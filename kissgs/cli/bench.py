@@ -1,329 +1,296 @@
-"""``kissgs bench``: measurements of presets, external codecs, parts of the codec and the rasteriser."""
+"""``kissgs bench``: bytes, seconds and quality of a scene with each preset and in limited times.
+
+The studies behind the documentation's figures are in ``bench/`` of the source repository, and use :func:`measured`.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated
+import contextlib
+import csv
+import io
+import math
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from kissgs.cli.arguments import FilesArgument, ImagesOption, ResolutionOption, ScaleOption, SetOption, ViewsOption
-from kissgs.cli.bench_arguments import (
-    ExternalCodecsOption,
-    JsonOption,
-    PlotOption,
-    PresetsOption,
-    RepeatsOption,
-    SetAllOption,
-    SogIterationsOption,
-    SplatTransformOption,
-    SupervisionOption,
-    ThreadsOption,
-)
-from kissgs.cli.bench_capacity import capacity
-from kissgs.cli.bench_scenes import open_inputs, report
-from kissgs.cli.options import open_views
+from kissgs.cli.arguments import ForceOption, ViewsOption
+from kissgs.cli.files import show
+from kissgs.cli.options import chosen, open_views
+from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 
-app = typer.Typer(
-    name="bench",
-    help="Measure presets, external codecs, parts of the codec and the rasteriser on your scenes.",
-    no_args_is_help=True,
-)
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from kissgs.cameras.views import Views
+    from kissgs.evaluation.results import Evaluation
+    from kissgs.io.container_names import ContainerName
+    from kissgs.pipeline.report import Report
+    from kissgs.settings import Settings
+
+Result = TypeVar("Result")
+
+TIMES = ("5s", "30s", "2min")
+"""Default time limits."""
 
 
-@app.command()
-def codecs(
-    scenes: FilesArgument,
-    presets: PresetsOption = None,
-    changes: SetAllOption = None,
-    containers: Annotated[
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measurement:
+    """A scene that was compressed, decompressed and evaluated.
+
+    ``report`` has the times from file to zip, ``decode_seconds`` and ``decode_cpu_seconds`` are from there to arrays,
+    and ``peak_memory`` is that of both, bytes; 0 where the system does not report it.
+    """
+
+    report: Report
+    decode_seconds: float
+    decode_cpu_seconds: float
+    peak_memory: int
+    evaluation: Evaluation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """A row of the table, and a line of the CSV file; bytes, seconds and decibels."""
+
+    name: str  # the preset, or the time limit as "in 30s"
+    bytes: int
+    bytes_per_gaussian: float
+    seconds: float  # wall time of encoding
+    cpu_seconds: float  # of encoding, all threads
+    decode_seconds: float
+    peak_memory: int  # of encoding and decoding
+    against: str  # "photos", or "renderings" of the scene
+    psnr: float  # mean over views
+    psnr_change: float | None  # from the PSNR of the scene itself to photographs
+    ssim: float  # mean over views
+    worst_view: float  # largest loss to a photograph, negative; without photographs the lowest PSNR
+
+
+def bench(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene of any format that kissgs reads.")],
+    presets: Annotated[
         list[str] | None,
-        typer.Option("--container", help="Container of the presets, sogxt or sog; repeatable. Default: sogxt."),
+        typer.Option("--preset", "-p", help="Preset to measure; repeatable. Default, without --time: all."),
     ] = None,
-    external_codecs: ExternalCodecsOption = None,
-    splat_transform: SplatTransformOption = "splat-transform",
-    sog_iterations: SogIterationsOption = None,
-    quality_offsets: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--quality-offset",
-            min=-30,
-            max=30,
-            help="Measure balanced, or the presets of --preset, at this quality offset (dB) too; repeatable.",
-        ),
-    ] = None,
-    repeats: RepeatsOption = 1,
-    evaluate: Annotated[
-        bool,
-        typer.Option(
-            "--evaluate", help="Compare rendered images too; implied by --views, --quality-offset and --plot."
-        ),
-    ] = False,
-    plot: PlotOption = None,
-    views: ViewsOption = None,
-    scale: ScaleOption = None,
-    images: ImagesOption = None,
-    resolution: ResolutionOption = None,
-    threads: ThreadsOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure bytes, times, memory and errors of presets and external codecs, each in a separate process."""
-    capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    inputs = open_inputs(scenes, capture, threads, plot)
-    from kissgs.cli import bench_codecs
-
-    output = bench_codecs.codecs(
-        inputs,
-        presets=presets,
-        changes=changes,
-        containers=containers or [],
-        external=bench_codecs.ExternalCodecs(external_codecs or [], splat_transform, sog_iterations),
-        quality_offsets=quality_offsets or [],
-        repeats=repeats,
-        evaluate=evaluate or plot is not None,
-    )
-    report(output, as_json, plot)
-
-
-@app.command()
-def frontier(
-    scenes: FilesArgument,
     times: Annotated[
         list[str] | None,
         typer.Option(
-            "--time", metavar="TIME", help="Time limit to measure; repeatable. Default: 5s, 30s, 2min and 10min."
+            "--time",
+            metavar="TIME",
+            help="Time limit to measure; repeatable. Default, without --preset: 5s, 30s and 2min.",
         ),
     ] = None,
-    presets: PresetsOption = None,
-    changes: SetAllOption = None,
-    external_codecs: ExternalCodecsOption = None,
-    splat_transform: SplatTransformOption = "splat-transform",
-    sog_iterations: SogIterationsOption = None,
-    plot: PlotOption = None,
     views: ViewsOption = None,
-    scale: ScaleOption = None,
-    images: ImagesOption = None,
-    resolution: ResolutionOption = None,
-    threads: ThreadsOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure bytes and quality of what is found in limited times, beside presets and external codecs."""
-    capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    inputs = open_inputs(scenes, capture, threads, plot)
-    from kissgs.cli import bench_codecs, bench_frontier
-
-    output = bench_frontier.frontier(
-        inputs,
-        times=times or [],
-        presets=presets,
-        changes=changes,
-        external=bench_codecs.ExternalCodecs(external_codecs or [], splat_transform, sog_iterations),
-    )
-    report(output, as_json, plot)
-
-
-@app.command()
-def scaling(
-    counts: Annotated[
-        list[int],
-        typer.Option(
-            "--gaussians",
-            min=1,
-            help="Measure the scene resampled to this number of Gaussians, or a sample scene of it; repeatable.",
-        ),
-    ],
-    scenes: Annotated[
-        list[str] | None, typer.Argument(metavar="FILE…", help="Files or glob patterns. Default: sample scenes.")
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE.csv", help="Write the table as CSV, and beside it a plot as PNG."),
     ] = None,
-    degrees: Annotated[
-        list[int] | None,
-        typer.Option("--degree", min=0, max=3, help="Degree of the sample scenes; repeatable. Default: 3."),
-    ] = None,
-    presets: PresetsOption = None,
-    changes: SetAllOption = None,
-    external_codecs: ExternalCodecsOption = None,
-    splat_transform: SplatTransformOption = "splat-transform",
-    sog_iterations: SogIterationsOption = None,
-    repeats: RepeatsOption = 1,
-    evaluate: Annotated[
-        bool, typer.Option("--evaluate", help="Compare rendered images too; implied by --views.")
-    ] = False,
-    plot: PlotOption = None,
-    views: ViewsOption = None,
-    scale: ScaleOption = None,
-    images: ImagesOption = None,
-    resolution: ResolutionOption = None,
-    threads: ThreadsOption = 0,
-    as_json: JsonOption = False,
+    force: ForceOption = False,
 ) -> None:
-    """Measure how bytes, and times and memory of every stage, grow with the number of Gaussians.
+    """Measure bytes, seconds, memory and quality of a scene with each preset and in limited times.
 
-    Ctrl-C ends it with what is measured.
+    Each is compressed, decompressed and evaluated in a process of its own.
     """
-    capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    inputs = open_inputs(scenes or [], capture, threads, plot)
-    from kissgs.cli import bench_scaling
-    from kissgs.cli.bench_codecs import ExternalCodecs
+    from kissgs.cli.console import progress_bar
+    from kissgs.settings import Preset
 
-    output = bench_scaling.scaling(
-        inputs,
-        counts,
-        degrees=degrees or [],
-        presets=presets,
-        changes=changes,
-        external=ExternalCodecs(external_codecs or [], splat_transform, sog_iterations),
-        repeats=repeats,
-        evaluate=evaluate,
-        plotted=plot is not None,
+    if not presets and not times:
+        presets, times = list(Preset), list(TIMES)
+    runs = {str(name): chosen(name, None) for name in presets or []}
+    runs.update({f"in {limit}": chosen("balanced", None, time=limit) for limit in times or []})
+    plot = None if output is None else _plot_beside(output, force)
+    capture = open_views(views)
+    rows, failed = list[Row](), False
+    try:
+        with progress_bar(False) as progress:
+            for done, (name, settings) in enumerate(runs.items()):
+                progress("measure", done / len(runs), name)
+                try:
+                    rows.append(row_of(name, measured(scene, settings, views=capture)))
+                except KissgsError as error:
+                    if not rows:
+                        raise
+                    failed = True
+                    sys.stderr.write(f"kissgs: {name}: {error}\n")
+    finally:  # after an interrupt too, since these may have taken hours
+        if rows:
+            _print_and_write(rows, output, plot, force)
+    if failed:
+        raise typer.Exit(2)
+
+
+def _plot_beside(output: Path, force: bool) -> Path | None:
+    """Check that the outputs can be written, before a long measurement; return the path of the plot, if any."""
+    from kissgs.io.atomic import refuse_existing
+
+    if output.suffix.lower() != ".csv":
+        raise OutputError(f"{output!s:.100} is no name of a table; end it in .csv")
+    refuse_existing(output, overwrite=force)
+    if find_spec("matplotlib") is None:
+        sys.stderr.write("kissgs: no plot without matplotlib, which is missing: pip install 'kissgs[bench]'\n")
+        return None
+    refuse_existing(output.with_suffix(".png"), overwrite=force)
+    return output.with_suffix(".png")
+
+
+def measured(
+    scene: Path, settings: Settings, *, container: ContainerName = "sogxt", views: Views | None = None
+) -> Measurement:
+    """Compress, decompress and evaluate a scene in a separate process; ``views`` serve the encoder and the evaluation.
+
+    Raises:
+        KissgsError: the scene or the capture cannot be used, or the process was killed.
+    """
+    return isolated(partial(_measure, scene, settings, container, views), str(scene))
+
+
+def _measure(scene: Path, settings: Settings, container: ContainerName, views: Views | None) -> Measurement:
+    from kissgs.core.timing import peak_memory
+    from kissgs.evaluation.evaluate import evaluate
+    from kissgs.pipeline.decompress import decompress
+    from kissgs.pipeline.pipeline import compress
+    from kissgs.pipeline.scene_files import load
+
+    result = compress(scene, settings=settings, container=container, views=views)
+    archive = result.to_zip()
+    wall, cpu = time.perf_counter(), time.process_time()
+    decoded = decompress(archive)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    peak = peak_memory()
+    return Measurement(
+        report=result.report,
+        decode_seconds=wall,
+        decode_cpu_seconds=cpu,
+        peak_memory=peak,
+        evaluation=evaluate(load(scene), decoded, views),
     )
-    report(output, as_json, plot)
 
 
-@app.command()
-def ablation(
-    scenes: FilesArgument,
-    presets: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--preset",
-            "-p",
-            help="Preset to measure: paper, balanced or small; repeatable. Default: paper and balanced.",
-        ),
-    ] = None,
-    changes: SetAllOption = None,
-    views: ViewsOption = None,
-    scale: ScaleOption = None,
-    images: ImagesOption = None,
-    resolution: ResolutionOption = None,
-    threads: ThreadsOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure bytes and PSNR of presets with one part of the codec left out or one setting changed at a time."""
-    capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    inputs = open_inputs(scenes, capture, threads)
-    from kissgs.cli import bench_ablation
+def isolated(work: Callable[[], Result], what: str) -> Result:
+    """Call ``work`` in a separate process, so that its times and memory are its own; ``what`` is for error messages.
 
-    report(bench_ablation.ablation(inputs, presets=presets, changes=changes), as_json)
+    Raises:
+        UnsupportedError: the process was killed, most likely for lack of memory.
+    """
+    ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process, which ends the other
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=ignore) as pool:
+        try:
+            worker = pool.submit(os.getpid).result()
+            result = pool.submit(work)
+            try:
+                return result.result()
+            finally:
+                if not result.done():
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(worker, signal.SIGTERM)
+        except BrokenProcessPool as error:
+            raise UnsupportedError(
+                f"{what}: the measurement was killed, most likely for lack of memory; free some or give a smaller scene"
+            ) from error
 
 
-@app.command()
-def compaction(
-    scenes: FilesArgument,
-    preset: Annotated[
-        str, typer.Option("--preset", "-p", help="fast only prunes; balanced, small and paper also train.")
-    ] = "balanced",
-    changes: SetOption = None,
-    ratios: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--ratio",
-            min=0,
-            max=1,
-            help="Share of the Gaussians to keep; repeatable. Default: 0.7, 0.5, 0.3, 0.2, 0.1 and 0.05.",
-        ),
-    ] = None,
-    strategies: Annotated[
-        list[str] | None, typer.Option("--strategy", help="Strategy to measure; repeatable. Default: all.")
-    ] = None,
-    supervision: SupervisionOption = "photos",
-    plot: PlotOption = None,
-    views: ViewsOption = None,
-    scale: ScaleOption = None,
-    images: ImagesOption = None,
-    resolution: ResolutionOption = None,
-    threads: ThreadsOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Compare strategies of compaction at equal numbers of Gaussians and of training steps."""
-    capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    inputs = open_inputs(scenes, capture, threads, plot)
-    from kissgs.cli import bench_curves
-
-    output = bench_curves.compaction(
-        inputs,
-        preset=preset,
-        changes=changes,
-        ratios=ratios or [],
-        strategies=strategies or [],
-        supervision=supervision,
+def row_of(name: str, found: Measurement) -> Row:
+    """Return the row of a measurement."""
+    report, evaluation = found.report, found.evaluation
+    mean, all_views = evaluation.mean, [view.comparison for view in evaluation.views]
+    losses = [change for comparison in all_views if (change := comparison.change) is not None]
+    return Row(
+        name=name,
+        bytes=report.container_bytes,
+        bytes_per_gaussian=report.bytes_per_gaussian,
+        seconds=sum(report.seconds.values()),
+        cpu_seconds=report.cpu_seconds,
+        decode_seconds=found.decode_seconds,
+        peak_memory=found.peak_memory,
+        against=evaluation.against,
+        psnr=mean.candidate.psnr,
+        psnr_change=mean.change,
+        ssim=mean.candidate.ssim,
+        worst_view=min(losses) if losses else min(comparison.candidate.psnr for comparison in all_views),
     )
-    report(output, as_json, plot)
 
 
-@app.command()
-def finetuning(
-    scenes: FilesArgument,
-    preset: Annotated[
-        str, typer.Option("--preset", "-p", help="Preset with rate-distortion planning: balanced or small.")
-    ] = "balanced",
-    changes: SetOption = None,
-    quality_offsets: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--quality-offset",
-            min=-30,
-            max=30,
-            help="Quality offset to measure (dB); repeatable. Default: -8, -5, -2 and 1; with --ratio, that of the "
-            "preset.",
-        ),
-    ] = None,
-    ratios: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--ratio",
-            min=0,
-            max=1,
-            help="First compact the scene to this share of its Gaussians; repeatable. Default: no compaction.",
-        ),
-    ] = None,
-    supervision: SupervisionOption = "photos",
-    plot: PlotOption = None,
-    views: ViewsOption = None,
-    scale: ScaleOption = None,
-    images: ImagesOption = None,
-    resolution: ResolutionOption = None,
-    threads: ThreadsOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure bytes and PSNR with and without fine-tuning."""
-    capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    inputs = open_inputs(scenes, capture, threads, plot)
-    from kissgs.cli import bench_curves
+def _print_and_write(rows: Sequence[Row], output: Path | None, plot: Path | None, force: bool) -> None:
+    """Print the table, write it and plot it; what cannot be printed is written nevertheless."""
+    from kissgs.io.atomic import atomic_file
 
-    output = bench_curves.finetuning(
-        inputs,
-        preset=preset,
-        changes=changes,
-        quality_offsets=quality_offsets or [],
-        ratios=ratios or [],
-        supervision=supervision,
-    )
-    report(output, as_json, plot)
+    try:
+        show(_table(rows))
+    finally:
+        if output is not None:
+            text = io.StringIO(newline="")
+            writer = csv.DictWriter(text, list(asdict(rows[0])))
+            writer.writeheader()
+            writer.writerows(map(asdict, rows))
+            with atomic_file(output, overwrite=force) as file:
+                file.write(text.getvalue().encode())
+        if plot is not None:
+            with atomic_file(plot, overwrite=force) as file:
+                file.write(_png(rows))
 
 
-@app.command()
-def rendering(
-    scenes: FilesArgument,
-    counts: Annotated[
-        list[int] | None,
-        typer.Option(
-            "--gaussians",
-            min=1,
-            help="Measure the scene resampled to this number of Gaussians; repeatable. Default: the scene as it is.",
-        ),
-    ] = None,
-    views: ViewsOption = None,
-    scale: ScaleOption = None,
-    images: ImagesOption = None,
-    resolution: ResolutionOption = None,
-    threads: ThreadsOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure CPU times of the rasteriser: forward, backward, loss, Adam and removal scores."""
-    capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    inputs = open_inputs(scenes, capture, threads)
-    from kissgs.cli import bench_rendering
+def _table(rows: Sequence[Row]) -> Table:
+    """Return the table for the terminal, at most 120 columns wide."""
+    from rich.table import Column, Table
 
-    report(bench_rendering.rendering(inputs, counts or []), as_json)
+    from kissgs.evaluation.metric_text import format_metric
+
+    photos = rows[0].against == "photos"
+    heads = [
+        *("bytes", "per\nGaussian", "encode\nwall s", "encode\nCPU s", "decode\ns", "peak\nMB"),
+        *(("PSNR to\nphotos", "change\ndB") if photos else ("PSNR",)),
+        *("SSIM", "worst\nchange" if photos else "worst\nview"),
+    ]
+    table = Table("", *(Column(head, justify="right") for head in heads), box=None, pad_edge=False)
+    for row in rows:
+        table.add_row(
+            row.name,
+            *(f"{row.bytes:,}", f"{row.bytes_per_gaussian:.2f}", f"{row.seconds:.1f}", f"{row.cpu_seconds:.1f}"),
+            *(f"{row.decode_seconds:.2f}", f"{row.peak_memory / 1e6:.0f}", format_metric(row.psnr, 2)),
+            *(() if row.psnr_change is None else (format_metric(row.psnr_change, 2, signed=True),)),
+            *(format_metric(row.ssim, 4), format_metric(row.worst_view, 2, signed=photos)),
+        )
+    return table
 
 
-app.command()(capacity)
+def _png(rows: Sequence[Row]) -> bytes:
+    """Plot quality over size, and size over time."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
+
+    figure = Figure(figsize=(11, 4.8), layout="constrained")
+    quality, speed = figure.subplots(1, 2)
+    for n, row in enumerate(rows):  # open squares, so that a preset shows where a time limit has chosen the same
+        style = (
+            {"marker": "s", "facecolors": "none", "s": 90}
+            if row.name.startswith("in ")
+            else {"marker": "o", "facecolors": f"C{n}", "s": 40}
+        )
+        at = row.bytes / 1000, row.seconds, row.psnr if math.isfinite(row.psnr) else math.nan
+        quality.scatter(at[0], at[2], edgecolors=f"C{n}", label=row.name, **style)
+        speed.scatter(at[1], at[0], edgecolors=f"C{n}", **style)
+    images = "photographs" if rows[0].against == "photos" else "renderings of the scene"
+    quality.set(xlabel="kilobytes", ylabel=f"PSNR to {images}, dB")
+    speed.set(xlabel="encoding, seconds", ylabel="kilobytes", ylim=(0, 1.15 * max(row.bytes for row in rows) / 1000))
+    for axes in (quality, speed):
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:,g}")
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+    figure.legend(loc="outside right center")
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=150)
+    return file.getvalue()

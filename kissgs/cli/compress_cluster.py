@@ -31,7 +31,7 @@ PROCESS_BYTES = 500_000_000
 
 MEMORY_RATIO, TRAINING_RATIO, PACKED_RATIO = 4, 12, 10
 """Memory that a scene needs for each byte of its ``.ply``: without and with training; and by how much the files of
-compressed formats are smaller than that. Measured: docs/benchmarks.md, "Seconds and memory of every stage"."""
+compressed formats are smaller than that. Measured: docs/benchmarks.md, "Time and memory by the number of Gaussians"."""
 
 
 @dataclass

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
-from kissgs.benchmark.render_speed import RenderingCost
 from kissgs.cli.tables import size, surroundings_summary
 from kissgs.evaluation.html import ReportScene
 from kissgs.evaluation.results import Comparison, Evaluation
@@ -77,16 +74,3 @@ def _group(title: str, parts: list[str]) -> list[Column]:
     """Return columns with one common title, over the first of them."""
     first = Column(f"{title}\n{parts[0]}", justify="right")
     return [first, *(Column(f"\n\n{part}", justify="right") for part in parts[1:])]
-
-
-def rendering_table(rows: Iterable[tuple[str, RenderingCost]]) -> Table:
-    """Format the costs of rendering: milliseconds of processor time per rendered image."""
-    columns = ("forward", "forward + backward", "L1 + SSIM", "Adam", "training step", "forward + scores")
-    head = ("Gaussians", "visible", "image", *(f"{column} ms" for column in columns))
-    table = Table("scene", *(Column(name, justify="right") for name in head), box=None, pad_edge=False)
-    for scene, cost in rows:
-        passes = (cost.render, cost.render_and_backward, cost.loss, cost.adam)
-        times = (*passes, cost.training_step, cost.removal_scores)
-        scene_cells = f"{cost.gaussians:,}", f"{cost.visible:,}", f"{cost.width}x{cost.height}"
-        table.add_row(scene, *scene_cells, *(f"{milliseconds:.1f}" for milliseconds in times))
-    return table

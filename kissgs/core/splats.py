@@ -123,11 +123,6 @@ def sampled_rows(blocks: Iterable[Float[np.ndarray, "n C"]], count: int) -> Floa
     return np.concatenate(found) if found else np.empty((0, 4), np.float32)
 
 
-def float32_bytes(count: int, sh_degree: int) -> int:
-    """Return the bytes of the arrays of ``count`` Gaussians of this SH degree, 0 to 3."""
-    return 4 * count * (14 + 3 * SH_REST_COUNTS[sh_degree])
-
-
 def empty_splats(count: int, coefficients: int) -> Splats:
     """Return a scene of uninitialised arrays; ``coefficients`` is K, the number of SH coefficients in ``shN``."""
     return Splats(

@@ -62,9 +62,3 @@ def peak_memory() -> int:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
-
-
-def reset_peak_memory() -> None:
-    """Let :func:`peak_memory` begin anew at the present resident memory; without effect where the system cannot."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")

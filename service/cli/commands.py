@@ -10,7 +10,6 @@ import secrets
 import signal
 import subprocess
 import sys
-from pathlib import Path
 from typing import NoReturn
 
 import kissgs
@@ -43,16 +42,12 @@ def run() -> None:
     commands.add_parser("viewer", help="fetch what the preview page draws with, if it is not there yet")
     key = commands.add_parser("key", help="make a key for an owner")
     key.add_argument("owner", help="a name, such as that of a person or a program")
-    measure = commands.add_parser("bench", help="measure what the service costs beyond the compression itself")
-    measure.add_argument("scene", nargs="?", type=Path, help="a .ply; by default the sample scene")
     given = parser.parse_args()
     match given.command:
         case "health":
             sys.exit(_health())
         case "viewer":
             sys.exit(subprocess.run([sys.executable, VENDOR_SCRIPT], check=False).returncode)
-        case "bench":
-            _bench(given.scene)
         case "key":
             _make_key(given.owner)
         case "settings":
@@ -110,17 +105,6 @@ def _health() -> int:
         sys.stdout.write(f"no answer from {host}:{settings.port}: {error}\n")
         return 1
     return 0 if answer.status_code == httpx.codes.OK else 1
-
-
-def _bench(scene: Path | None) -> None:
-    from .bench import bench
-
-    try:
-        if scene is not None:
-            kissgs.read_ply_info(scene)
-        bench(scene)
-    except (SettingsError, kissgs.KissgsError) as error:
-        _fail(error)
 
 
 def _make_key(owner: str) -> None:

@@ -1,23 +1,20 @@
-"""``kissgs bench`` as a user runs it; reference: the library's functions, and the texts of errors."""
+"""``kissgs bench`` as a user runs it; reference: ``kissgs compress`` and ``evaluate`` by hand, and texts of errors."""
 
 from __future__ import annotations
 
+import csv
 import json
-import sys
-from collections.abc import Iterator
+import os
+import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
-from helpers.benchmark_rows import measured
-from helpers.captured_scene import cameras
+from helpers.captured_scene import SCENE, write_capture
 from helpers.command_line import failure, run
 
 import kissgs
-from kissgs.benchmark.results import Measurement
-from kissgs.benchmark.scaling import FailedMeasurement
-from kissgs.cli import bench_scaling
-from kissgs.cli.bench_codecs import ExternalCodecs
-from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, report
+from kissgs.cli import bench
 from kissgs.cli.interrupts import Interrupted
 
 
@@ -28,238 +25,126 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.quick(0)
-def test_each_preset_is_measured(scene: Path) -> None:
-    rows = json.loads(run("bench", "codecs", scene, "-p", "fast", "-p", "paper", "--repeats", 2, "--json").stdout)
-    assert [(row["codec"], len(row["runs"])) for row in rows] == [("fast", 2), ("paper", 2)]
-    for row in rows:
-        result = kissgs.compress(scene, settings=kissgs.Settings(preset=row["codec"]))
-        assert row["report"]["container_bytes"] == row["bytes"] == len(result.to_zip())
-        assert row["file_bytes"] == result.report.file_bytes
-        assert row["reproducible"] is True
-        assert row["evaluation"] is None
-        assert sum(row["runs"][0]["stage_seconds"].values()) == pytest.approx(row["runs"][0]["encode_seconds"])
+def table(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
 
-def test_a_curve_is_plotted_and_images_are_compared(scene: Path, tmp_path: Path) -> None:
-    quick = ["--set", "sensitivity_views=4", "--set", "sensitivity_view_size=60"]
-    options = ["-p", "balanced", "--quality-offset", -3, *quick, "--plot", tmp_path / "p.svg"]
-    done = run("bench", "codecs", scene, *options)
+def test_the_table_has_the_bytes_and_the_quality_of_the_commands(scene: Path, tmp_path: Path) -> None:
+    done = run("bench", scene, "-p", "fast", "-p", "paper", "--time", "0.01s", "-o", tmp_path / "t.csv")
     assert done.returncode == 0, done.stderr
-    assert "balanced at -3" in done.stdout.decode()
-    assert "f_rest_centroids.webp" in done.stdout.decode()
-    assert (tmp_path / "p.svg").read_bytes().startswith(b"<?xml")
+    rows = table(tmp_path / "t.csv")
+    assert [row["name"] for row in rows] == ["fast", "paper", "in 0.01s"]
+    assert rows[2]["bytes"] == rows[0]["bytes"], "there is time for the preset fast only"
+    for row in rows[:2]:
+        assert run("compress", scene, "-p", row["name"], "-o", tmp_path / "c.zip", "--force").returncode == 0
+        found = json.loads(run("evaluate", scene, tmp_path / "c.zip", "--json").stdout)
+        assert int(row["bytes"]) == (tmp_path / "c.zip").stat().st_size == found["bytes"]["candidate"]
+        assert float(row["bytes_per_gaussian"]) == int(row["bytes"]) / 600
+        views = [view["candidate_vs_reference"]["psnr"] for view in found["views"]]
+        assert float(row["psnr"]) == pytest.approx(np.mean(np.minimum(views, 60)), abs=1e-6)
+        assert float(row["ssim"]) == pytest.approx(found["mean"]["candidate_vs_reference"]["ssim"], abs=1e-6)
+        assert float(row["worst_view"]) == pytest.approx(min(views), abs=1e-6)
+        assert (row["against"], row["psnr_change"]) == ("renderings", "")
+        assert min(float(row[name]) for name in ("seconds", "cpu_seconds", "decode_seconds", "peak_memory")) > 0
+        assert f"{int(row['bytes']):,}" in done.stdout.decode()
+    assert (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_time_limits_are_measured_beside_presets(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    words = "bench", "frontier", scene, "-p", "fast", "--time", "0.01s", "--time", "0.02s"
-    rows = json.loads(run(*words, "--json").stdout)
-    assert [row["codec"] for row in rows] == ["fast", "in 0.01 s", "in 0.02 s"]
-    assert len({row["bytes"] for row in rows}) == 1  # there is time for the preset fast only
-    done = run(*words, "--plot", tmp_path / "p.svg")
+def test_photographs_are_compared_with(tmp_path: Path) -> None:
+    kissgs.save(SCENE, tmp_path / "scene.ply")
+    capture = write_capture(tmp_path / "capture", names=("a.png", "b.png", "c.png"))
+    words = tmp_path / "scene.ply", "-p", "fast", "--views", capture, "-o", tmp_path / "t.csv"
+    done = run("bench", *words)
     assert done.returncode == 0, done.stderr
-    assert [line.split()[-1] == "*" for line in done.stdout.decode().splitlines() if "fast" in line] == [True]
-    assert (tmp_path / "p.svg").read_bytes().startswith(b"<?xml")
-
-
-def test_other_sizes_are_measured_and_plotted(scene: Path, tmp_path: Path) -> None:
-    options = ["-p", "fast", "--gaussians", 200, "--gaussians", 900, "--json", "--plot", tmp_path / "p.png"]
-    done = run("bench", "scaling", scene, *options)
-    assert done.returncode == 0, done.stderr
-    assert [row["gaussians"] for row in json.loads(done.stdout)] == [200, 900]
-    assert (tmp_path / "p.png").stat().st_size > 10_000
-
-
-@pytest.mark.quick(0)
-def test_sample_scenes_are_measured_beside_other_codecs(tmp_path: Path) -> None:
-    """The external codec copies its input."""
-    tool = tmp_path / "tool.py"
-    tool.write_text("import shutil, sys; shutil.copy(*sys.argv[-2:])")
-    words = ["--gaussians", 500, "--degree", 0, "-p", "fast", "--external", "spz"]
-    done = run("bench", "scaling", *words, "--splat-transform", f"{sys.executable} {tool}", "--json")
-    assert done.returncode == 0, done.stderr
-    rows = json.loads(done.stdout)
-    assert [(row["scene"], row["codec"], row["gaussians"]) for row in rows] == [
-        ("sample, degree 0", "fast", 500),
-        ("sample, degree 0", "spz", 500),
-    ]
-    for row in rows:
-        assert row["peak_memory_per_gaussian"] == row["peak_memory"] / 500
-        assert row["peak_memory_ratio"] == row["peak_memory"] / (56 * 500)
-    assert b"sample scenes of up to 500 Gaussians" in done.stderr
-
-
-def scaled(inputs: BenchInputs) -> BenchOutput:
-    """Measure sample scenes in this process."""
-    return bench_scaling.scaling(
-        inputs,
-        [7, 9],
-        degrees=[],
-        presets=["fast", "small"],
-        changes=None,
-        external=ExternalCodecs([], "splat-transform", None),
-        repeats=1,
-        evaluate=False,
-        plotted=False,
+    (row,) = table(tmp_path / "t.csv")
+    result = kissgs.compress(
+        tmp_path / "scene.ply", settings=kissgs.Settings(preset="fast"), views=kissgs.load_views(capture)
     )
+    (view,) = kissgs.load_views(capture).test
+    photo = view.load_photo() / 255
+    psnr = {
+        name: -10 * np.log10(np.mean((np.clip(kissgs.render(splats, view.camera)[0], 0, 1) - photo) ** 2))
+        for name, splats in (("scene", SCENE), ("decoded", kissgs.decompress(result.files)))
+    }
+    assert row["against"] == "photos"
+    assert float(row["psnr"]) == pytest.approx(psnr["decoded"], abs=1e-3)
+    assert float(row["psnr_change"]) == pytest.approx(psnr["decoded"] - psnr["scene"], abs=1e-3)
+    assert float(row["worst_view"]) == pytest.approx(float(row["psnr_change"])), "there is one held-out view"
+    assert max(map(len, done.stdout.decode().splitlines())) <= 120
 
 
-def test_sample_scenes_have_no_photographs() -> None:
-    with pytest.raises(kissgs.UnsupportedError, match="--views needs the FILE of its scene"):
-        scaled(BenchInputs(scenes=[], views=cameras()))
+def test_all_presets_and_some_times_are_measured_by_default(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, float | None]] = []
+
+    def measured(path: Path, settings: kissgs.Settings, **_: object) -> bench.Measurement:
+        asked.append((str(settings.preset), settings.time_limit))
+        return one
+
+    one = bench.measured(scene, kissgs.Settings(preset="fast"))
+    monkeypatch.setattr(bench, "measured", measured)
+    assert run("bench", scene).returncode == 0
+    presets: list[tuple[str, float | None]] = [("fast", None), ("balanced", None), ("small", None), ("paper", None)]
+    assert asked == [*presets, ("balanced", 5), ("balanced", 30), ("balanced", 120)]
 
 
-def test_an_interrupt_keeps_what_is_measured(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("error", [kissgs.UnsupportedError("it was killed"), Interrupted(signal.SIGINT)])
+def test_what_is_measured_is_kept_if_a_later_one_fails(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
-    def interrupted(source: Path | int, *_: object, **__: object) -> Iterator[Measurement | FailedMeasurement]:
-        yield measured("fast", 9, 30.0, gaussians=7)
-        yield FailedMeasurement(scene="scene.ply", codec="small", gaussians=7, failure="the measurement was killed")
-        raise Interrupted(2)
+    one = bench.measured(scene, kissgs.Settings(preset="fast"))
+    left: list[bench.Measurement | BaseException] = [one, error]
 
-    monkeypatch.setattr("kissgs.benchmark.scaling.measure_scaling", interrupted)
-    output = scaled(BenchInputs(scenes=[]))
-    with pytest.raises(Interrupted):
-        report(output, as_json=True)
-    rows = json.loads(capsys.readouterr().out)
-    assert [(row["gaussians"], row.get("failure")) for row in rows] == [(7, None), (7, "the measurement was killed")]
-    with pytest.raises(Interrupted):
-        report(output, as_json=False)
-    assert "small, 7: the measurement was killed" in capsys.readouterr().out
+    def measured(*_: object, **__: object) -> bench.Measurement:
+        found = left.pop(0)
+        if isinstance(found, BaseException):
+            raise found
+        return found
+
+    monkeypatch.setattr(bench, "measured", measured)
+    words = [str(scene), "-p", "fast", "-p", "paper", "-o", str(tmp_path / "t.csv")]
+    if isinstance(error, Interrupted):
+        with pytest.raises(Interrupted):
+            bench.bench(scene, presets=["fast", "paper"], output=tmp_path / "t.csv")
+    else:
+        done = run("bench", *words)
+        assert (done.returncode, done.stderr) == (2, b"kissgs: paper: it was killed\n")
+    assert [row["name"] for row in table(tmp_path / "t.csv")] == ["fast"]
+
+
+def test_a_killed_measurement_and_an_error_end_in_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(kissgs.UnsupportedError, match=r"^a scene: the measurement was killed"):
+        bench.isolated(killed, "a scene")
+    with pytest.raises(kissgs.InvalidSceneError, match="there is no such file"):
+        bench.measured(tmp_path / "none.ply", kissgs.Settings())
+
+
+def killed() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_without_matplotlib_the_table_is_written(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "find_spec", lambda name: None)
+    done = run("bench", scene, "-p", "fast", "-o", tmp_path / "t.csv")
+    assert b"kissgs: no plot without matplotlib, which is missing: pip install 'kissgs[bench]'\n" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("scene.ply --degree 1", "--degree is for sample scenes"),
-        ("--degree 1 --degree 2 --plot p.svg", "--plot takes one scene; give one --degree"),
-        ("--external spz --splat-transform no-such-tool", "cannot start no-such-tool"),
-        ("none.ply -p small --gaussians 7", "none.ply: there is no such file"),
+        ("-p gzip", "fast"),
+        ("--time soon", "soon"),
+        ("-o table.txt", "table.txt is no name of a table; end it in .csv"),
+        ("-o no/such/table.csv", "there is no folder no/such"),
+        ("-o there.csv", "there.csv exists already"),
+        ("-o plotted.csv", "plotted.png exists already"),
+        ("--views none", "none"),
     ],
 )
-def test_invalid_options_of_scaling_are_refused(options: str, message: str) -> None:
-    assert message in failure("bench", "scaling", "--gaussians", 5, "-p", "fast", *options.split())
-
-
-def test_clusters_are_simulated(tmp_path: Path) -> None:
-    words = ("bench", "capacity", "-p", "fast", "--gaussians", 2000, "--degree", 1, "--cpus", 8, "--dollars", 0.3)
-    done = run(*words, "--json", "--plot", tmp_path / "capacity.svg")
-    said = done.stderr.decode().splitlines()[0]
-    assert said.startswith(
-        "kissgs: measuring 2,000 Gaussians with levels of detail and without: about 1 min of processor "
-    )
-    costs, *runs = json.loads(done.stdout)
-    assert costs["node"] == {"cpus": 8, "network_bytes": 625e6, "dollars": 0.3}
-    assert [run["jobs_per_day"] for run in runs[16:]] == [1e3, 1e4, 1e5, 1e6]
-    assert all(run["longest_wait"] <= 60 and run["busy"] < 1 for run in runs[16:])
-    assert b"<svg" in (tmp_path / "capacity.svg").read_bytes()
-    shown = run(*words).stdout.decode()
-    assert "1,000,000,000" in shown
-    assert max(map(len, shown.splitlines())) <= 120
-
-
-def test_the_time_of_a_simulation_is_stated_by_count_and_preset(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Oracle: 240 and 62 CPU seconds of a million Gaussians, docs/scaling.md."""
-    from kissgs.benchmark import streaming_costs
-
-    monkeypatch.setattr(streaming_costs, "isolated", lambda work, what: None)
-    for count, preset, minutes in ((1_048_576, "balanced", 5), (10_000_000, "balanced", 40), (10_000_000, "fast", 11)):
-        said: list[str] = []
-        settings = kissgs.Settings.from_preset(preset)
-        streaming_costs.measure_costs(3, settings, count, announce=said.append)
-        assert f"{count:,} Gaussians with levels of detail and without: about {minutes} min" in said[0]
-
-
-def test_what_makes_a_simulation_faster_is_named_where_it_applies(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: it named the preset fast where it was chosen, and a number of Gaussians that no file has."""
-    from kissgs.benchmark import streaming_costs
-
-    monkeypatch.setattr(streaming_costs, "isolated", lambda work, what: None)
-    for source, preset, end in (
-        (3, "balanced", " min of processor time; fewer Gaussians and the preset fast take less"),
-        (3, "fast", " min of processor time; fewer Gaussians take less"),
-        (scene, "balanced", " min of processor time; the preset fast takes less"),
-        (scene, "fast", " min of processor time"),
-    ):
-        said: list[str] = []
-        streaming_costs.measure_costs(source, kissgs.Settings.from_preset(preset), 1000, announce=said.append)
-        assert said[0].endswith(end)
-
-
-@pytest.mark.quick(0)
-def test_images_are_compared_and_the_rasteriser_is_measured(scene: Path) -> None:
-    rows = json.loads(run("bench", "codecs", scene, "-p", "fast", "--evaluate", "--json").stdout)
-    assert rows[0]["evaluation"]["mean"]["candidate_vs_reference"]["psnr"] > 20
-    rows = json.loads(run("bench", "rendering", scene, "--gaussians", 100, "--json").stdout)
-    assert [row["gaussians"] for row in rows] == [100]
-
-
-@pytest.mark.parametrize(
-    ("command", "options", "message"),
-    [
-        ("codecs", "--quality-offset 1 -p fast", "--quality-offset needs a preset with rate-distortion planning"),
-        ("codecs", "--external rar -p fast", "unknown external codec 'rar'; choose sog or spz"),
-        ("codecs", "--sog-iterations 1", "--sog-iterations needs --external sog"),
-        ("codecs", "--external sog --splat-transform '", "--splat-transform ': no closing quotation"),
-        ("codecs", "--plot curve.jpg", "ends in .svg, .png or .pdf"),
-        ("codecs", "--scale 4", "--views"),
-        ("rendering", "--gaussians 99999999999999", "need more memory than there is"),
-        ("ablation", "-p fast", "balanced or small, not fast"),
-        ("finetuning", "-p fast", "choose balanced or small"),
-        ("finetuning", "--supervision cameras", "--supervision cameras needs a capture"),
-    ],
-)
-def test_invalid_options_are_refused(scene: Path, command: str, options: str, message: str) -> None:
-    assert message in failure("bench", command, scene, *options.split())
-
-
-def test_a_command_has_only_its_own_options(scene: Path) -> None:
-    for words in (["rendering", scene, "-p", "fast"], ["codecs", scene, "--gaussians", 5], ["scaling", scene]):
-        assert run("bench", *words).returncode == 2
-
-
-def test_without_a_command_help_is_printed() -> None:
-    done = run("bench")
-    printed = (done.stdout + done.stderr).decode()
-    commands = ("codecs", "scaling", "ablation", "compaction", "finetuning", "rendering")
-    assert [command for command in commands if f"│ {command} " not in printed] == []
-
-
-def test_a_plot_of_two_scenes_is_refused(scene: Path, tmp_path: Path) -> None:
-    assert "--plot takes one scene" in failure("bench", "codecs", scene, "other.ply", "--plot", tmp_path / "p.svg")
-
-
-@pytest.mark.parametrize("words", [["ablation", "-p", "paper"], ["rendering"], ["codecs", "-p", "fast"]])
-@pytest.mark.quick(0)
-def test_the_results_of_other_scenes_are_printed_if_one_fails(scene: Path, words: list[str]) -> None:
-    done = run("bench", *words, scene, scene.with_name("none.ply"), "--json")
-    assert done.returncode == 2
-    assert b"none.ply: there is no such file" in done.stderr
-    assert {row["scene"] for row in json.loads(done.stdout)} == {"scene.ply"}
-
-
-def test_scenes_of_equal_file_names_have_different_names(scene: Path, tmp_path: Path) -> None:
-    """Many captures have a scene called point_cloud.ply."""
-    other = tmp_path / "other" / scene.name
-    other.parent.mkdir()
-    kissgs.save(kissgs.sample_scene(50, sh_degree=0), other)
-    rows = json.loads(run("bench", "codecs", scene, other, scene, "-p", "fast", "--json").stdout)
-    names = [f"{path.parent.name}/{path.name}" for path in (scene, other)]
-    assert [(row["scene"], row["gaussians"]) for row in rows] == [(names[0], 600), (names[1], 50)]
-
-
-def test_an_empty_scene_is_not_resampled(tmp_path: Path) -> None:
-    kissgs.save(kissgs.sample_scene(0), tmp_path / "none.ply")
-    plot = ["--plot", tmp_path / "p.svg"]
-    done = run("bench", "scaling", tmp_path / "none.ply", "-p", "fast", "--gaussians", 5, *plot)
-    assert done.returncode == 2
-    assert b"a scene without Gaussians cannot be plotted" in done.stderr
-    rows = json.loads(run("bench", "scaling", tmp_path / "none.ply", "-p", "fast", "--gaussians", 5, "--json").stdout)
-    assert [row["gaussians"] for row in rows] == [0]
-
-
-def test_there_is_no_table_if_all_scenes_fail() -> None:
-    done = run("bench", "codecs", "none.ply", "nothing.ply", "-p", "fast")
-    assert (done.returncode, done.stdout) == (2, b"")
-    assert done.stderr.count(b"there is no such file") == 2
+def test_wrong_inputs_are_refused_before_a_measurement(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str, message: str
+) -> None:
+    monkeypatch.setattr(bench, "measured", None)
+    for name in ("there.csv", "plotted.png"):
+        (tmp_path / name).touch()
+    assert message in failure("bench", scene, *options.split(), cwd=tmp_path)

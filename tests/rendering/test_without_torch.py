@@ -15,9 +15,6 @@ assert result.mean.candidate_vs_reference.psnr > 15
 for module in ("differentiable", "losses"):
     with pytest.raises(UnsupportedError, match="train"):
         __import__(f"kissgs.rendering.{module}")
-from kissgs.benchmark.render_speed import rendering_cost
-with pytest.raises(UnsupportedError, match="train"):
-    rendering_cost(scene, [views.train[0].camera])
 with pytest.raises(UnsupportedError, match="cuda"):
     kissgs.render(scene, views.train[0].camera, device="cuda")
 """

@@ -3,12 +3,9 @@
 import contextlib
 import hashlib
 import os
-import re
 import resource
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 import uuid
@@ -18,7 +15,6 @@ import uvicorn
 from helpers.running import wait_until
 from helpers.service import SLOW, SMALL, events, problem, read_response, scene_bytes
 
-from kissgs.benchmark import service_load
 from service.core.problems import ProblemError
 from service.core.settings import ServiceSettings
 from service.http.server import TimeoutProtocol, config_of
@@ -37,18 +33,6 @@ def slowest(service, count=60):
         spent.append(time.perf_counter() - begun)
         time.sleep(0.01)
     return max(spent)
-
-
-@pytest.mark.quick(0)
-def test_the_load_of_a_service_is_measured(start, monkeypatch, capsys):
-    """Oracle: the service's processor time so far, which no part of it exceeds."""
-    service = start()
-    monkeypatch.setattr(service_load, "JOBS", 2)
-    monkeypatch.setattr(sys, "argv", ["service_load", service.url, str(service.process.pid)])
-    service_load.main()
-    found = re.fullmatch(r"(-?[0-9.]+) CPU s per job, (-?[0-9.]+) CPU s per GB\n", capsys.readouterr().out)
-    assert float(found[1]) < service_load._cpu_seconds(service.process.pid)
-    assert service.http.get("/v1/jobs").json()["jobs"] == []
 
 
 @pytest.mark.quick(0)
@@ -352,31 +336,6 @@ def test_events_continue_after_a_restart(start):
     seen += [int(line[4:]) for line in rest.splitlines() if line.startswith("id: ")]
     assert seen == list(range(1, len(seen) + 1))
     assert '"succeeded"' in rest
-
-
-@pytest.mark.quick(0)
-def test_the_bench_command(monkeypatch, capsys, tmp_path):
-    from service.cli import bench
-
-    for name, value in (("UPLOAD_BYTES", 5_000_000), ("POLLS", 5), ("REPEATS", 1)):
-        monkeypatch.setattr(bench, name, value)
-    scene = tmp_path / "scene.ply"
-    scene.write_bytes(SMALL)
-    bench.bench(scene)
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines] == [
-        "status while a job uses every processor",
-        "server memory",
-        "over `kissgs compress`, scene.ply",
-    ]
-    missing = subprocess.run(
-        [sys.executable, "-m", "service", "bench", "nothing.ply"],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert (missing.returncode, "no such file" in missing.stderr) == (2, True)
 
 
 def test_a_stalled_upload_does_not_delay_a_stop(start):

@@ -1,4 +1,4 @@
-/** What scripts/bench-decoder asks of a page, a fresh one for each: the first time counts loading and compiling as well. */
+/** What bench/decoder.py asks of a page, a fresh one for each: the first time counts loading and compiling as well. */
 
 import { openZip } from "../zip.js";
 

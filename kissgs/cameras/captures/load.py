@@ -181,7 +181,7 @@ def _sizes(posed: PosedImage, photo: _Photo | None, scale: int) -> tuple[tuple[i
         raise InvalidViewsError(
             f"{photo.found.path} has {size[0]}x{size[1]} pixels, but its camera ({posed.where}) is for "
             f"{nominal[0]}x{nominal[1]}, another aspect ratio; name the folder of the cameras' "
-            "photographs (--images of kissgs evaluate, render and bench)"
+            "photographs (--images of kissgs evaluate and render)"
         )
     return nominal, size
 

@@ -101,7 +101,7 @@ def find_photos(
         raise InvalidViewsError(
             f"{len(missing)} of {len(names)} photographs {'is' if len(missing) == 1 else 'are'} missing; the first is "
             f"{quoted(names[missing[0]])}, searched in {folder}; add what is missing, or name the folder that has all "
-            "of them (--images of kissgs evaluate, render and bench)"
+            "of them (--images of kissgs evaluate and render)"
         )
     return tuple(photo for photo in found if photo is not None)
 

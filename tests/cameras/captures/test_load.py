@@ -216,7 +216,7 @@ def test_photographs_of_another_aspect_ratio(tmp_path):
     assert message(tmp_path) == (
         f"{tmp_path}/images/a.jpg has 120x86 pixels, but its camera ({tmp_path}/sparse/0/images.txt, image 'a.jpg') is "
         "for 120x80, another aspect ratio; name the folder of the cameras' photographs (--images of "
-        "kissgs evaluate, render and bench)"
+        "kissgs evaluate and render)"
     )
 
 

@@ -161,9 +161,7 @@ def message(root, *names, **options):
 
 def test_missing_photographs(tmp_path):
     touch(tmp_path, "images_2/a.jpg", "images_2/c.png")
-    remedy = (
-        "; add what is missing, or name the folder that has all of them (--images of kissgs evaluate, render and bench)"
-    )
+    remedy = "; add what is missing, or name the folder that has all of them (--images of kissgs evaluate and render)"
     assert message(tmp_path, *(f"images/{x}.jpg" for x in "abcd")) == (
         f"2 of 4 photographs are missing; the first is 'images/b.jpg', searched in {tmp_path}/images_2{remedy}"
     )

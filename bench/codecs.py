@@ -1,0 +1,114 @@
+"""Presets, points of their quality curves, and external codecs on scenes, each in a process of its own.
+
+    python bench/codecs.py fox.ply --views fox --offsets -7 -3 4 --external sog spz --sog-iterations 1
+
+External codecs need splat-transform (npm install -g @playcanvas/splat-transform). An offset is a value of
+quality_offset_db of the presets that plan by rate and distortion; bytes are compared at equal PSNR along that curve.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from typing import Any
+
+from bench.common import arguments, at_quality_offset, bytes_at, head, row, run, signed, write
+from bench.external import FORMATS, External, measure_external
+from kissgs import Evaluation, KissgsError, Preset
+from kissgs.cli.bench import Measurement, measured
+from kissgs.cli.options import chosen
+
+HEAD = "codec", "bytes", "per Gaussian", "wall s", "CPU s", "decode CPU s", "peak MB"
+IMAGES = "PSNR to photographs", "change, dB", "SSIM", "PSNR to the original", "SSIM", "worst view"
+
+
+def main() -> None:
+    """Print tables of all codecs and of the bytes by file, and the bytes at equal PSNR."""
+    parser = arguments(__doc__)
+    parser.add_argument("-p", "--presets", nargs="+", default=list(Preset))
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="change a setting of all presets"
+    )
+    parser.add_argument("--containers", nargs="+", default=["sogxt"], choices=["sogxt", "sog"])
+    parser.add_argument("--offsets", nargs="+", type=float, default=[], metavar="DB")
+    parser.add_argument("--external", nargs="+", default=[], choices=FORMATS)
+    parser.add_argument("--splat-transform", default="splat-transform", help="command that starts it")
+    parser.add_argument("--sog-iterations", type=int, help="k-means iterations over the SH of .sog")
+    given = parser.parse_args()
+    files: dict[str, dict[str, int]] = {}
+    points: dict[str, list[tuple[float, float]]] = {}
+    others: dict[str, tuple[float, int]] = {}
+    head(*HEAD, *IMAGES)
+    for preset in given.presets:
+        settings = chosen(preset, given.set)
+        offsets = given.offsets if settings.encode.rate_distortion else []
+        for container in given.containers:
+            curve = str(preset) if container == "sogxt" else f"{preset} .{container}"
+            for offset in [None, *offsets]:
+                tuned = settings if offset is None else at_quality_offset(settings, offset)
+                found = measured(given.scene, tuned, container=container, views=given.views)
+                name = curve if offset is None else f"{curve} at {offset:g}"
+                psnr = print_measurement(name, found)
+                files[name] = found.report.file_bytes
+                points.setdefault(curve, []).append((psnr, found.report.container_bytes))
+    for ending in given.external:
+        try:
+            external = measure_external(
+                given.scene,
+                ending,
+                shlex.split(given.splat_transform),
+                sh_iterations=given.sog_iterations,
+                views=given.views,
+            )
+        except KissgsError as error:
+            sys.stderr.write(f"{error}\n")
+            continue
+        psnr = print_external(f".{ending}", external)
+        others[f".{ending}"] = psnr, external.bytes
+    print_files(files)
+    for name, (psnr, size) in others.items():
+        for curve, curve_points in points.items():
+            equal = bytes_at(curve_points, psnr)
+            if equal is not None:
+                at = f"at the PSNR of {name} to the original, {psnr:.2f} dB"
+                write(f"{at}: {curve} {equal:,.0f} bytes, {equal / size:.3f} of its")
+
+
+def print_measurement(name: str, found: Measurement) -> float:
+    """Print a row; return the PSNR to renderings of the original."""
+    report = found.report
+    wall, memory = f"{sum(report.seconds.values()):.1f}", f"{found.peak_memory / 1e6:.0f}"
+    times = wall, f"{report.cpu_seconds:.1f}", f"{found.decode_cpu_seconds:.2f}", memory
+    row(name, report.container_bytes, f"{report.bytes_per_gaussian:.2f}", *times, *images(found.evaluation))
+    return found.evaluation.mean.candidate_vs_reference.psnr
+
+
+def print_external(name: str, found: External) -> float:
+    """Print a row; return the PSNR to renderings of the original."""
+    times = f"{found.encode_seconds:.1f}", f"{found.encode_cpu_seconds:.1f}", f"{found.decode_cpu_seconds:.2f}"
+    per_gaussian = f"{found.bytes / max(found.evaluation.reference_count, 1):.2f}"
+    row(name, found.bytes, per_gaussian, *times, f"{found.peak_memory / 1e6:.0f}", *images(found.evaluation))
+    return found.evaluation.mean.candidate_vs_reference.psnr
+
+
+def images(evaluation: Evaluation) -> list[Any]:
+    """Return the cells of :data:`IMAGES`; those of photographs are empty without any."""
+    mean = evaluation.mean
+    other = mean.candidate_vs_reference
+    photos = ["", "", ""]
+    if mean.reference is not None:
+        photos = [f"{mean.candidate.psnr:.2f}", signed(mean.change), f"{mean.candidate.ssim:.4f}"]
+    worst = evaluation.worst.comparison.candidate_vs_reference.psnr
+    return [*photos, f"{other.psnr:.2f}", f"{other.ssim:.4f}", f"{worst:.2f}"]
+
+
+def print_files(files: dict[str, dict[str, int]]) -> None:
+    """Print the bytes of every file of the containers."""
+    write("")
+    head("bytes of", *files)
+    for name in dict.fromkeys(name for each in files.values() for name in each):
+        row(name, *(each.get(name, "") for each in files.values()))
+
+
+if __name__ == "__main__":
+    run(main)

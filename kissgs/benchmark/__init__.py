@@ -1,1 +1,0 @@
-"""Measurements of presets, parts of the codec and external codecs: takes scenes, returns results and plots."""

@@ -1,0 +1,94 @@
+"""Studies of ``bench/``; reference: curves given as formulas, a converter with known errors, bytes counted by hand."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import kissgs
+from bench import paper_parts
+from bench.common import at_quality_offset, bytes_at, saving
+from bench.external import measure_external
+from bench.rendering import resampled
+from kissgs.core.splats import ATTRIBUTES
+from kissgs.sogxt.container import zip_bytes
+from kissgs.sogxt.encode import encode
+
+STUDIES = sorted(path.stem for path in Path(__file__).parents[1].glob("bench/[a-z]*.py"))
+
+COPYING_TOOL = """
+import shutil, sys
+held = b"x" * 2**27
+print("copied")
+shutil.copy(*sys.argv[-2:])
+"""
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_has_what_it_imports(name: str) -> None:
+    importlib.import_module(f"bench.{name}")
+
+
+@pytest.mark.parametrize("growth", [1.05, 1.3])
+def test_bytes_are_interpolated_exponentially_and_not_extrapolated(growth: float) -> None:
+    curve = [(q, 1e6 * growth**q) for q in (41.0, 30.0, 35.5)]
+    for quality in (30.0, 33.3, 35.5, 41.0):
+        assert bytes_at([*curve, (math.inf, 5.0), (math.nan, 5.0)], quality) == pytest.approx(1e6 * growth**quality)
+    assert [bytes_at(curve, quality) for quality in (29.99, 41.01, math.nan)] == [None] * 3
+    assert bytes_at([], 30.0) is None
+
+
+def test_the_saving_is_the_mean_difference_where_both_curves_are() -> None:
+    curve = [(q, 1e6 * 1.1**q) for q in (30.0, 34.0, 41.0)]
+    other = [(q, 0.8e6 * 1.1**q) for q in (33.0, 38.0, 50.0)]
+    assert saving(curve, other) == pytest.approx(0.2)
+    assert saving(other, curve) == pytest.approx(-0.25)
+    assert saving(curve, [(50.0, 1.0), (60.0, 2.0)]) is None
+
+
+def test_a_quality_offset_replaces_every_goal() -> None:
+    other = at_quality_offset(kissgs.Settings.from_preset("small", psnr=40.0), -3.5)
+    assert (other.encode.quality_offset_db, other.encode.psnr, other.preset) == (-3.5, None, "small")
+
+
+def test_an_external_codec_is_measured_without_this_process(tmp_path: Path) -> None:
+    """The tool holds 128 MB; this process holds 1 GB, which Linux would count as that of the process it starts."""
+    scene, tool, held = tmp_path / "scene.ply", tmp_path / "tool.py", b"x" * 2**30
+    kissgs.save(kissgs.sample_scene(100, sh_degree=0), scene)
+    tool.write_text(COPYING_TOOL)
+    found = measure_external(scene, "spz", [sys.executable, str(tool)])
+    assert found.bytes == scene.stat().st_size
+    assert 2**27 < found.peak_memory < len(held)
+    assert 0 < found.encode_cpu_seconds < 30
+    assert found.evaluation.mean.candidate_vs_reference.psnr == math.inf
+    tool.write_text("import sys; sys.exit('out of splats')")
+    with pytest.raises(kissgs.KissgsError, match=r"scene.ply to \.spz: out of splats"):
+        measure_external(scene, "spz", [sys.executable, str(tool)])
+
+
+def test_parts_of_the_paper_that_only_save_bytes_change_nothing_else() -> None:
+    scene, settings = kissgs.sample_scene(200, sh_degree=1), kissgs.Settings.from_preset("paper").encode
+    whole = paper_parts.encode_parts(scene, settings, 1)
+    assert whole.size(settings, 1) == len(zip_bytes(encode(scene, settings, threads=1).files))
+    for leave_out in (paper_parts.webp, paper_parts.scene_order, paper_parts.codebook_order, paper_parts.label_pairs):
+        parts = leave_out(whole, settings, 1)
+        assert parts.size(settings, 1) != whole.size(settings, 1)
+        assert all(np.array_equal(getattr(whole.decoded, name), getattr(parts.decoded, name)) for name in ATTRIBUTES)
+    floats = paper_parts.as_floats("scales", "scales")(whole, settings, 1)
+    assert np.array_equal(floats.decoded.scales, whole.exact.scales)
+    assert np.abs(whole.exact.scales - whole.decoded.scales).max() < 0.1
+
+
+@pytest.mark.parametrize("count", [1, 70, 200, 450])
+def test_a_resampled_scene_has_the_count_and_covers_as_much(count: int) -> None:
+    scene = kissgs.sample_scene(200, sh_degree=0)
+    scene = replace(scene, scales=np.full_like(scene.scales, -3))
+    areas = [np.exp(2 * each.scales[:, 0].astype(float)).sum() for each in (scene, resampled(scene, count))]
+    assert len(resampled(scene, count)) == count
+    assert areas[1] == pytest.approx(areas[0], rel=1e-5)
