@@ -8,7 +8,6 @@
 # make docs               what is generated in docs/
 # make setup              .venv alone, which the others make too (PYTHON=… for another Python than python3)
 # make setup-dev          the same, with what tests and checks need (TORCH_INDEX=… for another build of torch)
-# make setup-s3           a server for the tests of replicas on S3, which are skipped without it
 # make clean              removes all that make has made; the data of a service, kissgs-data, stays
 # make help               this list
 
@@ -16,7 +15,7 @@ SCENE ?=
 PRESET ?= balanced
 KISSGS = .venv/bin/kissgs
 
-.PHONY: help demo serve test test-all lint bench docs setup setup-dev setup-s3 clean
+.PHONY: help demo serve test test-all lint bench docs setup setup-dev clean
 
 help:
 	@sed -n '/^#/!q; s/^# //p' Makefile
@@ -55,10 +54,7 @@ setup:
 setup-dev:
 	@scripts/setup dev
 
-setup-s3:
-	@scripts/setup_s3
-
 clean:
-	@rm -rf .venv .venv-s3 demo-out build dist web_decoder/vendor web_decoder/.vendor-* web_decoder/node_modules
+	@rm -rf .venv demo-out build dist web_decoder/vendor web_decoder/.vendor-* web_decoder/node_modules
 	@rm -rf .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache .schemathesis
 	@find kissgs service bench tests docs scripts -name __pycache__ -prune -exec rm -rf {} +

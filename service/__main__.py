@@ -1,5 +1,22 @@
-"""``python -m service`` is ``kissgs-serve``."""
+"""``kissgs-serve``, where its packages are installed; ``python -m service`` in a checkout."""
 
-from .cli.main import main
+from __future__ import annotations
 
-main()
+import io
+import sys
+
+
+def main() -> None:
+    """Entry point."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # None if closed. Not every encoding has all characters of the help
+        sys.stdout.reconfigure(errors="backslashreplace")
+    try:
+        from .cli import run
+    except ModuleNotFoundError as error:
+        sys.stderr.write(f"kissgs-serve: the package {error.name} is missing: pip install 'kissgs[service]'\n")
+        sys.exit(2)
+    run()
+
+
+if __name__ == "__main__":
+    main()

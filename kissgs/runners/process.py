@@ -136,7 +136,7 @@ class ItemProcess:
             stdout=subprocess.PIPE,
             stderr=errors,
             cwd=folder,
-            env=child_environment(("KISSGS_", "AWS_", "RAY_AUTH", "PG")),
+            env=child_environment(("KISSGS_", "AWS_", "RAY_AUTH")),
             start_new_session=True,
         )
         with self._lock:
@@ -228,7 +228,7 @@ def json_lines(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
 def child_environment(secret: tuple[str, ...] = ("KISSGS_", "AWS_")) -> dict[str, str]:
     """Return this process's environment without variables whose names begin so.
 
-    By default, these are the settings of a service and its storage, some of them secrets.
+    By default, these are the settings of a service and the credentials of a cloud.
     """
     inherited = {name: value for name, value in os.environ.items() if not name.upper().startswith(secret)}
     return {**inherited, "OMP_WAIT_POLICY": "PASSIVE", "PYTHONUNBUFFERED": "1"}

@@ -4,8 +4,9 @@ Its argument is the address. It reads JSON lines from standard input, items to s
 lines to standard output: the nodes whenever they change, and the events of each item. When standard input closes, it
 ends all items and exits.
 
-Every start of an item is one Ray task, a streaming generator whose values are the item's events; the values are small
-and come with the reply, not through Ray's object store. Retries are ours and not Ray's, because Ray continues such a
+Every start of an item is one Ray task, a streaming generator whose values are the item's events; they are small and
+come with the reply. If the node does not see the item's folder, blocks of files go there and come back through Ray's
+object store (:mod:`kissgs.runners.file_transfer`). Retries are ours and not Ray's, because Ray continues such a
 generator behind the values that have been consumed, which only suits generators that yield the same values again.
 """
 
@@ -26,13 +27,15 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import cache
+from pathlib import Path
 from typing import Any, NoReturn
 
 import ray
 from ray.exceptions import RayError, RayTaskError, TaskCancelledError
 
 from kissgs._version import __version__
-from kissgs.core.errors import RunnerError
+from kissgs.core.errors import OutputError, RunnerError
+from kissgs.runners import file_transfer
 from kissgs.runners.contract import INTERNAL, LOST, NODE_UNUSABLE, Outcome, WorkItem
 from kissgs.runners.ray_connection import NoCluster, connect, first_line, start_here
 
@@ -44,6 +47,9 @@ RETRY_SECONDS = 1.0
 
 FORCE_SECONDS = 5.0
 """Seconds after which a cancelled task that has not ended is killed."""
+
+EVENTS_AHEAD = 4
+"""Events of a start that have not been read, beyond which its task waits: they may be blocks of files."""
 
 LOCAL = "local"
 """Argument instead of an address: start a cluster on this machine."""
@@ -118,6 +124,7 @@ class Driver:
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._generators: dict[str, Any] = {}
         self._cancelled = set[str]()
+        self._sends_files = False  # until a node has not seen a folder
 
     async def run(self) -> None:
         """Handle messages from standard input until that closes; then cancel all items."""
@@ -171,8 +178,7 @@ class Driver:
         task, outcome = _remote_task(item), Outcome("cancelled", starts=0)
         for start in range(1, item.retries + 2):
             if item_id not in self._cancelled:
-                self._generators[item_id] = task.remote(item.as_dict(), __version__)
-                outcome = await self._follow(item_id, start)
+                outcome = await self._start(task, item_id, item, start)
             if outcome.kind != "lost":
                 return outcome
             if item_id in self._cancelled:
@@ -181,12 +187,33 @@ class Driver:
             await asyncio.sleep(RETRY_SECONDS)
         return outcome
 
-    async def _follow(self, item_id: str, start: int) -> Outcome:
-        """Forward the events of one start of an item and return its outcome."""
+    async def _start(self, task: Any, item_id: str, item: WorkItem, start: int) -> Outcome:  # noqa: ANN401
+        """Start an item, a second time with its files if the node does not see its folder; return the outcome."""
+        for with_files in (self._sends_files, True):
+            try:
+                files = await asyncio.to_thread(_stored_files, item) if with_files and item.files else None
+            except OSError as error:
+                return _unusable_files(error, start)
+            if item_id in self._cancelled:  # meanwhile
+                break
+            self._generators[item_id] = task.remote(item.as_dict(), __version__, files)
+            outcome = await self._follow(item_id, item, start)
+            if outcome is not None:
+                return outcome
+            self._sends_files = True
+        return Outcome("cancelled", starts=start)
+
+    async def _follow(self, item_id: str, item: WorkItem, start: int) -> Outcome | None:
+        """Forward the events of one start of an item; return its outcome, None if the node needs the item's files."""
         node = ""
         try:
             async for reference in self._generators[item_id]:
                 event = await reference
+                if "unseen" in event:
+                    return None
+                if "file" in event:
+                    await asyncio.to_thread(file_transfer.receive, Path(item.folder or ""), event)
+                    continue
                 if "outcome" in event:
                     return Outcome(**{**event["outcome"], "node": node, "starts": start})
                 if "node" in event:
@@ -203,6 +230,9 @@ class Driver:
         except RayError as error:
             message = f"the node {node or 'of the work'} was lost {start} times: {first_line(error)}"
             return Outcome("lost", code=LOST, message=message, node=node, starts=start)
+        except OSError as error:  # of a file that has come back
+            ray.cancel(self._generators[item_id])
+            return _unusable_files(error, start)
         return Outcome("lost", code=LOST, message="the work ended without an outcome", node=node, starts=start)
 
 
@@ -224,6 +254,18 @@ class _Messages:
         self._loop.call_soon_threadsafe(self._queue.put_nowait, None)
 
 
+def _stored_files(item: WorkItem) -> dict[str, list[Any]]:
+    """Store an item's files as blocks in Ray's object store; return references to them by name."""
+    folder = Path(item.folder or "")
+    return {name: [ray.put(block) for block in file_transfer.blocks_of(folder / name)] for name in item.files}
+
+
+def _unusable_files(error: OSError, start: int) -> Outcome:
+    reason = (error.strerror or str(error)).lower()
+    message = f"the files of the work cannot be read or written: {reason}"
+    return Outcome("error", code=OutputError.code, message=message, starts=start)
+
+
 @cache
 def _exported_function() -> Any:  # noqa: ANN401
     """Return the function for nodes as Ray's; each call of ``ray.remote`` would store one more in the cluster."""
@@ -238,38 +280,69 @@ def _remote_task(item: WorkItem) -> Any:  # noqa: ANN401  Ray's decorated functi
         num_gpus=wanted.gpus if wanted.gpus <= 1 else math.ceil(wanted.gpus),
         memory=wanted.memory or None,
         num_returns="streaming",
+        _generator_backpressure_num_objects=EVENTS_AHEAD,
         max_retries=0,
         scheduling_strategy="SPREAD",
         name=item.function,
     )
 
 
-def function_for_nodes() -> Callable[[dict[str, Any], str], Iterator[dict[str, Any]]]:
+def function_for_nodes() -> Callable[[dict[str, Any], str, dict[str, list[Any]] | None], Iterator[dict[str, Any]]]:
     """Return the function that nodes run, as a local one: Ray sends its code, and not its name as of a global one."""
     unusable = NODE_UNUSABLE  # an older version of kissgs on the node does not have it
 
-    def run(values: dict[str, Any], version: str) -> Iterator[dict[str, Any]]:
-        """Run an item in a process and yield its events; ``version`` is that of kissgs where it was submitted."""
-        from dataclasses import asdict
+    def run(values: dict[str, Any], version: str, files: dict[str, list[Any]] | None) -> Iterator[dict[str, Any]]:
+        """Run an item in a process and yield its events.
+
+        ``version`` is that of kissgs where it was submitted; ``files`` are references to the blocks of its files.
+        """
+        import contextlib
+        import time
+        from dataclasses import asdict, replace
+        from pathlib import Path
 
         import ray
 
         from kissgs._version import __version__
+        from kissgs.runners import file_transfer
         from kissgs.runners.contract import Outcome, WorkItem
         from kissgs.runners.process import ItemProcess
+        from kissgs.runners.temporary_folder import temporary_folder
 
         node = ray.util.get_node_ip_address()
         if __version__ != version:
             message = f"the node {node} has kissgs {__version__}, and this machine {version}; install one version"
             yield {"outcome": asdict(Outcome("error", code=unusable, message=message))}
             return
-        yield {"node": node}
-        process = ItemProcess(WorkItem.from_dict(values))
-        try:
-            for event in process.events():
-                yield {"outcome": asdict(event)} if isinstance(event, Outcome) else {"progress": list(event)}
-        finally:
-            process.kill()
+        item, before, folder = WorkItem.from_dict(values), None, Path()
+        with contextlib.ExitStack() as stack:
+            if item.files and not file_transfer.is_seen(item.folder):
+                if files is None:
+                    yield {"unseen": True}
+                    return
+                folder = stack.enter_context(temporary_folder())
+                for name, blocks in files.items():
+                    with (folder / name).open("wb") as file:
+                        for block in blocks:
+                            file.write(ray.get(block))
+                item, before = replace(item, folder=str(folder)), file_transfer.times_of(folder)
+            yield {"node": node}
+            process, looked, outcome = ItemProcess(item), time.monotonic(), None
+            try:
+                for event in process.events():
+                    if isinstance(event, Outcome):
+                        outcome = event
+                        break
+                    yield {"progress": list(event)}
+                    if before is not None and time.monotonic() - looked > file_transfer.CHECKPOINT_SECONDS:
+                        yield from file_transfer.changed(folder, before, complete=False)
+                        looked = time.monotonic()
+            finally:
+                process.kill()
+            if before is not None and outcome is not None:
+                yield from file_transfer.changed(folder, before, complete=outcome.kind == "done")
+            if outcome is not None:
+                yield {"outcome": asdict(outcome)}
 
     return run
 

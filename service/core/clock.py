@@ -16,12 +16,7 @@ def ticks() -> float:
 
 
 class Clock:
-    """Seconds since 1970 that advance with real time, independent of later changes to the machine's clock.
-
-    Args:
-        wall: the machine's clock, read once.
-        steady: a monotonic clock.
-    """
+    """Seconds since 1970 that advance with real time, independent of later changes to the machine's clock."""
 
     def __init__(self, wall: Callable[[], float] = time.time, steady: Callable[[], float] = ticks) -> None:
         self._steady = steady

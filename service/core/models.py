@@ -1,4 +1,4 @@
-"""Database tables as SQLAlchemy models, for SQLite (default) and PostgreSQL."""
+"""Database tables as SQLAlchemy models."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ SCHEMA_VERSION = 4
 
 NOTE_CHARS = 200
 """Maximum length of a progress note; longer notes are truncated."""
-
-Number = BigInteger().with_variant(Integer, "sqlite")  # SQLite counts up only in INTEGER columns
 
 
 class State(StrEnum):
@@ -37,7 +35,7 @@ class Base(DeclarativeBase):
 
 
 class Meta(Base):
-    """Properties of the database itself, by name: schema version, identity, owner, latest time."""
+    """Properties of the database itself, by name: schema version, identity, latest time."""
 
     __tablename__ = "meta"
 
@@ -65,7 +63,7 @@ class Job(Base):
         {"sqlite_autoincrement": True},  # numbers are cursors and must never be reused
     )
 
-    number: Mapped[int] = mapped_column(Number, primary_key=True, autoincrement=True)
+    number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
     id: Mapped[str] = mapped_column(String(32), unique=True)
     owner: Mapped[str] = mapped_column(String(64))
     name: Mapped[str] = mapped_column(String(200))

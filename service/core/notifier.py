@@ -5,11 +5,6 @@ from __future__ import annotations
 import asyncio
 from weakref import WeakValueDictionary
 
-ID_CHARS = 32
-"""Characters of a job's id; other names are shorter."""
-
-_ENDED = "end of "
-
 
 class JobNotifier:
     """Wakes all current subscribers of a name. Call :meth:`subscribe` first, then read the job, then wait."""
@@ -34,10 +29,10 @@ class JobNotifier:
         if event is not None:
             event.set()
 
-    def job_ids(self) -> set[str]:
-        """Return the ids of all jobs that have subscribers."""
-        names = (name.removeprefix(_ENDED) for name in list(self._waiting))
-        return {name for name in names if len(name) == ID_CHARS}
+    def notify_end(self, job_id: str) -> None:
+        """Wake all subscribers of a job, also those that wait for its end alone."""
+        self.notify(job_id)
+        self.notify(ended(job_id))
 
     def close(self) -> None:
         """Wake all subscribers, because the service is stopping."""
@@ -48,7 +43,7 @@ class JobNotifier:
 
 def ended(job_id: str) -> str:
     """Return the name that is notified once a job has ended, for subscribers that do not need its progress."""
-    return f"{_ENDED}{job_id}"
+    return f"end of {job_id}"
 
 
 async def wait(event: asyncio.Event, seconds: float) -> bool:

@@ -58,7 +58,6 @@ PROBLEM_TYPES: dict[str, ProblemType] = {
     "too-many-uploads": ProblemType(429, "Too many simultaneous uploads", retryable=True),
     "disk-full": ProblemType(507, "The server has not enough disk space", retryable=True),
     "stopping": ProblemType(503, "The service is stopping", retryable=True),
-    "storage": ProblemType(503, "The storage of the jobs' files cannot be used", retryable=True),
     "database": ProblemType(503, "The job database cannot be used", retryable=True),
 }
 """All problem codes. The meaning of a code never changes."""
@@ -92,15 +91,7 @@ class Problem(BaseModel):
 
 
 class ProblemError(Exception):
-    """Error that the service answers with a problem document.
-
-    Args:
-        code: one of :data:`PROBLEM_TYPES`.
-        detail: one sentence for the user.
-        retry_after: seconds, sent as ``Retry-After``.
-        headers: sent with the answer.
-        errors: every invalid field, if there are several.
-    """
+    """Error that the service answers with a problem document: a code of :data:`PROBLEM_TYPES` and one sentence."""
 
     def __init__(
         self,
@@ -135,11 +126,6 @@ def problem(code: str, detail: str, *, errors: list[dict[str, Any]] | None = Non
 def unusable_database() -> ProblemError:
     """Return the problem of a failing database; its cause appears only in the log and in ``/readyz``."""
     return ProblemError("database", "the job database cannot be used for now; try again later", retry_after=5)
-
-
-def unusable_storage() -> ProblemError:
-    """Return the problem of a failing storage; its cause appears only in the log and in ``/readyz``."""
-    return ProblemError("storage", "the storage of files cannot be used for now; try again later", retry_after=5)
 
 
 def answer(error: ProblemError) -> JSONResponse:

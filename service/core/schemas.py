@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 import kissgs
 
-from .formats import DEFAULT, Format
+from .files import DEFAULT, Format
 from .models import NOTE_CHARS, State
 from .problems import Problem
 

@@ -8,9 +8,9 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 PREFIX = "KISSGS_"
@@ -46,42 +46,26 @@ class ServiceSettings(BaseSettings):
 
     host: str = Field("127.0.0.1", description="Address to listen on; 0.0.0.0 listens on all interfaces.")
     port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 chooses a free port.")
-    data_dir: Path = Field(Path("kissgs-data"), description="Folder of jobs and results; created if missing.")
-    database_url: str | None = Field(
-        None, description="SQLAlchemy URL of the job database; by default an SQLite file in the data folder."
-    )
-    storage: str | None = Field(
-        None,
-        validate_default=True,
-        description="s3://BUCKET/PREFIX for uploads and results, which several services with this setting and one "
-        "PostgreSQL database share; by default the data folder, of one service. The variables AWS_ACCESS_KEY_ID, "
-        "AWS_SECRET_ACCESS_KEY, AWS_REGION and AWS_ENDPOINT_URL apply.",
+    data_dir: Path = Field(
+        Path("kissgs-data"), description="Folder of jobs, results and their database; created if missing."
     )
     keys: Annotated[tuple[ApiKey, ...], NoDecode] = Field(
         (),
         description="Keys as owner:sha256 (created by `kissgs-serve key`); without keys, everyone may use the service.",
     )
     names: Annotated[tuple[str, ...], NoDecode] = Field(
-        (),
-        description="Accepted host names; by default localhost if the service listens there without keys, else all.",
+        (), description="Accepted host names; by default localhost if the service listens there without keys, else all."
     )
     cors_origins: Annotated[tuple[str, ...], NoDecode] = Field(
         (), description="Origins whose web pages may use the service (CORS); none by default."
     )
 
     max_upload_bytes: ByteSize = Field(ByteSize(2 << 30), gt=0, description="Maximum bytes of one upload.")
-    max_header_bytes: ByteSize = Field(
-        ByteSize(64 << 10), ge=1024, le=1 << 20, description="Maximum bytes of a .ply header."
-    )
     max_gaussians: int = Field(5_000_000, gt=0, le=20_000_000, description="Maximum number of Gaussians of one scene.")
     max_uploads: int = Field(
         16,
         gt=0,
         description="Maximum number of simultaneous uploads. One key (without keys, one address) has a quarter.",
-    )
-    upload_idle_seconds: Seconds = Field(30, description="Seconds without data after which an upload is aborted.")
-    upload_min_rate: ByteSize = Field(
-        ByteSize(32 << 10), description="Average bytes per second below which an upload is aborted."
     )
     max_queue: int = Field(100, gt=0, description="Maximum number of waiting jobs.")
     max_jobs_per_key: int = Field(20, gt=0, description="Maximum number of waiting and running jobs of one key owner.")
@@ -90,13 +74,10 @@ class ServiceSettings(BaseSettings):
     )
     min_free_bytes: ByteSize = Field(ByteSize(1 << 30), ge=0, description="Bytes that must stay free on the disk.")
 
-    runner: Literal["local", "ray"] = Field(
-        "local", description="Where jobs run: local, on this machine, or ray, on the nodes of a Ray cluster."
-    )
-    ray_address: str = Field(
-        "auto",
-        description="Address of the Ray cluster's head, HOST:PORT; auto takes that of this machine, and starts one if "
-        "there is none.",
+    runner: str = Field(
+        "local",
+        description="Where jobs run: local, on this machine; HOST:PORT of a Ray cluster's head, on its nodes; or ray, "
+        "on the cluster of this machine, which is started if there is none.",
     )
     workers: int = Field(
         1, gt=0, le=64, description="Number of jobs that run simultaneously, on all machines together."
@@ -111,34 +92,29 @@ class ServiceSettings(BaseSettings):
     job_memory: ByteSize = Field(
         ByteSize(8 << 30), ge=256 << 20, description="Maximum bytes of memory of one job (Linux only)."
     )
-    job_starts: int = Field(
-        3, ge=1, description="Maximum number of starts of a job, including restarts of the service."
-    )
 
     keep_seconds: Seconds = Field(86400, description="Seconds for which results are kept after a job has ended.")
-    keep_uploads: bool = Field(
-        True, description="Keep the uploaded .ply as long as the result, unless its space is needed."
-    )
-    sweep_seconds: Seconds = Field(30, description="Seconds between two removals of expired jobs.")
-    sync_seconds: Seconds = Field(
-        30, le=600, description="Seconds that POST /v1/compress waits for its job before it answers 202 or 409."
-    )
     drain_seconds: float = Field(20, ge=0, description="Seconds that a stopping service waits for running jobs.")
-    log_level: Annotated[str, Field(pattern="^(debug|info|warning|error)$")] = Field(
-        "info", description="Log level: debug, info, warning or error."
-    )
 
-    @field_validator("storage")
+    # What no operator needs to choose.
+    max_header_bytes: ClassVar[int] = 64 << 10
+    """Maximum bytes of a .ply header: one with all known properties has three thousand."""
+    upload_idle_seconds: ClassVar[float] = 30
+    """Seconds without data after which an upload is aborted: TCP recovers from a lost packet in fewer."""
+    upload_min_rate: ClassVar[int] = 32 << 10
+    """Average bytes per second below which an upload is aborted: slower clients would keep their slots for days."""
+    job_starts: ClassVar[int] = 3
+    """Maximum number of starts of a job, including restarts of the service: the job may be what ends it."""
+    sweep_seconds: ClassVar[float] = 30
+    """Seconds between two removals of expired jobs, which are kept for hours."""
+    sync_seconds: ClassVar[float] = 30
+    """Seconds that POST /v1/compress waits for its job before it answers 202 or 409: many proxies give up after 60."""
+
+    @field_validator("runner")
     @classmethod
-    def _check_storage(cls, value: str | None, info: ValidationInfo) -> str | None:
-        if value is None:
-            return None
-        if not re.fullmatch(r"s3://[A-Za-z0-9][A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*/?", value):
-            raise ValueError(
-                "it is not s3://BUCKET or s3://BUCKET/PREFIX, of letters, digits, dots, dashes and underscores"
-            )
-        if not str(info.data.get("database_url") or "").startswith("postgres"):
-            raise ValueError("a storage that replicas share needs PostgreSQL; set KISSGS_DATABASE_URL, too")
+    def _check_runner(cls, value: str) -> str:
+        if value not in ("local", "ray") and ":" not in value:
+            raise ValueError("it is not local, ray, or HOST:PORT of a Ray cluster's head")
         return value
 
     @field_validator("keys", mode="before")
@@ -185,9 +161,9 @@ class ServiceSettings(BaseSettings):
         return name in LOOPBACK or bool(self.keys) or not self.is_private
 
     @property
-    def database(self) -> str:
-        """SQLAlchemy URL of the job database."""
-        return self.database_url or f"sqlite:///{(self.data_dir / 'jobs.sqlite').absolute()}"
+    def ray_address(self) -> str | None:
+        """Address of the Ray cluster that runs jobs, "auto" for that of this machine; None without one."""
+        return {"local": None, "ray": "auto"}.get(self.runner, self.runner)
 
     @classmethod
     def from_environment(cls) -> Self:

@@ -1,4 +1,4 @@
-"""The ASGI application: construction, conversion of errors to problem documents, start and stop."""
+"""The ASGI application: construction, errors as problem documents, start and stop, and its OpenAPI document."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 import logging
 from collections.abc import AsyncIterator
 from http import HTTPStatus
+from typing import Any
 
 from anyio.to_thread import run_sync
 from fastapi import FastAPI, Request
@@ -22,28 +23,38 @@ import kissgs
 from ..core.clock import Clock
 from ..core.metrics import Metrics
 from ..core.notifier import JobNotifier
-from ..core.problems import ProblemError, answer, field_errors, unusable_database
+from ..core.problems import Problem, ProblemError, answer, field_errors, unusable_database
+from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings, SettingsError
 from ..jobs.admission import Admission
-from ..jobs.completion import JobCompletion
 from ..jobs.container import ServiceContainer
 from ..jobs.decoding import Decoder
-from ..jobs.event_stream import EventStream
 from ..jobs.expiry import ExpiryTask
+from ..jobs.process import JobRunners
 from ..jobs.recovery import recover
-from ..jobs.replica_watch import ReplicaWatch
-from ..jobs.runner import JobRunner
-from ..jobs.status import QueueEstimator
-from ..jobs.worker import Worker
-from ..storage.database_health import error_text, is_full
-from ..storage.folder_binding import open_store
-from ..storage.job_files import FolderStorage
-from ..storage.s3_storage import S3Storage
+from ..jobs.status import EventStream, QueueEstimator
+from ..jobs.worker import JobCompletion, Worker
+from ..storage.database import error_text, is_full
+from ..storage.job_files import JobStorage
+from ..storage.job_records import open_store
 from .middleware import RequestMiddleware
-from .openapi import describe
-from .routes import facts, jobs, page, preview, results
+from .routes import facts, jobs, page, results
 
-ROUTERS = (jobs.router, results.router, facts.router, page.router, preview.router)
+DESCRIPTION = """\
+Upload a 3D Gaussian Splatting scene (`.ply`, `.sog`, `.spz`, `.splat`, `.ksplat`, `.glb`), follow the job, download a
+SOG-XT container of a few megabytes.
+
+    curl -F file=@scene.ply -F 'options={"preset": "balanced"}' localhost:8000/v1/jobs
+    curl 'localhost:8000/v1/jobs/ID?wait=30'
+    curl --fail -OJ localhost:8000/v1/jobs/ID/result
+
+Errors are RFC 9457 problem documents. `code` is stable, `detail` has the remedy, and `/v1/problems` lists all codes.
+"""
+
+_JOB_OPERATIONS = ("status", "events", "cancel", "delete", "result", "file", "decoded", "source", "report")
+"""Operations with the id of a job as a parameter."""
+
+ROUTERS = (jobs.router, results.router, facts.router, page.router)
 
 log = logging.getLogger("kissgs.service")
 
@@ -69,7 +80,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     for router in ROUTERS:
         app.include_router(router)
     app.mount("/static", page.RevalidatedFiles(directory=page.STATIC), name="static")
-    describe(app, keys_required=bool(settings.keys))
+    _describe(app, keys_required=bool(settings.keys))
     app.openapi()  # generated at the start, not during a request
     _answer_errors(app)
     if settings.cors_origins:
@@ -94,12 +105,9 @@ def _build_and_recover(settings: ServiceSettings) -> ServiceContainer:
     try:
         context = build(settings)
         try:
-            if context.storage.shared:
-                ReplicaWatch(context).recover()
-            else:
-                recover(context)
+            recover(context)
         except BaseException:
-            context.worker.runner.close()
+            context.worker.runners.close()
             context.store.close()
             context.storage.close()
             raise
@@ -108,23 +116,21 @@ def _build_and_recover(settings: ServiceSettings) -> ServiceContainer:
     except OSError as error:
         raise SettingsError(f"KISSGS_DATA_DIR: cannot use {settings.data_dir}: {str(error).lower()}") from error
     except SQLAlchemyError as error:
-        raise SettingsError(f"KISSGS_DATABASE_URL: the job database cannot be used: {error_text(error)}") from error
+        raise SettingsError(f"KISSGS_DATA_DIR: the job database cannot be used: {error_text(error)}") from error
     return context
 
 
 def build(settings: ServiceSettings) -> ServiceContainer:
     """Create all parts of a service without starting them."""
-    storage = S3Storage(settings.storage, settings.data_dir) if settings.storage else FolderStorage(settings.data_dir)
-    clock = Clock()
+    storage, clock = JobStorage(settings.data_dir), Clock()
     try:
-        runner = JobRunner.open(settings)  # first, because a replica that connects for long has no heartbeat meanwhile
+        store = open_store(storage, clock)
+        try:
+            runners = JobRunners.open(settings)
+        except BaseException:
+            store.close()
+            raise
     except BaseException:
-        storage.close()
-        raise
-    try:
-        store = open_store(settings, storage, clock)
-    except BaseException:
-        runner.close()
         storage.close()
         raise
     storage.remove_unfinished(store.ids())
@@ -133,10 +139,10 @@ def build(settings: ServiceSettings) -> ServiceContainer:
     notifier, metrics = JobNotifier(), Metrics()
     metrics.queue_limit.set(settings.max_queue)
     completion = JobCompletion(settings, store, storage, metrics, clock)
-    worker = Worker(settings, store, storage, notifier, metrics, completion, runner)
+    worker = Worker(settings, store, storage, notifier, metrics, completion, runners)
     queue = QueueEstimator(store, settings.workers)
     admission = Admission(settings, store, storage, queue)
-    decoder = Decoder(settings, store, storage, admission, runner)
+    decoder = Decoder(settings, store, storage, admission, runners)
     event_stream = EventStream(store, notifier, queue)
     return ServiceContainer(
         settings, store, storage, notifier, metrics, clock, worker, queue, admission, decoder, event_stream
@@ -148,9 +154,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     context: ServiceContainer = app.state.context
     context.worker.start()
     expiry = ExpiryTask(context, context.clock())
-    watch = ReplicaWatch(context)
-    running = (watch.heartbeat(), watch.follow()) if context.storage.shared else (expiry.heartbeat(),)
-    tasks = [asyncio.create_task(task) for task in (expiry.run(), *running)]
+    tasks = [asyncio.create_task(task) for task in (expiry.run(), expiry.heartbeat())]
     try:
         yield
     finally:
@@ -159,7 +163,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await run_sync(context.worker.runner.close)
+        await run_sync(context.worker.runners.close)
         context.store.close()
         context.storage.close()
 
@@ -208,3 +212,44 @@ def _allowed(path: str) -> str:
     routes = [route for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)]
     fitting = [route.methods or set() for route in routes if route.path_regex.match(path)]
     return ", ".join(sorted(set().union(*fitting))) or "GET, HEAD"
+
+
+def _describe(app: FastAPI, *, keys_required: bool) -> None:
+    """Complete the OpenAPI document of ``app``.
+
+    Adds the schemas of errors and of form fields, removes unused schemas, links responses that create a job to the
+    operations on it, and makes authorization optional unless keys are required.
+    """
+    app.description = DESCRIPTION
+    made = app.openapi
+
+    def completed() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            document = made()
+            schemas = document["components"]["schemas"]
+            for model in (Problem, JobOptions):
+                schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+                schemas.update(schema.pop("$defs", {}))
+                schemas[model.__name__] = schema
+            for unused in ("HTTPValidationError", "ValidationError"):
+                schemas.pop(unused, None)
+            for path in document["paths"].values():
+                for operation in path.values():
+                    _complete(operation, keys_required)
+            app.openapi_schema = document
+        return app.openapi_schema
+
+    app.openapi = completed  # type: ignore[method-assign]
+
+
+def _complete(operation: dict[str, Any], keys_required: bool) -> None:
+    if "security" in operation and not keys_required:
+        operation["security"].append({})
+    for parameter in operation.get("parameters", []):  # an absent parameter is not null
+        choices = [choice for choice in parameter["schema"].pop("anyOf", []) if choice != {"type": "null"}]
+        parameter["schema"] |= choices[0] if choices else {}
+    made = operation["responses"].get("202")
+    if made is not None:
+        for name in _JOB_OPERATIONS:
+            parameters = {"id": "$response.body#/id", **({"name": "meta.json"} if name == "file" else {})}
+            made.setdefault("links", {})[name] = {"operationId": name, "parameters": parameters}

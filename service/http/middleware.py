@@ -35,13 +35,7 @@ METHODS = ("GET", "HEAD", "POST", "DELETE", "OPTIONS", "PUT", "PATCH")
 
 
 class RequestMiddleware:
-    """ASGI middleware around the application.
-
-    Args:
-        app: the application.
-        metrics: counters of requests, labelled with the route's template, never with client input.
-        settings: accepted host names and origins.
-    """
+    """ASGI middleware around the application; metrics have the template of a route as a label, never client input."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics, settings: ServiceSettings) -> None:
         self._app, self._metrics, self._settings = app, metrics, settings

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import ipaddress
 import json
@@ -13,21 +12,18 @@ from dataclasses import dataclass
 
 from anyio.to_thread import run_sync
 from pydantic import ValidationError
-from sqlalchemy.exc import SQLAlchemyError
 from starlette.requests import Request
 
-from ..core.disk_estimates import checkpoint_bytes
+from ..core.files import checkpoint_bytes
 from ..core.models import Job
 from ..core.presets import can_train
-from ..core.problems import ProblemError, field_errors, unusable_database, unusable_storage
+from ..core.problems import ProblemError, field_errors, unusable_database
 from ..core.schemas import JobOptions
 from ..jobs.admission import FULL_SECONDS
 from ..jobs.container import ServiceContainer
 from ..jobs.worker import QUEUE
 from ..storage.job_records import LimitExceeded
-from ..storage.object_store import ObjectStoreError
-from .multipart import PartBegin, PartData, parts
-from .uploads import Received, Spool, scene_name, timed
+from .uploads import PartBegin, PartData, Received, Spool, parts, scene_name, timed
 
 RAW_TYPES = ("", "application/octet-stream", "application/ply", "application/x-ply", "model/ply")
 FORM_TYPE = "multipart/form-data"
@@ -74,9 +70,6 @@ async def submit(
     if health_problem := await run_sync(context.store.health_problem):
         log.error("a submission was refused: the job database cannot be used: %s", health_problem)
         raise unusable_database()
-    if context.storage.shared and (storage_problem := await run_sync(context.storage.health_problem)):
-        log.error("a submission was refused: %s", storage_problem)
-        raise unusable_storage()
     known = await run_sync(context.store.by_idempotency_key, owner, key) if key is not None else None
     if known is None:
         await run_sync(context.admission.check, owner)
@@ -260,34 +253,16 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
         idempotency_key=submission.key,
     )
     try:
-        context.store.take_claim(job.id)
         context.storage.adopt(received.path, job.id, received.file_name)
         return context.admission.add(job), True
-    except LimitExceeded:  # a concurrent request with the same key was faster
-        _withdraw(context, job.id)
-        known = _known(context, submission, owner)
-        if known is None:
-            raise
-        return known, False
-    except ObjectStoreError as error:
-        _withdraw(context, job.id)
-        log.error("a submission was refused: %s", error)
-        raise unusable_storage() from error
-    except OSError as error:
-        _withdraw(context, job.id)
-        reason = (error.strerror or str(error)).lower()
-        text = f"the upload cannot be stored: {reason}; try again later"
-        raise ProblemError("disk-full", text, retry_after=FULL_SECONDS) from error
-    except BaseException:
-        _withdraw(context, job.id)
+    except BaseException as error:
+        context.storage.remove_job(job.id)
+        if isinstance(error, LimitExceeded) and (known := _known(context, submission, owner)) is not None:
+            return known, False  # a concurrent request with the same key was faster
+        if isinstance(error, OSError):
+            text = f"the upload cannot be stored: {(error.strerror or str(error)).lower()}; try again later"
+            raise ProblemError("disk-full", text, retry_after=FULL_SECONDS) from error
         raise
-
-
-def _withdraw(context: ServiceContainer, job_id: str) -> None:
-    """Remove the files of a job that was not added; if that fails, others do it once this replica has ended."""
-    if context.storage.remove_job(job_id):
-        with contextlib.suppress(SQLAlchemyError):
-            context.store.drop_claim(job_id)
 
 
 def _known(context: ServiceContainer, submission: Submission, owner: str) -> Job | None:

@@ -13,8 +13,8 @@ from typing import NoReturn
 from ..core.models import Job
 from ..core.problems import ProblemError
 from ..core.settings import ServiceSettings
+from ..storage.job_files import JobStorage
 from ..storage.job_records import LimitExceeded, Store
-from ..storage.job_storage import JobStorage
 from .status import QueueEstimator
 
 BUSY_SECONDS = 5.0
@@ -57,21 +57,14 @@ class Admission:
         """Queue a job.
 
         Raises:
-            ProblemError: ``queue-full``, ``too-many-jobs`` or ``disk-full``.
+            ProblemError: ``queue-full`` or ``too-many-jobs``.
             LimitExceeded: its idempotency key is in use.
         """
         try:
-            with self._lock:  # counting and adding is one step with every database
-                limits = self.settings
-                most = (
-                    limits.max_disk_bytes if self.storage.shared else None
-                )  # replicas do not see each other's uploads
-                return self.store.add(job, max_queue=limits.max_queue, max_owner=limits.max_jobs_per_key, max_disk=most)
+            return self.store.add(job, max_queue=self.settings.max_queue, max_owner=self.settings.max_jobs_per_key)
         except LimitExceeded as refused:
             if refused.limit == "key":
                 raise
-            if refused.limit == "disk":
-                raise self._full(job.disk_bytes) from refused
             raise self._refused(refused.limit) from refused
 
     @property
@@ -151,8 +144,9 @@ class Admission:
     def _fits(self, size: int, reclaimable: int = 0) -> bool:
         taken = self.store.disk_bytes() + self._reserved - reclaimable
         free = self.storage.free_bytes() - (self._reserved - self._written)
-        free += 0 if self.storage.shared else reclaimable
-        return taken + size <= self.settings.max_disk_bytes and free - size >= self.settings.min_free_bytes
+        return (
+            taken + size <= self.settings.max_disk_bytes and free + reclaimable - size >= self.settings.min_free_bytes
+        )
 
     def _full(self, size: int) -> ProblemError:
         text = (

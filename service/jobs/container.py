@@ -18,12 +18,11 @@ from ..core.notifier import JobNotifier
 from ..core.problems import ProblemError
 from ..core.schemas import Health
 from ..core.settings import ServiceSettings
+from ..storage.job_files import JobStorage
 from ..storage.job_records import Store
-from ..storage.job_storage import JobStorage
 from .admission import Admission
 from .decoding import Decoder
-from .event_stream import EventStream
-from .status import QueueEstimator
+from .status import EventStream, QueueEstimator
 from .worker import Worker
 
 READY_SECONDS = 2.0

@@ -9,16 +9,14 @@ from typing import Any
 
 from anyio.to_thread import run_sync
 
-from ..core.disk_estimates import BYTES_PER_GAUSSIAN
-from ..core.formats import container_file
+from ..core.files import BYTES_PER_GAUSSIAN, container_file
 from ..core.models import Job, State
 from ..core.problems import PROBLEM_TYPES, ProblemError
 from ..core.settings import ServiceSettings
+from ..storage.job_files import RESULT, JobStorage
 from ..storage.job_records import Store
-from ..storage.job_storage import DECODED, JobStorage, StoredObject
 from .admission import Admission
-from .completion import result_folder
-from .runner import DECODE, JobProcess, JobRunner
+from .process import DECODE, JobProcess, JobRunners
 
 
 @dataclass(frozen=True)
@@ -29,12 +27,12 @@ class Decoder:
     store: Store
     storage: JobStorage
     admission: Admission
-    runner: JobRunner
+    runners: JobRunners
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     _processes: dict[str, JobProcess] = field(default_factory=dict)
 
-    async def scene(self, job: Job) -> tuple[StoredObject, dict[str, Any]]:
-        """Return the decoded ``.ply`` of a succeeded job, and its size and SHA-256 by name.
+    async def scene(self, job: Job) -> tuple[Path, dict[str, Any]]:
+        """Return the path of the decoded ``.ply`` of a succeeded job, and its size and SHA-256 by name.
 
         Raises:
             ProblemError: the disk is full, the decoding failed, or the job was deleted or has expired meanwhile.
@@ -48,7 +46,7 @@ class Decoder:
                         await self._decode(job)
                         described = await run_sync(self.storage.read_decoded, job.id)
             if described is not None:
-                return await run_sync(self.storage.open, job.id, DECODED), described
+                return self.storage.decoded(job.id), described
         except OSError as error:
             raise _gone() from error
         raise _gone()
@@ -69,21 +67,12 @@ class Decoder:
         finally:
             if work is not None:
                 await run_sync(self.storage.discard, work)
-                if self.storage.shared:
-                    await run_sync(self.storage.remove_work, job.id)
             await run_sync(self.admission.release, size, 0)
 
     def _keep(self, work: Path, job: Job) -> None:
-        self.store.take_claim(job.id)
         self.storage.keep_decoded(work, job.id)
-        current = self.store.get(job.id)
-        if current is None or current.state != State.SUCCEEDED:  # another replica has removed the files before
-            self.storage.remove_job(job.id)
-            self.store.drop_claim(job.id)
-            raise _gone()
         reclaimable = self.storage.reclaimable_bytes(job.id)
         self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id), reclaimable_bytes=reclaimable)
-        self.store.drop_claim(job.id)
 
     def stop(self, job_id: str) -> None:
         """Kill the decoding of a job, if it is running."""
@@ -95,25 +84,18 @@ class Decoder:
         async def ignore(stage: str, fraction: float, note: str) -> None:
             pass
 
-        name = f"{result_folder(job)}/{container_file(job.options).name}"
-        source = await run_sync(self.storage.fetch, job.id, name, work)
-        task = {
-            "function": DECODE,
-            "source": str(source),
-            "work": str(work),
-        }
-        process = self._processes[job.id] = self.runner.process()
+        source = f"{RESULT}/{container_file(job.options).name}"
+        task = {"function": DECODE, "folder": str(work.parent), "files": [source], "source": source, "work": work.name}
+        process = self._processes[job.id] = JobProcess(self.runners)
         try:
             outcome = await process.run(task, ignore)
         finally:
             del self._processes[job.id]
-        if outcome.kind == "stopped":
+        if outcome.kind == "cancelled":
             raise _gone()
         if outcome.kind != "done":
-            code = outcome.data.get("code", "crashed")
-            raise ProblemError(
-                code if code in PROBLEM_TYPES else "internal", outcome.data.get("detail", "it was ended")
-            )
+            code = outcome.code if outcome.code in PROBLEM_TYPES else "internal"
+            raise ProblemError(code, outcome.message or "it was ended")
 
 
 def _gone() -> ProblemError:

@@ -1,4 +1,4 @@
-"""Expiry: removal of ended jobs after their time, and the heartbeat of the database lease."""
+"""Expiry: removal of ended jobs after their time, and the record of the time."""
 
 from __future__ import annotations
 
@@ -11,29 +11,21 @@ from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
 from ..core.models import ENDED, State
-from ..core.notifier import ended
-from ..storage.database_lease import HEARTBEAT_SECONDS
 from .container import ServiceContainer
 
 log = logging.getLogger("kissgs.service")
 
 
+HEARTBEAT_SECONDS = 5.0
+"""Seconds between records of the time, with the last of which the clock of the next start begins."""
+
 GRACE_SECONDS = 3600.0
 """Seconds after the start in which nothing expires, in case the machine's clock was wrong at the start."""
 
 
-RETRY_SECONDS = 600.0
-"""Seconds after which files that could not be removed are removed again."""
-
-
 @dataclass(frozen=True, slots=True)
 class ExpiryTask:
-    """Background task that removes expired jobs every ``settings.sweep_seconds``.
-
-    Attributes:
-        context: the parts of the service.
-        began: time of the service's start, seconds since 1970.
-    """
+    """Background task that removes expired jobs; the service ``began`` at that time, seconds since 1970."""
 
     context: ServiceContainer
     began: float
@@ -44,23 +36,21 @@ class ExpiryTask:
             await asyncio.sleep(self.context.settings.sweep_seconds)
             try:
                 for job_id in await run_sync(self.sweep):
-                    self.context.notifier.notify(job_id)
-                    self.context.notifier.notify(ended(job_id))
+                    self.context.notifier.notify_end(job_id)
             except Exception:
                 log.exception("expired jobs could not be removed; trying again")
 
     async def heartbeat(self) -> None:
-        """Renew the database lease periodically until cancelled."""
+        """Record the time periodically until cancelled."""
         while True:
             await asyncio.sleep(HEARTBEAT_SECONDS)
             with contextlib.suppress(SQLAlchemyError):  # /readyz and the worker report it
                 await run_sync(self.context.store.heartbeat)
 
     def sweep(self) -> list[str]:
-        """Expire ended jobs and remove their files after ``keep_seconds``; delete their rows after as long again.
+        """Expire ended jobs and remove their files after ``keep_seconds``, and return their ids.
 
-        Returns:
-            Ids of the jobs that have expired.
+        Their rows are deleted after as long again.
         """
         store, storage, now = self.context.store, self.context.storage, self.context.clock()
         completion, keep, expired = self.context.worker.completion, self.context.settings.keep_seconds, []
@@ -73,10 +63,8 @@ class ExpiryTask:
                 expired.append(job_id)
         while due := store.due([State.EXPIRED], now):
             for number, job_id in due:
-                if storage.remove_job(job_id):
-                    completion.forget(number)
-                else:
-                    store.update(number, expires_at=now + RETRY_SECONDS)
+                storage.remove_job(job_id)
+                completion.forget(number)
         if expired:
             log.info("%d jobs expired", len(expired))
         return expired

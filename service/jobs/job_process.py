@@ -1,7 +1,7 @@
 """Work of jobs: compression and decoding, run by :mod:`kissgs.runners` in a process of their own.
 
-Tasks name their files by path, and results are written below the folder ``work``. This module reads and writes all
-files of jobs that the service's own process does not.
+Tasks name their files relative to the folder of the job, the current one of the process, and results are written below
+its folder ``work``. This module reads and writes all files of jobs that the service's own process does not.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
 
     result = _run_compression(task, progress)
     folder = Path(task["work"]) / "result"
-    folder.mkdir()
+    folder.mkdir(parents=True)
     container = folder / task["container"]
     result.save(container)
     result.save(folder / "files")
@@ -74,9 +74,7 @@ def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed
     """
     import kissgs
 
-    checkpoint = None
-    if task["checkpoint"] is not None:  # relative, because the report may name it to the client
-        checkpoint = Path(os.path.relpath(task["checkpoint"], task["work"]))
+    checkpoint = None if task["checkpoint"] is None else Path(task["checkpoint"])
     while True:
         kept = [] if checkpoint is None else sorted(checkpoint.parent.glob(f"{checkpoint.stem}*{checkpoint.suffix}"))
         try:
@@ -117,7 +115,7 @@ def decode(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
 
 def without_paths(message: str, task: Task) -> str:
     """Return a message for clients, which does not say where the files of a task lie."""
-    return message.replace(str(task["source"]), "the scene").replace(str(task["work"]), "").replace(" /", " ")
+    return message.replace(task["source"], "the scene").replace(f"{task['work']}/", "")
 
 
 def _size_and_hash(path: Path) -> dict[str, Any]:

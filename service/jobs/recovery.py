@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import logging
 
-from ..core.formats import container_file
+from ..core.files import container_file
 from ..core.models import Job, State
-from ..storage.job_storage import RESULT, JobStorage
+from ..storage.job_files import JobStorage
 from .container import ServiceContainer
 
 log = logging.getLogger("kissgs.service")
@@ -23,19 +23,19 @@ def recover(context: ServiceContainer) -> None:
     known, failed = store.ids(), store.ids(State.FAILED)
     for job_id in sorted(storage.job_ids() & (known - store.ids(State.QUEUED, State.RUNNING, State.SUCCEEDED))):
         _finish_removal(storage, job_id, failed=job_id in failed)
-    storage.set_aside_unknown(store.ids)
+    storage.set_aside_unknown(store.ids())
 
 
 def _recover_job(context: ServiceContainer, job: Job) -> None:
     store, storage, completion = context.store, context.storage, context.worker.completion
-    summary = storage.read_result(job.id, RESULT, container_file(job.options).name)
-    if summary is None and storage.result_folders(job.id):
+    summary = storage.read_result(job.id, container_file(job.options).name)
+    if summary is None and storage.result(job.id).exists():
         log.warning("job %s: its result is damaged", job.id)
     if summary is not None:
         if job.state == State.QUEUED:
             log.warning("job %s: its result exists, although it is queued in the database", job.id)
             store.move(job.number, State.RUNNING)
-        completion.succeed(job, summary, RESULT)
+        completion.succeed(job, summary)
     elif storage.upload_name(job.id) is None:
         completion.lose(job)
     elif job.state == State.RUNNING and job.starts >= context.settings.job_starts:
@@ -47,7 +47,7 @@ def _recover_job(context: ServiceContainer, job: Job) -> None:
 
 def _finish_removal(storage: JobStorage, job_id: str, *, failed: bool) -> None:
     """Remove the files of an ended job; move them to the orphaned folder if a failed job has a result."""
-    if failed and storage.result_folders(job_id):
+    if failed and storage.result(job_id).exists():
         storage.set_aside(job_id, "holds a result, although the job failed according to the database,")
     else:
         storage.remove_job(job_id)

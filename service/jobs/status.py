@@ -1,25 +1,30 @@
-"""Job status for clients, with estimates of waiting times."""
+"""Status of jobs for clients, with estimates of waiting times, and their events as a stream that can be resumed."""
 
 from __future__ import annotations
 
+import asyncio
+import heapq
+import json
 import statistics
 import threading
+from collections import deque
+from collections.abc import AsyncIterator, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+from weakref import WeakValueDictionary
+
+from anyio.to_thread import run_sync
 
 from ..core.clock import as_datetime
-from ..core.models import ACTIVE, Job, State
+from ..core.models import ACTIVE, Event, Job, State
+from ..core.notifier import JobNotifier, wait
 from ..core.presets import can_train, limited_seconds, usual_seconds
 from ..core.schemas import FINETUNED, TIMED, Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
-from ..storage.job_queries import in_turn
 from ..storage.job_records import Store
 
 
 class QueueEstimator:
-    """Estimates of positions and times, from one reading of the queue for each change of it.
-
-    Args:
-        store: job store.
-        workers: maximum number of running jobs of each replica.
-    """
+    """Estimates of positions and times, from one reading of the queue for each change of it."""
 
     def __init__(self, store: Store, workers: int) -> None:
         self._store, self._workers = store, workers
@@ -31,7 +36,7 @@ class QueueEstimator:
         """Return the estimates at this moment."""
         with self._lock:
             changes = self._store.changes  # first, so that a change during the reading is read the next time
-            if self._latest is None or changes is None or changes != self._changes:
+            if self._latest is None or changes != self._changes:
                 self._latest, self._changes = _Queue(self._store, self._workers), changes
             return QueueEstimates(self._latest, self._store.clock())
 
@@ -42,13 +47,13 @@ class _Queue:
     def __init__(self, store: Store, workers: int) -> None:
         self._store = store
         self._rates: dict[tuple[str, bool], float | None] = {}
-        self.workers = workers * store.count_replicas()
+        self.workers = workers
         active, turns = store.active(), store.turns
         self.running = [(self.total(job), job.started_at) for job in active if job.state == State.RUNNING]
         self.positions: dict[int, int] = {}
         self.seconds_before: dict[int, float] = {}
         before = 0.0
-        for job in in_turn((job for job in active if job.state == State.QUEUED), turns):
+        for job in _in_turn((job for job in active if job.state == State.QUEUED), turns):
             self.positions[job.number] = 1 + len(self.positions)
             self.seconds_before[job.number] = before
             before += _remaining(self.total(job), 0.0)
@@ -178,3 +183,97 @@ def _links(job: Job) -> Links:
         report=f"{here}/report" if done else None,
         preview=f"/preview/{job.id}" if done else None,
     )
+
+
+KEEPALIVE_SECONDS = 15.0
+"""Seconds without an event after which a comment is sent, so that the connection is not taken for dead."""
+
+RETRY_MILLISECONDS = 1000
+"""Delay after which a browser reconnects, milliseconds."""
+
+
+class _Feed:
+    """Events of one job, read from the database once for all its clients."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+        self.job: Job | None = None
+        self.lock = asyncio.Lock()
+        self.changed = asyncio.Event()
+        self.changed.set()  # nothing has been read
+
+
+@dataclass(frozen=True)
+class EventStream:
+    """Streams of job events to any number of clients."""
+
+    store: Store
+    notifier: JobNotifier
+    queue: QueueEstimator
+    _feeds: WeakValueDictionary[str, _Feed] = field(default_factory=WeakValueDictionary)
+
+    async def stream(self, job: Job, after: int) -> AsyncIterator[str]:
+        """Yield the events with a ``seq`` above ``after``, until the job ends or is deleted, or the service stops."""
+        yield f"retry: {RETRY_MILLISECONDS}\n\n"
+        feed = self._feeds.get(job.id)
+        if feed is None:
+            feed = self._feeds[job.id] = _Feed()
+        while True:
+            await self._refresh(feed, job)
+            current = feed.job
+            for event in feed.events[after:]:  # ids count from 1 without gaps
+                after = event.seq
+                yield await self._format(event, current)
+            if (
+                current is None
+                or (after >= current.last_event and current.state not in ACTIVE)
+                or self.notifier.closing
+            ):
+                return
+            if not await wait(feed.changed, KEEPALIVE_SECONDS):
+                yield ": keep-alive\n\n"
+
+    async def _refresh(self, feed: _Feed, job: Job) -> None:
+        """Read new events, unless another client's request has just done so."""
+        async with feed.lock:
+            if feed.changed.is_set():
+                changed = self.notifier.subscribe(job.id)  # before reading, so that no later event is missed
+                feed.job, new = await run_sync(self._read, job, len(feed.events))
+                feed.events += new
+                feed.changed = changed
+
+    def _read(self, job: Job, after: int) -> tuple[Job | None, list[Event]]:
+        current = self.store.get(job.id)
+        return current, self.store.events(job.number, after)
+
+    def _status(self, job: Job) -> dict[str, Any]:
+        return job_status(job, self.queue.current()).model_dump(mode="json", exclude_none=True)
+
+    async def _format(self, event: Event, current: Job | None) -> str:
+        data = event.data
+        if (
+            event.kind == "state" and current is not None and event.seq == current.last_event
+        ):  # the full status is sent with the latest event only
+            data = {**data, "job": await run_sync(self._status, current)}
+        return f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"
+
+
+def _in_turn(queued: Iterable[Job], turns: Mapping[str, int]) -> list[Job]:
+    """Return queued jobs in the order in which :meth:`Store.claim` starts them.
+
+    The owners take turns, first the one whose ``turns``, the number of its last start, is the lowest; of one owner, the
+    oldest job is first.
+    """
+    waiting: dict[str, deque[Job]] = {}
+    for job in sorted(queued, key=lambda job: job.number):
+        waiting.setdefault(job.owner, deque()).append(job)
+    heads = [(turns.get(owner, 0), jobs[0].number, owner) for owner, jobs in waiting.items()]
+    heapq.heapify(heads)
+    order: list[Job] = []
+    latest = max(turns.values(), default=0)
+    while heads:
+        _, _, owner = heapq.heappop(heads)
+        order.append(waiting[owner].popleft())
+        if waiting[owner]:
+            heapq.heappush(heads, (latest + len(order), waiting[owner][0].number, owner))
+    return order

@@ -1,33 +1,203 @@
-"""Worker: runs queued jobs in order of submission, each in a job process, and sees that their ends are recorded."""
+"""Worker: runs queued jobs in order of submission, each in a job process, and records how they end."""
 
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
 
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
+from kissgs.runners import Outcome
+
+from ..core.clock import Clock
+from ..core.files import container_file
 from ..core.metrics import Metrics
-from ..core.models import Job, State
-from ..core.notifier import JobNotifier, ended, wait
+from ..core.models import ACTIVE, Job, State
+from ..core.notifier import JobNotifier, wait
+from ..core.problems import PROBLEM_TYPES, problem
+from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings
-from ..storage.database_health import error_text
+from ..storage.database import error_text, is_full
+from ..storage.job_files import JobStorage
 from ..storage.job_records import Store
-from ..storage.job_storage import JobStorage
-from .completion import LOST, JobCompletion
-from .outcomes import INTERNAL_ERROR, OutcomeRecorder, outcome_of
-from .runner import JobProcess, JobRunner, Outcome
-from .workplace import Workplace, workplace
+from .process import COMPRESS, POSTPONED, JobProcess, JobRunners, postponed
+
+T = TypeVar("T")
 
 log = logging.getLogger("kissgs.service")
 
+
+_TRANSIENT_ERRNOS = (errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT)
+"""Errors from a temporary lack of resources, not caused by the job."""
+
+_PERMANENT_ERRNOS = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY, errno.ELOOP)
+"""Errors from unexpected content of a job's folder, which do not go away."""
+
+INTERNAL_ERROR = Outcome(
+    "error",
+    code="internal",
+    message="the job could not be run because of an error in the service; please report it with the scene",
+)
+"""Outcome of a bug."""
+
+LOST = "the upload is no longer on the server's disk; submit the scene again"
+
+
+@dataclass(frozen=True, slots=True)
+class JobCompletion:
+    """Recorder of the end of jobs; methods block on the disk and the database."""
+
+    settings: ServiceSettings
+    store: Store
+    storage: JobStorage
+    metrics: Metrics
+    clock: Clock
+
+    def record(self, job: Job, outcome: Outcome, work: Path | None, stopping: bool) -> None:
+        """Record how a start of a job ended, and whether it is started again; the call can be repeated if it fails.
+
+        ``job`` is as it was started, ``work`` the folder of this start, if it has got one.
+
+        Raises:
+            OSError: the files cannot be stored or removed.
+            SQLAlchemyError: the database fails.
+        """
+        self.store.check()  # else files would change without a record in the database
+        self.storage.check()
+        current = self.store.get(job.id)
+        if current is None or current.state not in ACTIVE:  # cancelled or deleted meanwhile, or recorded already
+            self.storage.remove_work(job.id)
+            if current is not None and current.state == State.FAILED:
+                self.storage.remove_job(job.id)
+            return
+        if current.state == State.QUEUED or current.started_at != job.started_at:  # recorded already: started again
+            if work is not None:
+                self.storage.discard(work)
+            return
+        if outcome.kind == "done" and work is not None:
+            self.storage.keep_result(job.id, work)
+        self.storage.remove_work(job.id)  # before requeueing, because another worker may then run the job
+        again = job.starts < self.settings.job_starts
+        match outcome.kind:
+            case "done":
+                self.succeed(job, outcome.result)
+            case "cancelled":
+                self._requeue(job)
+            case "lost" if outcome.code in POSTPONED:
+                self._requeue(job)
+            case "crashed" if stopping:  # a supervisor may also have sent the signal to job processes
+                self._requeue(job)
+            case "crashed" if job.crashes == 0 and again:
+                log.warning("job %s is started again", job.id)
+                self.metrics.restarts.inc()
+                self.store.move(job.number, State.QUEUED, crashes=1)
+            case "lost" if stopping or again:
+                log.warning("job %s is started again elsewhere", job.id)
+                self.metrics.restarts.inc()
+                self.store.move(job.number, State.QUEUED)
+            case "error" | "crashed" | "lost":
+                self.fail(job, outcome.code, outcome.message)
+
+    def _requeue(self, job: Job) -> None:
+        """Return a job to the queue without counting its start."""
+        self.store.move(job.number, State.QUEUED, starts=job.starts - 1)
+
+    def is_permanent(self, error: Exception) -> bool:
+        """Return whether a retry would always fail, because of this job's folder alone."""
+        return isinstance(error, OSError) and error.errno in _PERMANENT_ERRNOS and self.storage.health_problem() is None
+
+    def succeed(self, job: Job, summary: dict[str, Any]) -> None:
+        """Record success of a job whose result is complete."""
+        self.storage.discard_checkpoints(job.id)
+        kept = self.storage.upload_name(job.id) is not None
+        values = {
+            "result": summary,
+            "upload_kept": kept,
+            "reclaimable_bytes": job.upload_bytes if kept else 0,
+            "disk_bytes": self.storage.job_bytes(job.id),
+        }
+        if not self.end(job, State.SUCCEEDED, **values):
+            current = self.store.get(job.id)
+            if current is None or current.state != State.SUCCEEDED:  # cancelled at the same moment
+                self.storage.remove_job(job.id)
+
+    def fail(self, job: Job, code: str, detail: str) -> None:
+        """Record failure of a job and remove its files."""
+        if self._failed(job, code, detail):
+            self.storage.remove_job(job.id)
+
+    def lose(self, job: Job) -> None:
+        """Record failure of a job whose upload is missing; other files move to the orphaned folder."""
+        if self._failed(job, "internal", LOST):
+            self.storage.set_aside(job.id, "has lost its upload")
+
+    def end(self, job: Job, state: State, **values: Any) -> bool:  # noqa: ANN401
+        """Set a job's final state and the columns ``values``; return False if it has already ended."""
+        moved = self.store.move(job.number, state, expires_at=self.clock() + self.settings.keep_seconds, **values)
+        current = self.store.get(job.id)
+        if moved and current is not None:
+            seconds = None if job.started_at is None else self.clock() - job.started_at
+            self.metrics.job_ended(current, state, seconds)
+            when = "before it was started" if seconds is None else f"after {seconds:.1f} s"
+            log.info("job %s %s %s", job.id, state, when)
+        return moved
+
+    def cancel(self, job: Job) -> bool:
+        """Record that a job was cancelled, also on a full disk; return False if it has already ended."""
+        return self._despite_full_disk(lambda: self.end(job, State.CANCELLED, upload_kept=False, disk_bytes=0))
+
+    def expire(self, number: int, job_id: str, **values: Any) -> None:  # noqa: ANN401
+        """Record that an ended job has expired, with the columns ``values``, and remove its files.
+
+        On a full disk the files go first, because the record needs space.
+        """
+        gone: dict[str, Any] = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0, **values}
+        try:
+            self.store.move(number, State.EXPIRED, **gone)
+        except SQLAlchemyError as error:
+            if not is_full(error):
+                raise
+            self.storage.remove_job(job_id)
+            self._despite_full_disk(lambda: self.store.move(number, State.EXPIRED, **gone))
+        self.storage.remove_job(job_id)
+
+    def forget(self, number: int) -> None:
+        """Remove the record of a job, also on a full disk."""
+        self._despite_full_disk(lambda: self.store.forget(number))
+        self.storage.keep_reserve()
+
+    def _despite_full_disk(self, change: Callable[[], T]) -> T:
+        """Make a change of the database, if necessary with the reserve of disk space."""
+        try:
+            return change()
+        except SQLAlchemyError as error:
+            if not (is_full(error) and self.storage.free_reserve()):
+                raise
+        return change()
+
+    def _failed(self, job: Job, code: str, detail: str) -> bool:
+        document = problem(code if code in PROBLEM_TYPES else "internal", detail).model_dump(exclude_none=True)
+        return self.end(job, State.FAILED, problem=document, upload_kept=False, disk_bytes=0)
+
+
+def outcome_of(error: Exception) -> Outcome:
+    """Return the outcome of a job whose process could not be run, or whose result could not be kept."""
+    if isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS:
+        return postponed()
+    if isinstance(error, OSError):
+        reason = (error.strerror or str(error)).lower()
+        return Outcome("error", code="output", message=f"the job's files cannot be written: {reason}; try again later")
+    return INTERNAL_ERROR
+
+
 IDLE_SECONDS = 1.0
 """Seconds after which an idle worker reads the queue even without a notification."""
-
-CANCEL_SECONDS, CANCEL_POLL_SECONDS = 10.0, 0.2
-"""Maximum wait for another replica to end a cancelled job, and the interval between looks, seconds."""
 
 LOST_SECONDS, MOST_LOST_SECONDS = 5.0, 60.0
 """Pause before a job is started again whose first start was lost, which doubles with every start; the longest one. On a
@@ -39,8 +209,8 @@ MOST_POSTPONED_SECONDS = 8.0
 REST_POLL_SECONDS = 0.1
 """Interval between looks whether a pause must end, seconds."""
 
-CHECKPOINT_SECONDS = 30.0
-"""Minimum seconds between two looks for new checkpoints that other replicas may need."""
+CHECKPOINT = "checkpoint.npz"
+"""Name of a job's checkpoint; that of fine-tuning after compaction has the same beginning."""
 
 QUEUE = "queue"
 """Name that is notified when a job is added to the queue."""
@@ -56,20 +226,15 @@ class Worker:
     notifier: JobNotifier
     metrics: Metrics
     completion: JobCompletion
-    runner: JobRunner
+    runners: JobRunners
     draining: bool = False
     _processes: dict[str, JobProcess] = field(default_factory=dict)
     _loops: list[asyncio.Task[None]] = field(default_factory=list)
     _last_poll: dict[int, float] = field(default_factory=dict)
     _logged: set[str] = field(default_factory=set)
-    _busy: int = 0
-    _abandoning: bool = False
     _waits: bool = False
     _postponed: int = 0
     _postponed_reason: str = ""
-
-    def __post_init__(self) -> None:
-        self._recorder = OutcomeRecorder(self.settings, self.store, self.storage, self.metrics, self.completion)
 
     def start(self) -> None:
         """Start to run jobs."""
@@ -85,7 +250,7 @@ class Worker:
                 return f"worker {number} has ended"
             if now - self._last_poll.get(number, now) > 10 * IDLE_SECONDS and not self._processes:
                 return f"worker {number} has not read the queue for {now - self._last_poll[number]:.0f} s"
-        return self.runner.health_problem()
+        return self.runners.health_problem()
 
     async def drain(self) -> None:
         """Start no more jobs, wait up to ``drain_seconds`` for running ones, and requeue those that need longer.
@@ -116,38 +281,8 @@ class Worker:
         if process is not None:
             process.kill()
             await process.ended.wait()
-        elif self.storage.shared:
-            await self._wait_for_other_replica(job.id)
         await run_sync(self.storage.remove_job, job.id)
-        self.notifier.notify(job.id)
-        self.notifier.notify(ended(job.id))
-
-    async def _wait_for_other_replica(self, job_id: str) -> None:
-        """Wait until the replica that runs a job has ended it; one that has died is not waited for."""
-        for _ in range(round(CANCEL_SECONDS / CANCEL_POLL_SECONDS)):
-            if not await run_sync(self.store.is_claimed, job_id):
-                return
-            await asyncio.sleep(CANCEL_POLL_SECONDS)
-
-    def running_ids(self) -> set[str]:
-        """Return the ids of all jobs with a process of this replica."""
-        return set(self._processes)
-
-    def kill(self, job_id: str) -> None:
-        """Kill the process of a job, if it is running."""
-        process = self._processes.get(job_id)
-        if process is not None:
-            process.kill()
-
-    async def abandon(self) -> None:
-        """End all jobs without recording it, because another replica has queued them again."""
-        self._abandoning = True
-        try:
-            while self._busy:
-                self.kill_running()
-                await asyncio.sleep(CANCEL_POLL_SECONDS)
-        finally:
-            self._abandoning = False
+        self.notifier.notify_end(job.id)
 
     # Running -------------------------------------------------------------------------------------------------------
 
@@ -167,29 +302,24 @@ class Worker:
             if job is None:
                 await wait(queued, IDLE_SECONDS)
             else:
-                self._busy += 1
-                try:
-                    await self._run(job)
-                finally:
-                    self._busy -= 1
+                await self._run(job)
 
     def _claim(self) -> Job | None:
         self.storage.check()  # else all queued jobs would fail, because their uploads cannot be read
-        if problem := self.runner.health_problem():
+        if problem := self.runners.health_problem():
             raise ConnectionError(problem)
         return self.store.claim()
 
     async def _run(self, job: Job) -> None:
-        process = self._processes[job.id] = self.runner.process()
+        process = self._processes[job.id] = JobProcess(self.runners)
         log.info("job %s starts: %d Gaussians, %s", job.id, job.gaussians, job.preset)
         self.metrics.busy.inc()
         if job.starts == 1 and job.started_at is not None:
             self.metrics.waited.observe(job.started_at - job.created_at)
         self.notifier.notify(job.id)
-        place = workplace(self.settings, self.storage, job)
         try:
-            outcome = await self._follow(job, process, place)
-            if outcome.kind == "lost" and job.starts < self.settings.job_starts:
+            outcome = await self._follow(job, process)
+            if outcome.kind == "lost" and outcome.code not in POSTPONED and job.starts < self.settings.job_starts:
                 await self._rest(min(MOST_LOST_SECONDS, LOST_SECONDS * 2 ** (job.starts - 1)), process)
         except Exception as error:
             log.exception("job %s: its process could not be run", job.id)
@@ -201,24 +331,25 @@ class Worker:
             self.metrics.busy.dec()
         storage_problem = await run_sync(self.storage.health_problem)
         if storage_problem and outcome.kind in ("error", "crashed", "lost"):
-            outcome = Outcome("postponed")  # not caused by the job
-        await self._finish(job, outcome, place)
+            outcome = postponed()  # not caused by the job
+        await self._finish(job, outcome, process.work)
 
     async def _rest(self, seconds: float, process: JobProcess | None = None) -> None:
         """Wait, but not while all jobs are being ended, or once the process of a job has been killed."""
         clock = asyncio.get_running_loop().time
         end = clock() + seconds
-        while clock() < end and not (self.draining or self._abandoning or (process is not None and process.killed)):
+        while clock() < end and not (self.draining or (process is not None and process.killed)):
             await asyncio.sleep(min(REST_POLL_SECONDS, seconds))
 
-    async def _follow(self, job: Job, process: JobProcess, place: Workplace) -> Outcome:
+    async def _follow(self, job: Job, process: JobProcess) -> Outcome:
         current = await run_sync(self.store.get, job.id)  # cancelled before its process was registered?
         if current is None or current.state != State.RUNNING:
-            return Outcome("stopped")
-        try:
-            task = await run_sync(place.task)
-        except FileNotFoundError:
-            return Outcome("error", {"code": "internal", "detail": LOST})
+            return Outcome("cancelled")
+        upload = await run_sync(self.storage.upload_name, job.id)
+        if upload is None:
+            return Outcome("error", code="internal", message=LOST)
+        process.work = await run_sync(self.storage.new_work, job.id)
+        task = await run_sync(self._task, job, upload, process.work)
 
         async def progress(stage: str, fraction: float, note: str) -> None:
             try:
@@ -227,39 +358,38 @@ class Worker:
                 self._log_once(f"job {job.id}: progress was not recorded", error)
             self.notifier.notify(job.id)
 
-        keeping = asyncio.create_task(self._keep_checkpoints(job, place)) if place.stores_checkpoints else None
-        try:
-            return await process.run(task, progress)
-        finally:
-            if keeping is not None:
-                keeping.cancel()
-                await asyncio.gather(keeping, return_exceptions=True)
+        return await process.run(task, progress)
 
-    async def _keep_checkpoints(self, job: Job, place: Workplace) -> None:
-        """Store the checkpoints of a running job for other replicas, in at most a tenth of the time."""
-        clock = asyncio.get_running_loop().time
-        while True:
-            await asyncio.sleep(CHECKPOINT_SECONDS)
-            begun = clock()
-            try:
-                await run_sync(place.store_checkpoints)
-            except OSError as error:  # the job may succeed without
-                self._log_once(f"job {job.id}: its checkpoint was not stored", error)
-            await asyncio.sleep(9 * (clock() - begun))
+    def _task(self, job: Job, upload: str, work: Path) -> dict[str, Any]:
+        """Return the task of a start, whose result goes to ``work`` in the job's folder."""
+        options = JobOptions.model_validate(job.options)
+        checkpoints = self.storage.checkpoints(job.id) if options.resumable else []
+        return {
+            "function": COMPRESS,
+            "folder": str(work.parent),
+            "files": [upload, *checkpoints],
+            "source": upload,
+            "work": work.name,
+            "checkpoint": CHECKPOINT if options.resumable else None,
+            "settings": {
+                name: value for name, value in job.options.items() if name not in ("format", "evaluate", "origin")
+            },
+            "format": options.format,
+            "container": container_file(job.options).name,
+            "evaluate": options.evaluate,
+            "origin": options.origin,
+        }
 
     # How jobs end -----------------------------------------------------------------------------------------------------
 
-    async def _finish(self, job: Job, outcome: Outcome, place: Workplace) -> None:
+    async def _finish(self, job: Job, outcome: Outcome, work: Path | None) -> None:
         """Record how a job ended; retry while that fails, so that no job is lost because of a full disk."""
         while True:
             try:
-                await run_sync(self._recorder.record, job, outcome, place, self.draining)
+                await run_sync(self.completion.record, job, outcome, work, self.draining)
                 break
             except (SQLAlchemyError, OSError) as error:
-                if self._abandoning:
-                    await run_sync(self.storage.remove_work, job.id)
-                    return
-                if outcome.kind == "done" and await run_sync(self._recorder.is_permanent, error):
+                if outcome.kind == "done" and await run_sync(self.completion.is_permanent, error):
                     log.error("job %s: its result cannot be kept: %s", job.id, error_text(error))
                     outcome = outcome_of(error)
                     continue
@@ -272,10 +402,9 @@ class Worker:
                 if outcome is INTERNAL_ERROR:  # the next start of the service recovers the job
                     return
                 outcome = INTERNAL_ERROR
-        self.notifier.notify(job.id)
-        self.notifier.notify(ended(job.id))
-        if outcome.kind == "postponed":
-            await self._rest_after_postponed(str(outcome.data.get("reason", "")))
+        self.notifier.notify_end(job.id)
+        if outcome.code in POSTPONED:
+            await self._rest_after_postponed(outcome.message)
         else:
             self._postponed, self._postponed_reason = 0, ""
         self.notifier.notify(QUEUE)

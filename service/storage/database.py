@@ -1,30 +1,196 @@
-"""Opening of the job database: an SQLite file in the data folder, or the database of a SQLAlchemy URL."""
+"""The job database, the file ``jobs.sqlite`` of the data folder: opening, and checks while it is open."""
 
 from __future__ import annotations
 
+import ctypes
 import math
-import re
+import os
 import secrets
+import shutil
 import sqlite3
+import threading
+import time
+from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import sqlalchemy as sa
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session, sessionmaker
 
 from ..core.models import SCHEMA_VERSION, Base, Job, Meta
 from ..core.settings import SettingsError
-from .database_health import (
-    IDENTITY,
-    check_pages,
-    check_rows,
-    check_writable,
-    error_text,
-    keep_open,
-    sqlite_file,
-)
-from .machine import IDENTITY_BITS
-from .replicas import JOIN_LOCK, lock
+from .job_files import RESERVE_BYTES
+
+WAIT_SECONDS = 2.0
+"""Maximum wait for a lock during a check, seconds."""
+
+MAX_SCAN_SHARE = 0.01
+"""Maximum share of time spent on reading all pages of the database in search of damage."""
+
+IDENTITY = "identity"
+"""Row of ``meta`` with a random number that identifies the database."""
+
+DISK_FULL = f"database or disk is full; free {RESERVE_BYTES:,} bytes there"
+"""SQLite's words for a full disk, and the remedy."""
+
+
+class DatabaseReplacedError(SQLAlchemyError):
+    """The database was removed or replaced while this service had it open."""
+
+
+def error_text(error: BaseException) -> str:
+    """Return the first line of a database driver's message, and for a full disk what to do."""
+    lines = str(getattr(error, "orig", None) or error).strip().splitlines()
+    reason = lines[0].strip() if lines else type(error).__name__
+    return DISK_FULL if DISK_FULL.startswith(f"{reason};") else reason
+
+
+def is_full(error: BaseException) -> bool:
+    """Return whether a database failed because its disk is full."""
+    reason = error_text(error).lower()
+    return "is full" in reason or "no space left" in reason
+
+
+def check_rows(connection: sa.Connection) -> None:
+    """Read the last row of each table, with all columns, as a quick check.
+
+    Raises:
+        SQLAlchemyError: a table or a column is missing or damaged.
+    """
+    for table in Base.metadata.sorted_tables:
+        last = [column.desc() for column in table.primary_key]
+        connection.execute(sa.select(table).order_by(*last).limit(1)).all()
+
+
+def check_writable(connection: sa.Connection) -> None:
+    """Overwrite a value with itself, because SQLite reports a read-only database only on a write.
+
+    Raises:
+        SQLAlchemyError: the database cannot be written to.
+    """
+    connection.execute(sa.update(Meta).where(Meta.name == IDENTITY).values(value=Meta.value))
+
+
+def check_pages(connection: sa.Connection) -> str | None:
+    """Check the structure of the database; return a description of the damage, None if there is none."""
+    found = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar()
+    return None if found == "ok" else " ".join(str(found).split())
+
+
+def keep_open(connection: sqlite3.Connection) -> None:
+    """Keep a connection open until the process ends.
+
+    Closing the last connection to a database removes its journal by name; if the database has been replaced, that would
+    be the journal of the new one.
+    """
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(connection))
+
+
+class DatabaseMonitor:
+    """Monitor of an open database, which must have the number ``identity`` in ``meta``."""
+
+    def __init__(self, file: Path, identity: float | None) -> None:
+        self.identity = identity
+        self._lock = threading.Lock()
+        self._check_started, self._last_problem = 0.0, ""
+        self._last_scan, self._scan_seconds = time.monotonic(), 0.0
+        self._file = file
+        # Kept open, so that the journal stays the same file.
+        self._connection = sqlite3.connect(file, timeout=WAIT_SECONDS, check_same_thread=False)
+        self._connection.execute("SELECT count(*) FROM meta").fetchall()
+        real = os.path.realpath(file)
+        self._files = {path: _inode(path) for path in (file, Path(f"{real}-wal"), Path(f"{real}-shm"))}
+        self._probe = sa.create_engine("sqlite://", creator=lambda: _open(file), poolclass=sa.NullPool)
+
+    def close(self) -> None:
+        """Close the database; if it was removed or replaced, leave the new files untouched."""
+        try:
+            self.check_files()
+        except DatabaseReplacedError:
+            keep_open(self._connection)
+        else:
+            self._connection.close()
+
+    def abandon(self) -> None:
+        """Stop using the database without closing it, so that its files, including the journal, stay unchanged."""
+        keep_open(self._connection)
+
+    def check_files(self) -> None:
+        """Check that the database's files are those that were opened; takes microseconds.
+
+        Raises:
+            DatabaseReplacedError: a file was removed or replaced.
+        """
+        for path, known in self._files.items():
+            found = _inode(path)
+            if found != known:
+                change = "removed" if found is None else "replaced"
+                raise DatabaseReplacedError(
+                    f"{path.name} was {change} while the service runs; put it back and restart the service"
+                )
+
+    def check_identity(self, connection: sa.Connection | Session) -> None:
+        """Check that the file has not got the content of another database.
+
+        Raises:
+            DatabaseReplacedError: it has.
+        """
+        if connection.scalar(sa.select(Meta.value).where(Meta.name == IDENTITY)) != self.identity:
+            raise DatabaseReplacedError("it was replaced by another database")
+
+    def health_problem(self) -> str | None:
+        """Check the database; return the problem, None if there is none. Takes 2 ms, or longer to wait for a lock.
+
+        Concurrent calls share one check, which never started before the call.
+        """
+        called = time.monotonic()
+        with self._lock:
+            if self._check_started < called:
+                self._check_started = time.monotonic()
+                self._last_problem = self._run_checks()
+            return self._last_problem or None
+
+    def _run_checks(self) -> str:
+        try:
+            self.check_files()
+            if not self._file.stat().st_size:  # opening it would remove the journal
+                return "its file is empty"
+            with self._probe.connect() as connection:
+                return self._inspect(connection)
+        except (SQLAlchemyError, sqlite3.Error, OSError, ValueError) as error:
+            return error_text(error)
+
+    def _inspect(self, connection: sa.Connection) -> str:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+        try:
+            self.check_identity(connection)
+            check_writable(connection)
+            check_rows(connection)
+        finally:
+            connection.rollback()
+        begun = time.monotonic()
+        if begun - self._last_scan < self._scan_seconds / MAX_SCAN_SHARE:
+            return ""
+        damage = check_pages(connection)
+        self._last_scan = time.monotonic()
+        self._scan_seconds = self._last_scan - begun
+        return f"it is damaged: {damage}" if damage else ""
+
+
+def _open(file: Path) -> sqlite3.Connection:
+    """Open an existing database; never create one."""
+    address = f"file:{quote(str(file))}?mode=rw"
+    return sqlite3.connect(address, uri=True, timeout=WAIT_SECONDS, isolation_level=None, check_same_thread=False)
+
+
+def _inode(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
 
 Sessions = sessionmaker[Session]
 
@@ -34,63 +200,53 @@ START_SECONDS = 5.0
 LOCK_SECONDS = 30.0
 """Maximum wait for a lock after the start, seconds."""
 
-IDLE_TRANSACTION_SECONDS = 30.0
-"""Seconds after which a transaction that does nothing is ended by PostgreSQL."""
+IDENTITY_BITS = 48
+"""Bits of the number of a database, which a float column holds exactly."""
 
 _HINTS = {
     "locked": "another program has locked it; stop that program and start again",
-    "lock timeout": "another program has locked it; stop that program and start again",
-    "not a database": "restore it from a backup, or set KISSGS_DATABASE_URL to another database",
+    "not a database": "restore it from a backup",
     "malformed": "restore it from a backup",
     "readonly": "give the service write permission",
-    "read-only": "give the service write permission",
 }
-"""Remedies by parts of the messages of database drivers."""
+"""Remedies by parts of SQLite's messages."""
 
 
 class NewDatabaseError(SettingsError):
     """The database does not exist or is empty, although the data folder has jobs."""
 
 
-def connect(url: str, *, create: bool = True) -> tuple[sa.Engine, Sessions, Sessions]:
-    """Open the database, check that it is intact, and create its tables if there are none.
-
-    Args:
-        url: SQLAlchemy URL.
-        create: whether a new database may be created.
+def connect(file: Path, *, create: bool = True) -> tuple[sa.Engine, Sessions, Sessions]:
+    """Open the database, check that it is intact, and ``create`` it and its tables if there are none.
 
     Returns:
-        The engine; sessions for writing, each with exclusive access to an SQLite database from its first statement; and
-        sessions for reading, which wait for no lock.
+        The engine; sessions for writing, each with exclusive access from its first statement; and sessions for reading,
+        which wait for no lock.
 
     Raises:
         NewDatabaseError: the database is new, and ``create`` is false. Nothing has been created.
         SettingsError: it cannot be opened, is damaged, or has another schema version. It is unchanged.
     """
     opened: list[Any] = []
-    first = _engine(url, START_SECONDS, opened)
-    file = sqlite_file(first.url)
-    if file is None and first.dialect.name == "sqlite":
-        raise SettingsError("KISSGS_DATABASE_URL: a database in memory would lose all jobs; use a file")
+    first = _engine(file, START_SECONDS, opened)
     try:
-        if not create and file is not None and not (file.exists() and file.stat().st_size):
+        if not create and not (file.exists() and file.stat().st_size):
             raise NewDatabaseError("the job database is new")
         with _writing(first).begin() as session:
             _check(session, create=create)
-        engine = _engine(url, LOCK_SECONDS)
+        engine = _engine(file, LOCK_SECONDS)
         engine.connect().close()  # before the first engine closes, which would remove the journal
     except Exception as error:
         for connection in opened:
-            if isinstance(connection, sqlite3.Connection):
-                keep_open(connection)  # so that an existing journal stays unchanged
-        if file is None:
-            first.dispose()
+            keep_open(connection)  # so that an existing journal stays unchanged
         if isinstance(error, SettingsError):
             raise
         reason = error_text(error)
+        if reason == "disk I/O error" and shutil.disk_usage(file.parent).free < RESERVE_BYTES:
+            reason = DISK_FULL  # the index of the journal does not fit
         hint = next((hint for words, hint in _HINTS.items() if words in reason.lower()), "")
         raise SettingsError(
-            f"KISSGS_DATABASE_URL: the job database cannot be opened: {reason}" + (f"; {hint}" if hint else "")
+            f"KISSGS_DATA_DIR: the job database {file} cannot be opened: {reason}" + (f"; {hint}" if hint else "")
         ) from error
     first.dispose()
     return engine, _writing(engine), sessionmaker(engine, expire_on_commit=False)
@@ -100,45 +256,9 @@ def _writing(engine: sa.Engine) -> Sessions:
     return sessionmaker(engine.execution_options(kissgs_writes=True), expire_on_commit=False)
 
 
-def _engine(url: str, wait: float, opened: list[Any] | None = None) -> sa.Engine:
-    if re.match(r"postgres(ql)?://", url):
-        url = f"postgresql+psycopg://{url.partition('://')[2]}"
-    try:  # keep data of clients out of messages and logs
-        engine = sa.create_engine(url, pool_pre_ping=not url.startswith("sqlite"), hide_parameters=True)
-    except ModuleNotFoundError as error:
-        raise SettingsError(
-            f"KISSGS_DATABASE_URL: the package {error.name} is missing; "
-            "for PostgreSQL: pip install 'kissgs[postgresql]'"
-        ) from error
-    except (ArgumentError, NoSuchModuleError, ValueError) as error:
-        raise SettingsError(f"KISSGS_DATABASE_URL: {error_text(error)}; set it to a SQLAlchemy URL") from error
-    if engine.dialect.name == "sqlite":
-        _tune_sqlite(engine, wait, opened)
-    elif engine.dialect.name == "postgresql":
-        _tune_postgresql(engine)
-    return engine
-
-
-def _tune_postgresql(engine: sa.Engine) -> None:
-    """Refuse encodings that lack characters; end the transactions of a suspended service, which others wait for."""
-
-    @sa.event.listens_for(engine, "connect", insert=True)  # before SQLAlchemy reads texts, which it cannot in SQL_ASCII
-    def tune(connection: Any, record: object) -> None:  # noqa: ANN401
-        with connection.cursor() as cursor:
-            cursor.execute("SHOW server_encoding")
-            (found,) = cursor.fetchone()
-            encoding = found if isinstance(found, str) else found.decode("ascii")  # bytes in SQL_ASCII
-            if encoding != "UTF8":
-                raise SettingsError(
-                    f"KISSGS_DATABASE_URL: the database has the encoding {encoding}, but jobs need UTF8; create "
-                    "another with CREATE DATABASE … ENCODING 'UTF8' TEMPLATE template0"
-                )
-            cursor.execute(f"SET idle_in_transaction_session_timeout = {int(1000 * IDLE_TRANSACTION_SECONDS)}")
-        connection.commit()
-
-
-def _tune_sqlite(engine: sa.Engine, wait: float, opened: list[Any] | None) -> None:
-    """Set up SQLite for one writer and many readers, with commits that survive crashes and power failures."""
+def _engine(file: Path, wait: float, opened: list[Any] | None = None) -> sa.Engine:
+    """Return an engine for one writer and many readers, with commits that survive crashes and power failures."""
+    engine = sa.create_engine(sa.URL.create("sqlite", database=str(file)), hide_parameters=True)  # not data of clients
 
     @sa.event.listens_for(engine, "connect")
     def tune(connection: Any, record: object) -> None:  # noqa: ANN401
@@ -157,13 +277,12 @@ def _tune_sqlite(engine: sa.Engine, wait: float, opened: list[Any] | None) -> No
         writes = connection.get_execution_options().get("kissgs_writes")
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
+    return engine
+
 
 def _check(session: Session, *, create: bool) -> None:
     """Check that all tables exist and can be read; create them if none exists."""
     connection = session.connection()
-    if connection.dialect.name == "postgresql":
-        connection.exec_driver_sql(f"SET LOCAL lock_timeout = {int(1000 * START_SECONDS)}")
-        lock(session, JOIN_LOCK)  # of simultaneous first starts, one creates the tables
     required = set(Base.metadata.tables)
     existing = required & set(sa.inspect(connection).get_table_names())
     values = _meta_values(session) if "meta" in existing else {}
@@ -182,11 +301,11 @@ def _check(session: Session, *, create: bool) -> None:
     elif version != SCHEMA_VERSION:
         raise SettingsError(
             f"the job database has schema version {version:g}, but this service needs {SCHEMA_VERSION}; "
-            "use another data folder or database, or the version of the service that created it"
+            "use another data folder, or the version of the service that created this one"
         )
     if missing := sorted(required - existing):
         raise _damaged(f"it has no table {missing[0]}")
-    if connection.dialect.name == "sqlite" and (damage := check_pages(connection)):
+    if damage := check_pages(connection):
         raise _damaged(damage)
     check_rows(connection)
     with connection.begin_nested() as trial:
@@ -204,7 +323,7 @@ def _meta_values(session: Session) -> dict[str, float]:
     values: dict[str, Any] = {row.name: row.value for row in session.scalars(sa.select(Meta))}
     for name, value in values.items():
         usable = isinstance(value, int | float) and math.isfinite(value)
-        if not usable or (name in (IDENTITY, "folder") and not (value >= 0 and float(value).is_integer())):
+        if not usable or (name == IDENTITY and not (value >= 0 and float(value).is_integer())):
             raise _damaged(f"its table meta has no valid {name[:32]}")
     return values
 

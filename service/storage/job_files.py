@@ -1,34 +1,53 @@
-"""``FolderStorage``: the files of jobs in a data folder; clients choose no file names.
+"""``JobStorage``: the data folder, which one service uses at a time, and the files of jobs in it.
 
+    incoming/TOKEN.part          an upload in progress
     jobs/ID/scene.ENDING         the complete upload: ply, sog, spz, splat, ksplat or glb
     jobs/ID/work-TOKEN/          files of a running job process
     jobs/ID/checkpoint*.npz      checkpoints of training, kept until the job ends
     jobs/ID/result/              the result, renamed to this when it is complete and on the disk
         scene.zip or scene.sog  report.json  files/NAME
     jobs/ID/decoded.ply          the decoded scene, after the first request; decoded.json has its size and checksum
+    jobs/.orphaned/ID/           folders of jobs that the database does not know; never read or removed
+    jobs.sqlite                  the database of jobs (:mod:`service.storage.job_records`)
+    lock                         lock of the service
+    reserve                      space that deleting and starting need on a full disk
 
-Incomplete files of a killed service have names that are never read, and the next start removes them. Only files with
-names of this list are removed.
+Clients choose no file names. Incomplete files of a killed service have names that are never read, and the next start
+removes them. Only files with names of this list are removed, and nothing behind a link in place of a job's folder.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import json
 import logging
 import os
+import re
 import secrets
+import shutil
 import time
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from ..core.formats import UPLOAD_FILES
-from .data_folder import JOB, DataFolder
-from .folder_numbers import sync_folder
-from .job_storage import DECODED, RESULT, JobStorage, StoredObject, complete_summary
+from ..core.files import UPLOAD_FILES
+from ..core.settings import SettingsError
 
 log = logging.getLogger("kissgs.service")
+
+ORPHANED = ".orphaned"
+"""Name of the folder, within ``jobs``, for folders that no job of the database owns."""
+
+JOB = re.compile("[0-9a-f]{32}")
+
+RESERVE_BYTES = 1 << 20
+"""Bytes of the reserve: to open an SQLite database and change it takes 100 kB of journal, each change 20 to 40."""
+
+_UPLOAD = re.compile(r"[0-9a-f]{16}\.part")
+
+RESULT = "result"
+"""Name of the folder of a job's result."""
 
 UNFINISHED = ("work-*", ".*.part")
 """Patterns of incomplete files in a job's folder: work folders, and checkpoints that are being written."""
@@ -37,18 +56,63 @@ JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", "checkpoint*.npz", "decoded.p
 """Patterns of all files that the service creates in a job's folder."""
 
 
-class FolderStorage(DataFolder, JobStorage):
-    """Files of jobs in the data folder of one service; for arguments and errors, see :class:`DataFolder`.
+class JobStorage:
+    """The data folder, locked by one service at a time. Methods block, and raise ``OSError`` if a file cannot be used.
 
-    Args:
-        root: the data folder.
+    Raises:
+        SettingsError: it cannot be created or written to, or another service uses it.
     """
 
-    setting, shared = "KISSGS_DATA_DIR", False
-
     def __init__(self, root: Path) -> None:
-        super().__init__(root)
-        self.place = str(self.jobs)
+        self.root = root.absolute()
+        self.incoming, self.jobs, self.database = (self.root / n for n in ("incoming", "jobs", "jobs.sqlite"))
+        try:
+            self.root.mkdir(mode=0o700, parents=True, exist_ok=True)
+            for folder in (self.incoming, self.jobs):
+                folder.mkdir(exist_ok=True)
+            self._lock: IO[str] = (self.root / "lock").open("a")
+        except OSError as error:
+            raise SettingsError(
+                f"KISSGS_DATA_DIR: cannot use {root}: {(error.strerror or str(error)).lower()}"
+            ) from error
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self._lock.close()
+            raise SettingsError(f"KISSGS_DATA_DIR: another service is using {root}; use a separate folder") from error
+        # Kept open, so that no file system reuses their inode numbers.
+        self._opened = {folder: os.open(folder, os.O_RDONLY) for folder in (self.incoming, self.jobs)}
+        if os.path.lexists(self.orphaned) and not self.orphaned.is_dir():
+            self.close()
+            raise SettingsError(f"KISSGS_DATA_DIR: {self.orphaned} is not a folder; move it away")
+
+    def close(self) -> None:
+        """Release the folder for other services."""
+        while self._opened:
+            os.close(self._opened.popitem()[1])
+        self._lock.close()
+
+    def new_upload(self) -> Path:
+        """Return a new path for an upload."""
+        return self.incoming / f"{secrets.token_hex(8)}.part"
+
+    def discard(self, path: Path) -> None:
+        """Remove a file or folder if it exists; of a link, remove only the link."""
+        if path.parent.parent == self.jobs and path.parent.is_symlink():
+            return
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                path.unlink()
+
+    def remove_uploads(self) -> None:
+        """Remove incomplete uploads of a previous service."""
+        for path in self.incoming.iterdir():
+            if _UPLOAD.fullmatch(path.name):
+                self.discard(path)
+
+    # Files of a job ---------------------------------------------------------------------------------------------------
 
     def adopt(self, upload: Path, job_id: str, name: str = UPLOAD_FILES[0]) -> None:
         """Move a complete upload to the folder of a job; ``name`` is one of :data:`UPLOAD_FILES`."""
@@ -69,11 +133,7 @@ class FolderStorage(DataFolder, JobStorage):
 
     def decoded(self, job_id: str) -> Path:
         """Return the path of the decoded scene, which exists after the first request."""
-        return self.jobs / job_id / DECODED
-
-    def checkpoint(self, job_id: str) -> Path:
-        """Return the path of the job's checkpoint."""
-        return self.jobs / job_id / "checkpoint.npz"
+        return self.jobs / job_id / "decoded.ply"
 
     def discard_checkpoints(self, job_id: str) -> None:
         """Remove the checkpoints of a job."""
@@ -98,19 +158,9 @@ class FolderStorage(DataFolder, JobStorage):
         path = self.upload(job_id)
         return path.name if path.is_file() else None
 
-    def fetch(self, job_id: str, name: str, work: Path) -> Path:
-        """Return the path of a job's file."""
-        return self.jobs / job_id / name
-
-    def open(self, job_id: str, name: str) -> StoredObject:
-        """Return a file of a job.
-
-        Raises:
-            FileNotFoundError: it does not exist.
-        """
-        path = self.jobs / job_id / name
-        found = path.stat()
-        return StoredObject(found.st_size, found.st_mtime, path)
+    def checkpoints(self, job_id: str) -> list[str]:
+        """Return the names of the job's checkpoints."""
+        return sorted(path.name for path in (self.jobs / job_id).glob("checkpoint*.npz"))
 
     def new_work(self, job_id: str) -> Path:
         """Create a new work folder for a job process."""
@@ -118,7 +168,7 @@ class FolderStorage(DataFolder, JobStorage):
         folder.mkdir()
         return folder
 
-    def keep_result(self, job_id: str, folder: str, work: Path) -> None:
+    def keep_result(self, job_id: str, work: Path) -> None:
         """Move the result from a work folder to its final path; do nothing if that is done already.
 
         A previous result moves to the work folder.
@@ -135,30 +185,15 @@ class FolderStorage(DataFolder, JobStorage):
         if not result.is_dir():
             raise FileNotFoundError(errno.ENOENT, "its result is missing")
 
-    def read_result(self, job_id: str, folder: str, container: str) -> dict[str, Any] | None:
+    def read_result(self, job_id: str, container: str) -> dict[str, Any] | None:
         """Return the summary of a complete result with this container; None if there is none or it is damaged."""
-        result = self.jobs / job_id / folder
+        result = self.result(job_id)
         try:
             text = (result / "summary.json").read_bytes()
             sizes = {str(path.relative_to(result)): path.stat().st_size for path in result.rglob("*")}
         except OSError:
             return None
-        return complete_summary(text, sizes, container)
-
-    def result_folders(self, job_id: str) -> list[str]:
-        """Return the name of the result's folder if it exists."""
-        return [RESULT] if self.result(job_id).exists() else []
-
-    def remove_result(self, job_id: str, folder: str) -> None:
-        """Remove a result."""
-        self.discard(self.jobs / job_id / folder)
-
-    def settle(self, job_id: str, folder: str, *, keep_upload: bool) -> bool:
-        """Remove a job's checkpoints, and its upload unless ``keep_upload``; return whether there is an upload now."""
-        self.discard_checkpoints(job_id)
-        if not keep_upload:
-            self.discard(self.upload(job_id))
-        return keep_upload and self.upload(job_id).is_file()
+        return _complete_summary(text, sizes, container)
 
     def keep_decoded(self, work: Path, job_id: str) -> None:
         """Move a decoded scene from a work folder to its final path."""
@@ -173,14 +208,20 @@ class FolderStorage(DataFolder, JobStorage):
         found: dict[str, Any] = json.loads(self.decoded(job_id).with_suffix(".json").read_text())
         return found
 
+    def job_bytes(self, job_id: str) -> int:
+        """Return the size of all files of a job, bytes."""
+        return sum(path.stat().st_size for path in (self.jobs / job_id).rglob("*") if path.is_file())
+
+    # Removal ----------------------------------------------------------------------------------------------------------
+
     def remove_work(self, job_id: str) -> None:
         """Remove the incomplete files of a job; complete checkpoints stay."""
         for pattern in UNFINISHED:
             for path in (self.jobs / job_id).glob(pattern):
                 self.discard(path)
 
-    def remove_job(self, job_id: str) -> bool:
-        """Remove all files of a job and return True; files that cannot be removed stay, with a warning in the log.
+    def remove_job(self, job_id: str) -> None:
+        """Remove all files of a job; files that cannot be removed stay, with a warning in the log.
 
         If the job's path is not a folder, or has other content, it is moved to the orphaned folder instead.
         """
@@ -192,7 +233,6 @@ class FolderStorage(DataFolder, JobStorage):
                 log.warning("job %s: its folder cannot be removed", job_id)
         except OSError as error:
             log.warning("job %s: its folder cannot be removed: %s", job_id, (error.strerror or str(error)).lower())
-        return True
 
     def _remove(self, folder: Path) -> bool:
         """Remove the folder of a job, or move it to the orphaned folder; return False if it still exists."""
@@ -221,6 +261,129 @@ class FolderStorage(DataFolder, JobStorage):
         for job_id in self.job_ids() & known:
             self.remove_work(job_id)
 
-    def job_bytes(self, job_id: str) -> int:
-        """Return the size of all files of a job, bytes."""
-        return sum(path.stat().st_size for path in (self.jobs / job_id).rglob("*") if path.is_file())
+    # Orphaned folders -----------------------------------------------------------------------------------------------
+
+    @property
+    def orphaned(self) -> Path:
+        """Folder for folders that no job of the database owns."""
+        return self.jobs / ORPHANED
+
+    def job_ids(self) -> set[str]:
+        """Return the ids of all jobs that have a folder."""
+        return {path.name for path in self.jobs.iterdir() if JOB.fullmatch(path.name) and path.is_dir()}
+
+    def move_to_orphaned(self, job_id: str, why: str) -> None:
+        """Move the folder of a job to the orphaned folder and log why; ``why`` continues "its folder ..."."""
+        self._move_to_orphaned(self.jobs / job_id)
+        log.warning("job %s: its folder %s and was moved to %s", job_id, why, self.orphaned)
+
+    def set_aside(self, job_id: str, why: str) -> None:
+        """Move the folder of a job to the orphaned folder; remove it if it is empty."""
+        with contextlib.suppress(OSError):  # not empty, not a folder, or missing
+            (self.jobs / job_id).rmdir()
+        if os.path.lexists(self.jobs / job_id):
+            self.move_to_orphaned(job_id, why)
+
+    def set_aside_unknown(self, known: set[str]) -> None:
+        """Move the folders of all jobs except ``known`` ones to the orphaned folder; call it before uploads start."""
+        unknown = sorted(self.job_ids() - known)
+        for job_id in unknown:
+            self._move_to_orphaned(self.jobs / job_id)
+        if unknown:
+            log.warning(
+                "folders of jobs that the database does not know were moved to %s: %d", self.orphaned, len(unknown)
+            )
+
+    def orphaned_note(self) -> str | None:
+        """Return a sentence about the entries of the orphaned folder; None if it is empty."""
+        count = self.count_orphaned()
+        return f"folders without a job in jobs/{ORPHANED} of the data folder: {count}" if count else None
+
+    def count_orphaned(self) -> int:
+        """Return the number of entries of the orphaned folder."""
+        try:
+            return sum(1 for _ in self.orphaned.iterdir())
+        except OSError:
+            return 0
+
+    def _move_to_orphaned(self, folder: Path) -> None:
+        self.orphaned.mkdir(exist_ok=True)
+        target, number = self.orphaned / folder.name, 1
+        while os.path.lexists(target):
+            number += 1
+            target = self.orphaned / f"{folder.name}-{number}"
+        folder.rename(target)
+
+    # The disk ------------------------------------------------------------------------------------------------------
+
+    def health_problem(self) -> str | None:
+        """Return why files cannot be stored; None if they can. Takes microseconds."""
+        for folder, opened in self._opened.items():
+            try:
+                same = os.path.samestat(folder.stat(), os.fstat(opened))
+            except OSError:
+                return f"the data folder cannot be used: its folder {folder.name} is missing; restore it"
+            if not same:
+                return f"the data folder cannot be used: its folder {folder.name} was replaced; restart the service"
+            if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+                return (
+                    f"the data folder cannot be used: its folder {folder.name} is not writable; change its permissions"
+                )
+        return None
+
+    def check(self) -> None:
+        """Check that files can be stored.
+
+        Raises:
+            OSError: they cannot.
+        """
+        if problem := self.health_problem():
+            raise OSError(problem)
+
+    def free_bytes(self) -> int:
+        """Return the free bytes of the disk."""
+        return shutil.disk_usage(self.root).free
+
+    def keep_reserve(self) -> None:
+        """Take the reserve if it is missing, or what is left of it on a full disk."""
+        path = self.root / "reserve"
+        try:
+            size = min(RESERVE_BYTES, self.free_bytes() - RESERVE_BYTES // 16)
+            if not path.exists() and size > 0:
+                with path.open("wb") as file:
+                    os.posix_fallocate(file.fileno(), 0, size)
+        except OSError:
+            self.free_reserve()
+
+    def free_reserve(self) -> bool:
+        """Free the reserve, for a change that will free more; return whether there was one."""
+        try:
+            (self.root / "reserve").unlink()
+        except OSError:
+            return False
+        return True
+
+
+def _complete_summary(text: bytes, sizes: dict[str, int], container: str) -> dict[str, Any] | None:
+    """Return the summary of a result that is complete; None if it is not.
+
+    ``text`` is that of ``summary.json``, ``sizes`` are the bytes of each file of the result by name, and ``container``
+    is the name of the container's file.
+    """
+    try:
+        summary: dict[str, Any] = json.loads(text)
+        required = {f"files/{name}": entry["bytes"] for name, entry in summary["files"].items()}
+        required |= {container: summary["container"]["bytes"], "report.json": summary["report"]["bytes"]}
+        complete = all(sizes.get(name) == size for name, size in required.items())
+        return summary if complete and {"count", "seconds", "cpu_seconds"} <= summary.keys() else None
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return None
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's entries to the disk, so that a power failure cannot undo a rename."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

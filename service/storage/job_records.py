@@ -1,4 +1,4 @@
-"""``Store``: all changes of the tables of jobs and events, each in one transaction; reading is in ``job_queries``.
+"""``Store``: reading and changes of the tables of jobs and events, each change in one transaction.
 
 State transitions are limited to :data:`_PREDECESSORS`, and compared and set in one step, so that of a simultaneous
 cancellation and result only one takes effect. Each change of state or progress adds an event for clients.
@@ -7,19 +7,18 @@ cancellation and result only one takes effect. Each change of state or progress 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.exc import IntegrityError, SQLAlchemyError
-from sqlalchemy.orm import Session
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session, load_only
 
 from ..core.models import ACTIVE, ENDED, NOTE_CHARS, Event, Job, Meta, State
-from . import database_lease, replicas
-from .database import connect
-from .database_health import IDENTITY, DatabaseMonitor, DatabaseReplacedError
-from .job_queries import JobQueries, count, disk_bytes
-from .replica_records import ReplicaRecords
+from ..core.settings import SettingsError
+from .database import IDENTITY, DatabaseMonitor, NewDatabaseError, connect
+from .job_files import RESERVE_BYTES, JobStorage
 
 _PREDECESSORS: dict[State, tuple[State, ...]] = {
     State.RUNNING: (State.QUEUED,),
@@ -33,53 +32,34 @@ _PREDECESSORS: dict[State, tuple[State, ...]] = {
 
 
 class LimitExceeded(Exception):
-    """A job was not added because of a limit: ``"queue"``, ``"owner"``, ``"disk"`` or ``"key"``.
-
-    Attributes:
-        limit: name of the limit.
-    """
+    """A job was not added because of a limit: ``"queue"``, ``"owner"`` or ``"key"``."""
 
     def __init__(self, limit: str) -> None:
         super().__init__(limit)
         self.limit = limit
 
 
-class Store(JobQueries, ReplicaRecords):
+class Store:
     """Jobs and events in a database. Methods block for milliseconds and are safe in any thread.
-
-    Attributes:
-        turns: by owner, the number of the last start of one of its jobs, counted from 1 since this service has started.
-
-    Args:
-        url: SQLAlchemy URL.
-        clock: returns the time, seconds since 1970.
-        create: whether a new database may be created.
 
     Raises:
         SettingsError: as for :func:`service.storage.database.connect`.
     """
 
-    def __init__(self, url: str, clock: Callable[[], float], *, create: bool = True) -> None:
-        self._engine, self._writing, self._reading = connect(url, create=create)
-        self._monitor = DatabaseMonitor(self._engine)
-        self._monitor.identity = self.meta_value(IDENTITY)
+    def __init__(self, file: Path, clock: Callable[[], float], *, create: bool = True) -> None:
+        self._engine, self._writing, self._reading = connect(file, create=create)
+        self._monitor = DatabaseMonitor(file, self.meta_value(IDENTITY))
         self.clock = clock
-        self.turns: dict[str, int] = {}
-        self._changes = 0
+        self.turns: dict[str, int] = {}  # by owner, the number of the last start of one of its jobs, counted from 1
+        self.changes = 0  # of the queue so far
 
     def close(self) -> None:
-        """Release the database lease and close all connections."""
-        if self._monitor.owner is not None and self.health_problem() is None:
-            with contextlib.suppress(SQLAlchemyError), self._write() as session:
-                database_lease.release(session)
-        if self._monitor.replica is not None:
-            with contextlib.suppress(SQLAlchemyError), self._writing.begin() as session:
-                replicas.remove(session, self._monitor.replica)
+        """Close all connections."""
         self._engine.dispose()
         self._monitor.close()
 
     def abandon(self) -> None:
-        """Close without changing the database's files or releasing the lease."""
+        """Close without changing the database's files."""
         self._monitor.abandon()
         self._engine.dispose()
 
@@ -98,63 +78,131 @@ class Store(JobQueries, ReplicaRecords):
         return self._monitor.health_problem()
 
     def meta_value(self, name: str) -> float | None:
-        """Return a row of ``meta``, such as ``identity``, ``folder`` or ``time``; None if it does not exist."""
+        """Return a row of ``meta``, such as ``identity`` or ``time``; None if it does not exist."""
         with self._reading() as session:
             found = session.get(Meta, name)
         return found.value if found is not None else None
-
-    def bind_to(self, folder: float, identity: float) -> None:
-        """Store the number of the data folder that the database belongs to, and the number of the database itself."""
-        with self._writing.begin() as session:
-            session.merge(Meta(name="folder", value=folder))
-            session.merge(Meta(name=IDENTITY, value=identity))
-        self._monitor.identity = identity
-
-    def acquire_database(self) -> None:
-        """Take the database lease, which periodic calls of :meth:`heartbeat` renew.
-
-        Raises:
-            SettingsError: another service holds the lease.
-        """
-        self._monitor.owner = database_lease.acquire(self._writing, self._reading)
 
     @contextlib.contextmanager
     def _write(self) -> Iterator[Session]:
         """Begin a transaction; raise an error if the database is removed or replaced before it ends."""
         self.check()
         with self._writing.begin() as session:
-            if problem := self._monitor.ownership_problem(session):
-                raise DatabaseReplacedError(f"the job database no longer belongs to this service: {problem}")
+            self._monitor.check_identity(session)
             yield session
         self.check()
 
+    # Reading ----------------------------------------------------------------------------------------------------------
+
+    def get(self, job_id: str, owner: str | None = None) -> Job | None:
+        """Return a job by id; None if it does not exist or has another owner than ``owner``."""
+        with self._reading() as session:
+            job = session.scalar(sa.select(Job).where(Job.id == job_id))
+        return job if job is not None and owner in (None, job.owner) else None
+
+    def by_idempotency_key(self, owner: str, key: str) -> Job | None:
+        """Return the job that ``owner`` submitted with this key; None if there is none."""
+        with self._reading() as session:
+            return session.scalar(sa.select(Job).where(Job.owner == owner, Job.idempotency_key == key))
+
+    def listing(self, owner: str, *, limit: int, before: int | None = None, state: State | None = None) -> list[Job]:
+        """Return up to ``limit`` jobs of an owner with a number below ``before``, newest first."""
+        query = sa.select(Job).where(Job.owner == owner).order_by(Job.number.desc()).limit(limit)
+        if before is not None:
+            query = query.where(Job.number < before)
+        if state is not None:
+            query = query.where(Job.state == state)
+        with self._reading() as session:
+            return list(session.scalars(query))
+
+    def in_state(self, *states: State) -> list[Job]:
+        """Return all jobs in one of ``states``, oldest first."""
+        with self._reading() as session:
+            return list(session.scalars(sa.select(Job).where(Job.state.in_(states)).order_by(Job.number)))
+
+    def active(self) -> list[Job]:
+        """Return all queued and running jobs, with only the columns that estimates need."""
+        columns = load_only(Job.owner, Job.state, Job.preset, Job.evaluate, Job.gaussians, Job.options, Job.started_at)
+        with self._reading() as session:
+            return list(session.scalars(sa.select(Job).where(Job.state.in_(ACTIVE)).options(columns)))
+
+    def events(self, number: int, after: int = 0) -> list[Event]:
+        """Return the events of a job with a ``seq`` above ``after``, in order."""
+        query = sa.select(Event).where(Event.job == number, Event.seq > after).order_by(Event.seq)
+        with self._reading() as session:
+            return list(session.scalars(query))
+
+    # Sums ----------------------------------------------------------------------------------------------------------
+
+    def counts(self) -> dict[State, int]:
+        """Return the number of jobs in each state."""
+        with self._reading() as session:
+            rows = session.execute(sa.select(Job.state, sa.func.count()).group_by(Job.state)).all()
+        found = {State(state): count for state, count in rows}
+        return {state: found.get(state, 0) for state in State}
+
+    def active_of(self, owner: str) -> int:
+        """Return the number of queued and running jobs of an owner."""
+        with self._reading() as session:
+            return _count(session, Job.owner == owner, Job.state.in_(ACTIVE))
+
+    def disk_bytes(self) -> int:
+        """Return the disk space of all jobs, bytes."""
+        with self._reading() as session:
+            return int(session.scalar(sa.select(sa.func.coalesce(sa.func.sum(Job.disk_bytes), 0))) or 0)
+
+    def rates(self, preset: str, evaluate: bool, limit: int = 21) -> list[float]:
+        """Return seconds per Gaussian of up to ``limit`` recent jobs of a preset, with or without evaluation."""
+        kind = Job.preset == preset, Job.evaluate == evaluate, Job.state == State.SUCCEEDED
+        query = sa.select(Job.finished_at - Job.started_at, Job.gaussians).where(*kind)
+        with self._reading() as session:
+            latest = session.execute(query.order_by(Job.number.desc()).limit(5 * limit)).all()
+        # In jobs with small scenes, the start of the process dominates.
+        return [spent / count for spent, count in latest if spent and count >= 10_000][:limit]
+
+    def ids(self, *states: State) -> set[str]:
+        """Return the ids of all jobs in ``states``, by default of all jobs."""
+        with self._reading() as session:
+            return set(session.scalars(sa.select(Job.id).where(Job.state.in_(states or tuple(State)))))
+
+    def due(self, states: Iterable[State], before: float, limit: int = 200) -> list[tuple[int, str]]:
+        """Return number and id of up to ``limit`` jobs in ``states`` that expire before a time."""
+        query = sa.select(Job.number, Job.id).where(Job.state.in_(tuple(states)), Job.expires_at < before)
+        with self._reading() as session:
+            return [(number, job_id) for number, job_id in session.execute(query.limit(limit))]
+
+    def reclaimable(self, limit: int = 50) -> list[tuple[int, str]]:
+        """Return number and id of up to ``limit`` ended jobs with reclaimable files, oldest first."""
+        query = sa.select(Job.number, Job.id).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
+        with self._reading() as session:
+            return [(number, job_id) for number, job_id in session.execute(query.order_by(Job.number).limit(limit))]
+
+    def reclaimable_bytes(self) -> int:
+        """Return the bytes of all reclaimable files of ended jobs."""
+        query = sa.select(sa.func.coalesce(sa.func.sum(Job.reclaimable_bytes), 0)).where(Job.reclaimable_bytes > 0)
+        with self._reading() as session:
+            return int(session.scalar(query.where(Job.state.in_(ENDED))) or 0)
+
+    def waiting(self) -> int:
+        """Return the number of queued jobs."""
+        with self._reading() as session:
+            return _count(session, Job.state == State.QUEUED)
+
     # Jobs ----------------------------------------------------------------------------------------------------------
 
-    @property
-    def changes(self) -> int | None:
-        """Number of changes of the queue so far; None if other replicas may change it, too."""
-        return self._changes if self.replica is None else None
-
-    def add(self, job: Job, *, max_queue: int, max_owner: int, max_disk: int | None = None) -> Job:
-        """Queue a job; of a replica, drop the claim of it.
+    def add(self, job: Job, *, max_queue: int, max_owner: int) -> Job:
+        """Queue a job.
 
         Raises:
-            LimitExceeded: ``max_queue`` jobs are queued, ``max_owner`` jobs of its owner are active, all jobs would
-                have more than ``max_disk`` bytes, or its idempotency key is in use.
-            DatabaseReplacedError: this replica has lost its claim.
+            LimitExceeded: ``max_queue`` jobs are queued, ``max_owner`` jobs of its owner are active, or its idempotency
+                key is in use.
         """
         try:
             with self._write() as session:
-                if self.replica is not None:
-                    replicas.lock(session, replicas.QUEUE_LOCK)  # counting and adding is one step for all replicas
-                    if not replicas.drop(session, job.id, self.replica):
-                        raise DatabaseReplacedError("another replica took this one for dead; send the request again")
-                if max_disk is not None and disk_bytes(session) + job.disk_bytes > max_disk:
-                    raise LimitExceeded("disk")
-                if count(session, Job.state == State.QUEUED) >= max_queue:
+                if _count(session, Job.state == State.QUEUED) >= max_queue:
                     raise LimitExceeded("queue")
                 active = Job.owner == job.owner, Job.owner != "", Job.state.in_(ACTIVE)
-                if count(session, *active) >= max_owner:
+                if _count(session, *active) >= max_owner:
                     raise LimitExceeded("owner")
                 job.created_at = self.clock()
                 session.add(job)
@@ -162,7 +210,7 @@ class Store(JobQueries, ReplicaRecords):
                 _add_event(session, job, "state", {"state": State.QUEUED})
         except IntegrityError as error:
             raise LimitExceeded("key") from error
-        self._changes += 1
+        self.changes += 1
         return job
 
     # Changes -------------------------------------------------------------------------------------------------------
@@ -175,47 +223,36 @@ class Store(JobQueries, ReplicaRecords):
         with self._write() as session:
             turn = [sa.case(self.turns, value=Job.owner, else_=0)] if self.turns else []
             query = sa.select(Job).where(Job.state == State.QUEUED).order_by(*turn, Job.number).limit(1)
-            job = session.scalar(query.with_for_update(skip_locked=True))
+            job = session.scalar(query)
             if job is None:
                 return None
             job.starts += 1
             job.started_at = self.clock()
             job.disk_bytes = job.upload_bytes + job.work_bytes
             job.state = State.RUNNING
-            if self.replica is not None:
-                replicas.take(session, job.id, self.replica)
             _add_event(session, job, "state", {"state": State.RUNNING, "start": job.starts})
             self.turns = {**self.turns, job.owner: max(self.turns.values(), default=0) + 1}
-        self._changes += 1
+        self.changes += 1
         return job
 
     def progress(self, number: int, stage: str, fraction: float, note: str = "") -> None:
         """Store the progress of a running job: stage, fraction from 0 to 1, and an optional note."""
         with self._write() as session:
-            job = session.get(Job, number, with_for_update=True)
+            job = session.get(Job, number)
             if job is not None and job.state == State.RUNNING:
                 job.stage, job.fraction, job.note = stage, fraction, note[:NOTE_CHARS] or None
                 optional = {"note": job.note} if job.note else {}
                 _add_event(session, job, "progress", {"stage": stage, "fraction": fraction, **optional})
 
-    def move(self, number: int, state: State, *, dead: str | None = None, **values: Any) -> bool:  # noqa: ANN401
+    def move(self, number: int, state: State, **values: Any) -> bool:  # noqa: ANN401
         """Set a job's state and the columns ``values``; return False if its current state does not allow it.
 
-        A job that returns to the queue loses its progress. A replica drops its own claim of the job, or that of a
-        ``dead`` replica, without which the state does not change. One of a job that has succeeded it keeps, or takes,
-        until the job's files are settled.
+        A job that returns to the queue loses its progress.
         """
         with self._write() as session:
-            job = session.get(Job, number, with_for_update=True)
+            job = session.get(Job, number)
             if job is None or job.state not in _PREDECESSORS[state]:
                 return False
-            holder = dead or self.replica
-            if holder is not None and state != State.RUNNING:
-                dropped = replicas.drop(session, job.id, holder)
-                if dead is not None and not dropped:
-                    return False
-                if state == State.SUCCEEDED and self.replica is not None:
-                    replicas.take(session, job.id, self.replica)
             for name, value in values.items():
                 setattr(job, name, value)
             if state == State.QUEUED:
@@ -224,7 +261,7 @@ class Store(JobQueries, ReplicaRecords):
                 job.finished_at = self.clock()
             job.state = state
             _add_event(session, job, "state", {"state": state, **({"problem": job.problem} if job.problem else {})})
-        self._changes += 1
+        self.changes += 1
         return True
 
     def update(self, number: int, **values: Any) -> None:  # noqa: ANN401
@@ -245,13 +282,57 @@ class Store(JobQueries, ReplicaRecords):
         return self.meta_value("time") or 0.0
 
     def heartbeat(self) -> None:
-        """Store the current time, which renews the lease and checks that the database is writable."""
+        """Store the current time, with which the clock of the next start begins; it checks that it can be written."""
         with self._write() as session:
             session.merge(Meta(name="time", value=self.clock()))
-            if self.replica is not None:
-                replicas.beat(session, self.replica)
+
+
+def _count(session: Session, *where: sa.ColumnElement[bool]) -> int:
+    """Return the number of jobs with these properties."""
+    return session.scalar(sa.select(sa.func.count()).select_from(Job).where(*where)) or 0
 
 
 def _add_event(session: Session, job: Job, kind: str, data: dict[str, Any]) -> None:
     job.last_event = (job.last_event or 0) + 1
     session.add(Event(job=job.number, seq=job.last_event, kind=kind, data=data))
+
+
+def open_store(folder: JobStorage, clock: Callable[[], float]) -> Store:
+    """Open the database of a data folder, on a full disk with the space of its reserve and of incomplete uploads.
+
+    Raises:
+        SettingsError: it cannot be opened, it is missing although the folder has jobs, or none of its waiting and
+            running jobs has a folder. Nothing has been removed.
+    """
+    stored = folder.job_ids()
+    store = _open(folder, clock, stored)
+    active = store.ids(*ACTIVE)
+    if active and not active & stored:
+        store.abandon()
+        raise SettingsError(
+            f"KISSGS_DATA_DIR: {folder.jobs} has none of the {len(active)} jobs that are queued or running in the job "
+            f"database; mount or restore that folder, or, if they are lost, create the empty folder "
+            f"{folder.jobs / min(active)} and start again, so that they are recorded as failed"
+        )
+    return store
+
+
+def _open(folder: JobStorage, clock: Callable[[], float], stored: set[str]) -> Store:
+    if folder.free_bytes() < RESERVE_BYTES:
+        folder.free_reserve()
+    try:
+        try:
+            return Store(folder.database, clock, create=not stored)
+        except NewDatabaseError:
+            raise
+        except SettingsError:
+            if folder.free_bytes() >= RESERVE_BYTES:
+                raise
+        folder.remove_uploads()  # this may free enough space for the database
+        return Store(folder.database, clock, create=not stored)
+    except NewDatabaseError as error:
+        raise SettingsError(
+            f"KISSGS_DATA_DIR: {folder.jobs} has the files of {len(stored)} jobs, but the job database "
+            f"{folder.database} is new and has none of them; restore it, choose another folder, or move the folder of "
+            "jobs away to start without jobs"
+        ) from error

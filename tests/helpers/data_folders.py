@@ -25,13 +25,13 @@ def no_variables(monkeypatch):
             monkeypatch.delenv(name)
 
 
-def opened(folder, url=None):
-    return build(ServiceSettings(data_dir=folder, database_url=url))
+def opened(folder):
+    return build(ServiceSettings(data_dir=folder))
 
 
 @contextlib.contextmanager
-def service(folder, url=None):
-    context = opened(folder, url)
+def service(folder):
+    context = opened(folder)
     try:
         recover(context)
         yield context

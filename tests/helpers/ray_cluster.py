@@ -18,6 +18,34 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 RAY = Path(sys.executable).with_name("ray")
 NODE_MEMORY = 1_000_000_000
+UNSEEN = """
+import sys
+from importlib.abc import MetaPathFinder
+from importlib.machinery import PathFinder
+from pathlib import Path
+
+
+class Patch(MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name != "kissgs.runners.file_transfer":
+            return None
+        spec = PathFinder.find_spec(name, path)
+        run = spec.loader.exec_module
+
+        def patched(module):
+            run(module)
+            seen = module.is_seen
+            module.CHECKPOINT_SECONDS = 0.2
+            module.is_seen = lambda folder: seen(folder) and any((p / "shared").exists() for p in Path(folder).parents)
+
+        spec.loader.exec_module = patched
+        return spec
+
+
+sys.meta_path.insert(0, Patch())
+"""
+"""Start-up code of a node's processes."""
+
 PATHS = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
 """``PYTHONPATH`` of nodes and of items."""
 
@@ -25,7 +53,8 @@ PATHS = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
 class RayCluster:
     """Cluster for use as ``with RayCluster() as cluster``; the head runs no items, each node one at a time.
 
-    Whoever connects needs the variables ``environment``, a token.
+    Whoever connects needs the variables ``environment``, a token. Nodes see no folder of an item, as if they were other
+    machines, but those below a folder with a file ``shared``.
     """
 
     def __init__(self) -> None:
@@ -82,12 +111,13 @@ class RayCluster:
         temporary = self.folder / f"temporary{len(self.logs)}"  # of its own, as on a machine of its own
         temporary.mkdir()
         environment["TMPDIR"] = str(temporary)
+        (temporary / "sitecustomize.py").write_text(UNSEEN)
         log = self.folder / f"log{len(self.logs)}"
         self.logs.append(log)
         with log.open("wb") as file:
             process = subprocess.Popen(
                 [RAY, "start", "--block", "--object-store-memory=80000000", *options],
-                env={**environment, "PYTHONPATH": PATHS},
+                env={**environment, "PYTHONPATH": f"{temporary}{os.pathsep}{PATHS}"},
                 stdout=file,
                 stderr=file,
                 cwd=self.folder,

@@ -1,34 +1,32 @@
-"""``RayReplicas``: replicas whose jobs run on the nodes of a Ray cluster, and share nothing with them but a bucket."""
+"""``RayService``: a service whose jobs run on the nodes of a Ray cluster."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from helpers.ray_cluster import NODE_MEMORY, RayCluster
-from helpers.s3_server import Bucket
-from helpers.service import Replicas
+from helpers.service import Service
 
 
-class RayReplicas(Replicas):
-    """Two replicas and a cluster, of which each runs as many jobs at a time as the cluster has nodes of one processor.
+class RayService(Service):
+    """A service and a cluster of nodes with one processor each, which see no data folder but those that are shared."""
 
-    Nodes do not get the paths of data folders, and have temporary folders of their own.
-    """
+    workers = 2
 
-    def __init__(self, folder: Path, cluster: RayCluster, bucket: Bucket, database: str, **settings: object) -> None:
+    def __init__(self, folder: Path, cluster: RayCluster, **settings: object) -> None:
         self.cluster = cluster
         fixed = {
-            "KISSGS_RUNNER": "ray",
-            "KISSGS_RAY_ADDRESS": cluster.address,
+            "KISSGS_RUNNER": cluster.address,
+            "KISSGS_WORKERS": self.workers,
             "KISSGS_JOB_MEMORY": NODE_MEMORY,
             "KISSGS_JOB_THREADS": 1,
         }
-        super().__init__(folder, 2, bucket, database, **{**fixed, **settings})
+        super().__init__(folder, **{**fixed, **settings})
 
     def children(self) -> list[int]:
-        """Return the ids of the processes of all jobs; decoding, which stays on the replica, is not counted."""
+        """Return the ids of the processes of all jobs; decoding, which stays with the service, is not counted."""
         return self.cluster.items()
 
     def leftovers(self) -> list[str]:
-        """Return the paths and keys of what no job should have left: here, on nodes, and in the bucket."""
+        """Return the paths of what no job should have left, in the data folder and on nodes."""
         return [*super().leftovers(), *self.cluster.left_by_items()]

@@ -1,5 +1,6 @@
 """Functions of work items for the tests of the runners; their processes import this module by name."""
 
+import hashlib
 import os
 import signal
 import time
@@ -73,3 +74,20 @@ def write_slowly(arguments, progress):
 def variables(arguments, progress):
     """Return the variables of the environment."""
     return {"environment": dict(os.environ)}
+
+
+def digest(arguments, progress):
+    """Write a checkpoint, report progress, in the first start for long, and write the SHA-256 of ``scene``."""
+    with Path(arguments["starts"]).open("a") as file:
+        file.write("start\n")
+    first = len(Path(arguments["starts"]).read_text().splitlines()) == 1
+    Path(".checkpoint.part").write_text("a checkpoint")
+    Path(".checkpoint.part").rename("checkpoint")
+    Path("made").mkdir()
+    Path("made/half").write_text("not complete")
+    for step in range(6000 if first else 1):
+        progress("digest", step / 6000, "")
+        time.sleep(0.1)
+    Path("made/half").unlink()
+    Path("made/digest").write_text(hashlib.sha256(Path("scene").read_bytes()).hexdigest())
+    return {"folder": str(Path.cwd())}

@@ -7,7 +7,7 @@ from kissgs.runners.contract import Resources, WorkItem
 
 MB = 1_000_000
 ONE_PROCESSOR = Resources()
-LIMITS = ("seconds", "memory_limit", "folder", "retries")
+LIMITS = ("seconds", "memory_limit", "folder", "files", "retries")
 
 
 def item(function, resources=ONE_PROCESSOR, **values):

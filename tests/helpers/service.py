@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import itertools
 import json
 import os
 import re
@@ -18,7 +17,6 @@ from pathlib import Path
 import httpx
 
 import kissgs
-from helpers.s3_server import Bucket
 from kissgs.io.ply import write_ply
 
 ROOT = Path(__file__).parents[2]
@@ -39,11 +37,18 @@ SLOW = json.dumps({"preset": "paper", "encode": {"plas_radius_decay": 0.99, "sh_
 
 
 class Service:
-    """Service for use as ``with Service(folder, KISSGS_X=…) as service``; ``service.http`` is its HTTP client."""
+    """Service for use as ``with Service(folder, KISSGS_X=…) as service``; ``service.http`` is its HTTP client.
+
+    Settings in small letters are constants of ``ServiceSettings``, such as ``sync_seconds=2``.
+    """
 
     def __init__(self, folder: Path, **settings: object) -> None:
         self.folder = folder
-        self.settings = {"KISSGS_MIN_FREE_BYTES": 0, **settings}
+        self.constants = {name: value for name, value in settings.items() if name.islower()}
+        self.settings = {
+            "KISSGS_MIN_FREE_BYTES": 0,
+            **{name: value for name, value in settings.items() if not name.islower()},
+        }
         self.log = folder.parent / f"{folder.name}.log"
         self.process: subprocess.Popen | None = None
 
@@ -61,7 +66,7 @@ class Service:
         chosen = {"KISSGS_PORT": 0, "KISSGS_DATA_DIR": self.folder, **self.settings}
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "service"],
+                [sys.executable, "-P", *self._program()],
                 env={**kept, "PYTHONPATH": str(ROOT), **{name: str(value) for name, value in chosen.items()}},
                 stdout=log,
                 stderr=log,
@@ -77,6 +82,13 @@ class Service:
                 break
             time.sleep(0.05)
         raise AssertionError(f"the service did not start: {self.log.read_text()[-3000:]}")
+
+    def _program(self) -> list[str]:
+        if not self.constants:
+            return ["-m", "service"]
+        changes = "".join(f"ServiceSettings.{name} = {value!r}\n" for name, value in self.constants.items())
+        imports = "from service.__main__ import main\nfrom service.core.settings import ServiceSettings\n"
+        return ["-c", f"{imports}{changes}main()"]
 
     def kill(self, number: int) -> int:
         """Send a signal, wait for the end, and return the exit status."""
@@ -173,80 +185,6 @@ class Service:
         connection = socket.create_connection(("127.0.0.1", self.port), timeout=300)
         connection.sendall(data)
         return connection
-
-
-class Replicas(Service):
-    """Replicas on one PostgreSQL database and one bucket, each with a data folder; requests go to them in turn."""
-
-    def __init__(self, folder: Path, count: int, bucket: Bucket, database: str, **settings: object) -> None:
-        self.bucket, self.database = bucket, database
-        fixed = {"KISSGS_DATABASE_URL": database, **bucket.variables}
-        folder.mkdir()
-        self.replicas = [Service(folder / f"replica{i}", **fixed, **settings) for i in range(count)]
-        super().__init__(self.replicas[0].folder)
-        self.workers = count
-
-    def start(self) -> Replicas:
-        for replica in self.replicas:
-            replica.start()
-        self.url, self.port, self.process = self.replicas[0].url, self.replicas[0].port, self.replicas[0].process
-        self.http = httpx.Client(base_url=self.url, timeout=300, trust_env=False, transport=_InTurn(self.replicas))
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for replica in self.replicas:
-            replica.__exit__()
-        self.http.close()
-
-    def restart(self) -> Replicas:
-        self.__exit__()
-        return self.start()
-
-    def kill(self, number: int) -> int:
-        for replica in self.replicas:
-            if replica.process.poll() is None:
-                replica.process.send_signal(number)
-        return max((replica.process.wait(timeout=300) for replica in self.replicas), key=abs)  # one signal for each
-
-    def children(self) -> list[int]:
-        return [child for replica in self.replicas for child in Service.children(replica)]
-
-    def memory(self) -> int:
-        return max(Service.memory(replica) for replica in self.replicas)
-
-    def stored(self) -> set[str]:
-        return {key.split("/")[1] for key in self.bucket.names() if key.startswith("jobs/")}
-
-    def uploads(self) -> list[str]:
-        return [name for replica in self.replicas for name in Service.uploads(replica)]
-
-    def leftovers(self) -> list[str]:
-        """Return the paths of files in the data folders, and the names of files that a succeeded job does not have."""
-        local = [
-            str(path)
-            for replica in self.replicas
-            for name in ("incoming", "jobs")
-            for path in (replica.folder / name).iterdir()
-        ]
-        result = "result-[0-9a-f]+-[0-9a-f]+/(summary.json|report.json|scene[.](zip|sog)|files/.+)"
-        kept = f"scene[.][a-z]+|{result}|decoded.(ply|json)"
-        return local + [
-            key
-            for key in self.bucket.names()
-            if not re.fullmatch(f"identity|database|jobs/[0-9a-f]{{32}}/({kept})", key)
-        ]
-
-
-class _InTurn(httpx.HTTPTransport):
-    """Transport that sends each request to the next replica."""
-
-    def __init__(self, replicas: list[Service]) -> None:
-        super().__init__(trust_env=False)
-        self._replicas = itertools.cycle(replicas)
-
-    def handle_request(self, request: httpx.Request) -> httpx.Response:
-        request.url = request.url.copy_with(port=next(self._replicas).port)
-        return super().handle_request(request)
 
 
 def read_response(connection: socket.socket) -> bytes:

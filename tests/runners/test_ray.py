@@ -133,6 +133,6 @@ def test_ray_is_not_installed(monkeypatch):
 def test_a_node_with_another_version(ray_cluster):
     from kissgs.runners.ray_driver import function_for_nodes
 
-    (event,) = function_for_nodes()(item("count", numbers=1).as_dict(), "0.0.0")
+    (event,) = function_for_nodes()(item("count", numbers=1).as_dict(), "0.0.0", None)
     assert (event["outcome"]["kind"], event["outcome"]["code"]) == ("error", "node-unusable")
     assert "this machine 0.0.0; install one version" in event["outcome"]["message"]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers.ray_cluster import NODE_MEMORY, PATHS, kill_tree, tree
-from helpers.ray_service import RayReplicas
+from helpers.ray_service import RayService
 from helpers.running import is_alive, wait_until
 from helpers.service import FAST, SLOW, SMALL, Service, events, scene_bytes
 
@@ -31,20 +31,22 @@ def settings_of(ray_cluster, ray_runner):
     wait_until(lambda: ray_runner.stats().cpus == 2)
     return {
         "local": common,
-        "ray": {**common, "KISSGS_RUNNER": "ray", "KISSGS_RAY_ADDRESS": ray_cluster.address},
+        "ray": {**common, "KISSGS_RUNNER": ray_cluster.address},
     }
 
 
-@pytest.fixture(scope="module", params=["local", "ray", pytest.param("bucket", marks=pytest.mark.exhaustive)])
-def service(request, settings_of, tmp_path_factory):
-    """A service with each runner, and replicas whose jobs run on a cluster without a folder that all see."""
-    folder = tmp_path_factory.mktemp(request.param) / "data"
-    if request.param != "bucket":
-        made = Service(folder, **settings_of[request.param])
-    else:
-        cluster, server, new_database = map(request.getfixturevalue, ("ray_cluster", "s3_server", "new_database"))
-        made = RayReplicas(folder, cluster, server.bucket(), new_database())
-    with made as it:
+@pytest.fixture(scope="module", params=["local", "ray", "ray without a shared folder"])
+def service(request, settings_of, ray_cluster, tmp_path_factory):
+    """A service with each runner, on a cluster with and without a folder that all nodes see."""
+    folder = tmp_path_factory.mktemp("data")
+    if request.param == "ray":
+        (folder / "shared").touch()
+    on_this_machine = request.param == "local"
+    with (
+        Service(folder / "a", **settings_of["local"])
+        if on_this_machine
+        else RayService(folder / "a", ray_cluster) as it
+    ):
         yield it
 
 
@@ -58,7 +60,7 @@ def processes_of(service, *jobs):
     """Wait for the processes of running jobs, the only ones of the service; return their ids."""
 
     def look():
-        if isinstance(service, RayReplicas):
+        if isinstance(service, RayService):
             return service.children()
         found = []
         for link in Path("/proc").glob("[0-9]*/cwd"):
@@ -159,8 +161,8 @@ def test_the_limits_of_jobs(settings_of, tmp_path, runner):
 
 
 @pytest.mark.quick(0)
-def test_a_job_whose_node_is_killed_runs_elsewhere(settings_of, whole_cluster, tmp_path):
-    with Service(tmp_path / "data", **settings_of["ray"]) as service:
+def test_a_job_whose_node_is_killed_runs_elsewhere(whole_cluster, tmp_path):
+    with RayService(tmp_path / "data", whole_cluster) as service:
         job = service.submit(MEDIUM, FAST)
         (pid,) = processes_of(service, job)
         kill_tree(next(node for node in whole_cluster.nodes if pid in tree(node.pid)))
@@ -189,7 +191,7 @@ def test_training_without_the_gpu_that_it_requests_fails_and_does_not_wait(setti
 
 
 def test_a_cluster_that_cannot_be_reached_is_a_problem_of_the_settings(ray_cluster, tmp_path):
-    variables = {"KISSGS_RUNNER": "ray", "KISSGS_RAY_ADDRESS": "127.0.0.1:1", "KISSGS_DATA_DIR": str(tmp_path / "data")}
+    variables = {"KISSGS_RUNNER": "127.0.0.1:1", "KISSGS_DATA_DIR": str(tmp_path / "data")}
     command = [sys.executable, "-P", "-m", "service"]
     done = subprocess.run(
         command,

@@ -26,9 +26,6 @@ class Records:
     def active(self):
         return []
 
-    def count_replicas(self):
-        return 1
-
     def rates(self, kind, evaluate):
         return [self.given[kind]] if kind in self.given else []
 

@@ -11,7 +11,7 @@ from helpers.service import FAST, SMALL, problem
 import kissgs
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.io.container_names import CONTAINERS, ENDINGS
-from service.core.formats import CONTAINER_FILES, Format
+from service.core.files import CONTAINER_FILES, Format
 from service.core.schemas import JobOptions
 from service.http.submission import Submission
 

@@ -125,7 +125,7 @@ def test_announced_bodies_reserve_no_disk_space(start):
 
 @pytest.mark.quick(0)
 def test_decoded_scenes_are_reclaimable(start):
-    service = start(KISSGS_MAX_DISK_BYTES=5 * len(SMALL), KISSGS_KEEP_UPLOADS="false")
+    service = start(KISSGS_MAX_DISK_BYTES=5 * len(SMALL))
     jobs = [service.ended(service.submit(scene_bytes(300, 1, seed))) for seed in range(2)]
     for job in jobs:
         assert service.http.get(job["links"]["decoded"]).status_code == 200
@@ -187,14 +187,14 @@ def test_an_error_in_the_job_process_is_internal(tmp_path):
     import asyncio
 
     from service.core.settings import ServiceSettings
-    from service.jobs.runner import JobRunner
+    from service.jobs.process import JobProcess, JobRunners
 
     async def ignore(stage, fraction, note):
         pass
 
-    task = {"function": "job_process:nothing", "work": str(tmp_path), "source": ""}
-    outcome = asyncio.run(JobRunner.open(ServiceSettings()).process().run(task, ignore))
-    assert (outcome.kind, outcome.data["code"]) == ("error", "internal")
+    task = {"function": "job_process:nothing", "folder": str(tmp_path), "files": [], "work": "work", "source": "x"}
+    outcome = asyncio.run(JobProcess(JobRunners.open(ServiceSettings())).run(task, ignore))
+    assert (outcome.kind, outcome.code) == ("error", "internal")
 
 
 @pytest.mark.quick(0)
@@ -304,18 +304,6 @@ def test_refused_methods_list_the_allowed_ones(service):
     for path, allowed in (("/livez", "GET, HEAD"), ("/v1/jobs", "GET, POST"), ("/v1/jobs/x", "DELETE, GET, HEAD")):
         answer = service.http.patch(path)
         assert (answer.headers["allow"], allowed in answer.json()["detail"]) == (allowed, True)
-
-
-@pytest.mark.quick(0)
-def test_another_data_folder_is_refused(tmp_path):
-    from helpers.service import Service
-
-    database = f"sqlite:///{tmp_path}/shared.sqlite"
-    with Service(tmp_path / "a", KISSGS_DATABASE_URL=database) as service:
-        job = service.ended(service.submit())
-        with pytest.raises(AssertionError, match="another data folder"):
-            Service(tmp_path / "b", KISSGS_DATABASE_URL=database).start()
-        assert service.status(job)["state"] == "succeeded"
 
 
 @pytest.mark.quick(0)

@@ -7,18 +7,18 @@ from concurrent.futures import Future
 import pytest
 from helpers.data_folders import add_a_job, service
 
-from kissgs.runners import Outcome as ItemOutcome
-from kissgs.runners import Resources, RunHandle, RunnerStats
+from kissgs.runners import NOT_STARTED, Outcome, Resources, RunHandle, RunnerStats
 from service.core.models import State
 from service.core.settings import ServiceSettings
 from service.jobs import worker as worker_module
-from service.jobs.runner import JobRunner, Outcome
+from service.jobs.process import JobProcess, JobRunners, postponed
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 
-TASK = {"function": "bucket_job:compress", "settings": {"preset": "fast"}}
-TRAINING = {"function": "bucket_job:compress", "settings": {"preset": "fast", "finetune": {"enabled": True}}}
-LOST = Outcome("lost", {"code": "crashed", "detail": "the machine was lost"})
+TASK = {"function": "job_process:compress", "folder": "/jobs/1", "files": [], "source": "scene.ply", "work": "work-1"}
+TASK["settings"] = {"preset": "fast"}
+TRAINING = {**TASK, "settings": {"preset": "fast", "finetune": {"enabled": True}}}
+LOST = Outcome("lost", code="crashed", message="the machine was lost")
 
 
 class Cluster:
@@ -51,42 +51,41 @@ async def ignore(stage, fraction, note):
 
 
 def outcome_on(cluster, task, local=None, **settings):
-    runner = JobRunner(ServiceSettings(job_threads=1, **settings), cluster, local or Cluster())
-    return asyncio.run(runner.process().run(task, ignore))
+    runners = JobRunners(ServiceSettings(job_threads=1, **settings), cluster, local or Cluster())
+    return asyncio.run(JobProcess(runners).run(task, ignore))
 
 
 MESSAGE = "the machine secret-7 cannot use the folder of the work: no such file"
 
 
 def test_a_node_that_cannot_work_loses_the_start_and_is_named_in_the_log_only(caplog):
-    cluster = Cluster(ItemOutcome("error", code="node-unusable", message=MESSAGE, node="10.0.0.7"))
+    cluster = Cluster(Outcome("error", code="node-unusable", message=MESSAGE, node="10.0.0.7"))
     outcome = outcome_on(cluster, TASK)
-    assert (outcome.kind, outcome.data["code"]) == ("lost", "internal")
-    assert "secret-7" not in outcome.data["detail"]
+    assert (outcome.kind, outcome.code) == ("lost", "internal")
+    assert "secret-7" not in outcome.message
     assert f"a job could not run on 10.0.0.7: {MESSAGE}" in caplog.text
 
 
 def test_on_this_machine_another_start_would_meet_the_same():
-    cluster = Cluster(ItemOutcome("error", code="node-unusable", message=MESSAGE))
+    cluster = Cluster(Outcome("error", code="node-unusable", message=MESSAGE))
     outcome = outcome_on(cluster, TASK, local=cluster)
-    assert (outcome.kind, outcome.data["code"]) == ("error", "output")
-    assert "secret-7" not in outcome.data["detail"]
+    assert (outcome.kind, outcome.code) == ("error", "output")
+    assert "secret-7" not in outcome.message
 
 
 @pytest.mark.parametrize(
     ("problem", "largest", "expected"),
     [
-        ("the connection to the Ray cluster was lost", None, "postponed"),
-        (None, None, "postponed"),  # no node has joined again yet
-        (None, Resources(8, 1 << 40), "error"),
-        (None, Resources(8, 1 << 40, 1), "done"),
+        ("the connection to the Ray cluster was lost", None, NOT_STARTED),
+        (None, None, NOT_STARTED),  # no node has joined again yet
+        (None, Resources(8, 1 << 40), "unsupported"),
+        (None, Resources(8, 1 << 40, 1), ""),
     ],
 )
 def test_training_fails_only_if_the_cluster_answers_and_has_no_gpu(problem, largest, expected):
-    outcome = outcome_on(Cluster(ItemOutcome("done"), problem, largest), TRAINING, job_gpus=1)
-    assert outcome.kind == expected
-    if expected == "error":
-        assert outcome.data["code"] == "unsupported"
+    outcome = outcome_on(Cluster(Outcome("done"), problem, largest), TRAINING, job_gpus=1)
+    assert outcome.code == expected
+    assert outcome.kind == {"unsupported": "error", "": "done"}.get(expected, "lost")
 
 
 @pytest.fixture
@@ -98,7 +97,7 @@ def context(tmp_path):
 def run(context, job, kind, meanwhile=None):
     """Run a job whose start has this outcome at once; return the seconds until that is recorded."""
 
-    async def follow(job, process, place):
+    async def follow(job, process):
         return kind
 
     async def measured():
@@ -157,19 +156,19 @@ def test_starts_that_are_not_possible_are_logged_once_and_rarely_tried(context, 
         pauses.append(seconds)
 
     monkeypatch.setattr(context.worker, "_rest", rest)
-    reason = Outcome("postponed", {"reason": "the machine node-7 could not start a process: no space left on device"})
+    reason = postponed("the machine node-7 could not start a process: no space left on device")
     job_id = add_a_job(context)
     for _ in range(5):
         run(context, context.store.claim(), reason)
     assert pauses == [1, 2, 4, 8, 8]
     assert caplog.text.count("could not start a process: no space left on device") == 1
     assert (context.store.get(job_id).state, context.store.get(job_id).starts) == (State.QUEUED, 0)
-    run(context, context.store.claim(), Outcome("error", {"code": "time-limit", "detail": "too long"}))
+    run(context, context.store.claim(), Outcome("error", code="time-limit", message="too long"))
     add_a_job(context)
     run(context, context.store.claim(), reason)
     assert pauses[-1] == 1
 
 
 def test_a_reason_of_the_runner_reaches_the_worker():
-    outcome = outcome_on(Cluster(ItemOutcome("lost", code="not-started", message="no more processes")), TASK)
-    assert (outcome.kind, outcome.data) == ("postponed", {"reason": "no more processes"})
+    outcome = outcome_on(Cluster(Outcome("lost", code="not-started", message="no more processes")), TASK)
+    assert outcome == postponed("no more processes")

@@ -13,10 +13,9 @@ from helpers.data_folders import add_a_job, finish_a_job, listing, names, servic
 from helpers.running import wait_until
 from helpers.service import SLOW, SMALL, problem, scene_bytes
 
+from kissgs.runners import Outcome
 from service.core.models import State
 from service.jobs.expiry import ExpiryTask
-from service.jobs.runner import Outcome
-from service.jobs.workplace import workplace
 
 
 def a_file(folder, elsewhere):
@@ -137,16 +136,15 @@ def test_recovery_follows_no_links(tmp_path):
 def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
     """A folder that was not empty once blocked its worker for ever."""
 
-    def refuse(job_id, folder, work):
+    def refuse(job_id, work):
         raise OSError(errno.ENOTEMPTY, "Directory not empty")
 
     with service(tmp_path / "data") as context:
         add_a_job(context)
         job = context.store.claim()
         monkeypatch.setattr(context.storage, "keep_result", refuse)
-        place = workplace(context.settings, context.storage, job)
-        place.task()
-        asyncio.run(asyncio.wait_for(context.worker._finish(job, Outcome("done", {}), place), 10))
+        work = context.storage.new_work(job.id)
+        asyncio.run(asyncio.wait_for(context.worker._finish(job, Outcome("done", {}), work), 10))
         found = context.store.get(job.id)
         assert (found.state, found.problem["code"]) == (State.FAILED, "output")
         assert found.problem["detail"].endswith("cannot be written: directory not empty; try again later")
@@ -156,7 +154,7 @@ def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
 def test_permanent_errors(tmp_path, monkeypatch, error):
     monkeypatch.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
     with service(tmp_path / "data") as context:
-        recorder = context.worker._recorder
+        recorder = context.worker.completion
         assert recorder.is_permanent(OSError(error, os.strerror(error)))
         assert not recorder.is_permanent(OSError(errno.ENOSPC, "no space left on device"))
         context.storage.jobs.rename(tmp_path / "away")

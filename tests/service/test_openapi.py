@@ -47,7 +47,7 @@ def test_schemathesis(tmp_path, seed):
             [
                 *(Path(sys.executable).with_name("schemathesis"), "--config-file", ROOT / "schemathesis.toml", "run"),
                 *(f"{service.url}/openapi.json", "--seed", str(seed), "--max-examples", "5", "--no-color"),
-                *("--suppress-health-check", "all", "--generation-database", "none"),
+                *("--suppress-health-check", "all", "--generation-database", "none", "--request-timeout", "60"),
             ],
             cwd=tmp_path,
             env={**os.environ, "PYTHONPATH": f"{ROOT / 'tests'}:{ROOT}", "SCHEMATHESIS_HOOKS": "helpers.schema_hooks"},

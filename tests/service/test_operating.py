@@ -52,7 +52,7 @@ def test_all_invalid_settings_are_reported_at_once(environment):
         "KISSGS_CORS_ORIGINS": "example.org",
         "KISSGS_JOB_MEMORY": "1MB",
         "KISSGS_JOB_SECONDS": "nan",
-        "KISSGS_LOG_LEVEL": "loud",
+        "KISSGS_RUNNER": "slurm",
         "KISSGS_WORKERS": "0",
     }
     for name, value in invalid.items():
@@ -75,8 +75,7 @@ def test_invalid_settings_end_in_a_message(tmp_path):
     blocked.write_text("")
     for settings, message in (
         ({"KISSGS_DATA_DIR": str(blocked / "data")}, "not a directory"),
-        ({"KISSGS_DATABASE_URL": "nothing://x"}, "KISSGS_DATABASE_URL"),
-        ({"KISSGS_DATABASE_URL": f"sqlite:///{tmp_path}/no/jobs.sqlite"}, "cannot be opened"),
+        ({"KISSGS_DATABASE_URL": "sqlite:///x"}, "KISSGS_DATABASE_URL: there is no such setting"),
     ):
         ended = command(**{"KISSGS_DATA_DIR": str(tmp_path / "data"), **settings})
         assert (ended.returncode, ended.stdout) == (2, "")
@@ -95,6 +94,14 @@ def test_a_database_of_another_version_is_refused(tmp_path):
     ended = command(KISSGS_DATA_DIR=str(tmp_path / "data"))
     assert ended.returncode == 2
     assert "version 99" in ended.stderr
+
+
+def test_a_second_service_on_a_data_folder_is_refused(service):
+    ended = command(KISSGS_DATA_DIR=str(service.folder))
+    assert (ended.returncode, ended.stdout) == (2, "")
+    expected = f"KISSGS_DATA_DIR: another service is using {service.folder}; use a separate folder"
+    assert ended.stderr == f"kissgs-serve: {expected}\n"
+    assert service.ended(service.submit())["state"] == "succeeded"
 
 
 def test_a_port_in_use(service, tmp_path):

@@ -8,7 +8,7 @@ import sys
 import pytest
 from helpers.service import ROOT
 
-from service.cli.main import main
+from service.__main__ import main
 
 
 def test_the_service_does_not_know_its_own_name():

@@ -15,7 +15,7 @@ from helpers.service import ROOT, problem, read_response
 
 from service.core.settings import ServiceSettings
 from service.http.app import create_app
-from service.http.routes import preview
+from service.http.routes import page
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 VENDOR = ROOT / "web_decoder" / "vendor"
@@ -44,7 +44,7 @@ def folder(tmp_path, monkeypatch):
     for name in (*FILES, *UNSERVED):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(FILES.get(name, "secret"))
-    monkeypatch.setattr(preview, "WEB_DECODER", folder)
+    monkeypatch.setattr(page, "WEB_DECODER", folder)
     return folder
 
 

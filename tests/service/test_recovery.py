@@ -70,7 +70,7 @@ def test_a_result_of_a_queued_job_is_recovered(two_jobs, upload, caplog):
 @pytest.mark.quick(0)
 def test_a_restored_database_with_a_running_service(tmp_path):
     """Both jobs are queued in the copy, but have succeeded since; one has lost its upload, the other has kept it."""
-    with Service(tmp_path / "data", KISSGS_KEEP_UPLOADS="false") as it:
+    with Service(tmp_path / "data") as it:
         long = it.submit(scene_bytes(20_000, 3), SLOW)
         it.running(long)
         jobs = [it.submit(), it.submit()]
@@ -84,7 +84,7 @@ def test_a_restored_database_with_a_running_service(tmp_path):
             path.unlink()
         for path in (tmp_path / "copy").glob("jobs.sqlite*"):
             shutil.copy(path, it.folder / path.name)
-        shutil.copy(tmp_path / "copy" / "jobs" / jobs[1]["id"] / "scene.ply", it.folder / "jobs" / jobs[1]["id"])
+        (it.folder / "jobs" / jobs[0]["id"] / "scene.ply").unlink()
         it.restart()
         assert [it.http.get(it.ended(job)["links"]["result"]).content for job in jobs] == zips
         assert it.http.get("/readyz").status_code == 200
@@ -194,8 +194,8 @@ def test_a_damaged_result(two_jobs, damage, state, caplog):
         (context.storage.new_work(job) / "result").mkdir()  # of a former start, and not complete
         work = context.storage.new_work(job)
         summary = write_result(context, job, work / "result")
-        context.storage.keep_result(job, "result", work)
-        context.storage.keep_result(job, "result", work)  # repeated if the end could not be recorded
+        context.storage.keep_result(job, work)
+        context.storage.keep_result(job, work)  # repeated if the end could not be recorded
         context.storage.remove_work(job)
         assert sorted(path.name for path in (folder / "jobs" / job).iterdir()) == ["result", "scene.ply"]
         assert json.loads((context.storage.result(job) / "summary.json").read_text()) == summary
@@ -204,4 +204,4 @@ def test_a_damaged_result(two_jobs, damage, state, caplog):
 def test_a_missing_result(two_jobs):
     folder, waiting, _ = two_jobs
     with service(folder) as context, pytest.raises(FileNotFoundError, match="its result is missing"):
-        context.storage.keep_result(waiting, "result", folder / "jobs" / waiting)
+        context.storage.keep_result(waiting, folder / "jobs" / waiting)

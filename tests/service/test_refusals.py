@@ -268,7 +268,7 @@ def test_idempotency_keys_work_with_a_full_queue(start):
 def test_too_many_uploads(start):
     service = start(KISSGS_MAX_UPLOADS=1)
     with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\nply\n"):
-        http = httpx.Client(base_url=service.url, trust_env=False)  # the limit is that of each replica
+        http = httpx.Client(base_url=service.url, trust_env=False)
         wait_for(lambda: "kissgs_uploads_in_flight 1.0" in http.get("/metrics").text)
         problem(http.post("/v1/jobs", content=SMALL), 429, "too-many-uploads")
     wait_for(lambda: http.post("/v1/jobs", content=SMALL).status_code == 202)
@@ -277,7 +277,7 @@ def test_too_many_uploads(start):
 
 @pytest.mark.quick(0)
 def test_disk_limit(start):
-    service = start(KISSGS_MAX_DISK_BYTES=2 * len(SMALL), KISSGS_KEEP_UPLOADS="true")
+    service = start(KISSGS_MAX_DISK_BYTES=2 * len(SMALL))
     job = service.ended(service.submit())
     assert "source" in job["links"]
     second = service.ended(service.submit(scene_bytes(300, seed=1)))  # the first job's upload is reclaimed
@@ -301,7 +301,7 @@ def test_minimum_free_disk_space(start):
 
 
 def test_a_stalled_upload(start):
-    service = start(KISSGS_UPLOAD_IDLE_SECONDS=0.5)
+    service = start(upload_idle_seconds=0.5)
     with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\nply\n") as connection:
         answer = read_response(connection)
         assert answer.startswith(b"HTTP/1.1 408")
@@ -311,7 +311,7 @@ def test_a_stalled_upload(start):
 
 def test_a_slow_upload(start):
     """Single bytes do not keep an upload alive."""
-    service = start(KISSGS_UPLOAD_IDLE_SECONDS=1)
+    service = start(upload_idle_seconds=1)
     connection = service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\n")
     connection.settimeout(0.2)
     answer, begun = b"", time.monotonic()

@@ -59,7 +59,7 @@ def test_the_server_is_killed_during_an_upload(start):
 @pytest.mark.quick(0)
 def test_the_server_is_killed_at_any_time(start, seed):
     """The job succeeds although the server is killed several times."""
-    service = start(KISSGS_JOB_STARTS=1000)
+    service = start(job_starts=1000)
     rng = random.Random(seed)
     job = service.submit()
     for _ in range(6):
@@ -83,7 +83,7 @@ def test_the_server_is_killed_while_the_result_is_written(start):
 
 @pytest.mark.quick(0)
 def test_a_job_that_crashes_the_server_fails_after_its_last_start(start):
-    service = start(KISSGS_JOB_STARTS=2)
+    service = start(job_starts=2)
     job = service.submit(BIG, SLOW)
     for _ in range(2):
         service.running(job)
@@ -153,17 +153,3 @@ def rewind(service, job, state):
             "UPDATE jobs SET state = ?, result = NULL, finished_at = NULL, expires_at = NULL WHERE id = ?",
             (state, job["id"]),
         )
-
-
-@pytest.mark.quick(0)
-def test_jobs_in_postgresql_survive(start, postgresql):
-    service = start(KISSGS_DATABASE_URL=postgresql)
-    done, running, waiting = service.ended(service.submit()), service.submit(MEDIUM), service.submit()
-    service.running(running)
-    service.kill(signal.SIGKILL)
-    service.restart()
-    assert service.only_result(waiting) == service.only_result(done) == EXPECTED
-    assert service.status(running)["starts"] == 2
-    listed = service.http.get("/v1/jobs").json()["jobs"]
-    assert [job["id"] for job in listed] == [job["id"] for job in (waiting, running, done)]
-    assert service.http.get("/readyz").status_code == 200

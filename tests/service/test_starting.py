@@ -3,13 +3,9 @@
 import shutil
 
 import pytest
-import sqlalchemy as sa
-from helpers.data_folders import database, finish_a_job, listing, names, opened, service
+from helpers.data_folders import database, finish_a_job, listing, names, service
 
-from service.core.models import SCHEMA_VERSION, State
-from service.core.settings import SettingsError
-from service.storage.job_files import FolderStorage
-from service.storage.job_records import Store
+from service.core.models import State
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 
@@ -17,45 +13,23 @@ pytestmark = pytest.mark.usefixtures("no_variables")
 def test_repeated_starts(tmp_path):
     with service(tmp_path / "data") as context:
         job = finish_a_job(context)
-    numbers = (tmp_path / "data" / "identity").read_text(), (tmp_path / "data" / "database").read_text()
     for _ in range(2):
         with service(tmp_path / "data") as context:
             assert context.store.get(job).state == State.SUCCEEDED
             assert context.storage.result(job).exists()
             assert context.storage.count_orphaned() == 0
-    assert ((tmp_path / "data" / "identity").read_text(), (tmp_path / "data" / "database").read_text()) == numbers
 
 
-@pytest.mark.parametrize("lost", [["database"], ["identity"], ["identity", "database"]])
-@pytest.mark.parametrize("numbered", [True, False])
-@pytest.mark.quick(2)
-def test_a_folder_of_a_development_version(jobs_folder, lost, numbered):
-    """Missing numbers are restored, because folder and database have common jobs."""
-    for name in lost:
-        (jobs_folder / name).unlink()
-    if not numbered:
-        database(jobs_folder, "DELETE FROM meta WHERE name = 'identity'")
+def test_a_folder_of_an_earlier_version(jobs_folder):
+    """It has numbers of the folder and of its owner, in files and in the database."""
+    for name in ("identity", "database"):
+        (jobs_folder / name).write_text("123\n")
+    for name in ("folder", "owner", "owner-process", "owner-machine"):
+        database(jobs_folder, f"INSERT INTO meta VALUES ('{name}', 123)")
     with service(jobs_folder) as context:
         assert context.storage.job_ids() == context.store.ids()
         assert context.store.health_problem() is None
         assert finish_a_job(context) in context.store.ids()
-    with service(jobs_folder) as context:
-        assert len(context.store.ids()) == 121
-
-
-@pytest.mark.parametrize("step", ["write_number", "bind_to"])
-def test_an_interrupted_first_start(tmp_path, monkeypatch, step):
-    def end(*arguments):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr({"write_number": FolderStorage, "bind_to": Store}[step], step, end)
-        with pytest.raises(KeyboardInterrupt):
-            opened(tmp_path / "data")
-    with service(tmp_path / "data") as context:
-        finish_a_job(context)
-    with service(tmp_path / "data") as context:
-        assert len(context.store.ids()) == 1
 
 
 def test_a_start_after_the_jobs_were_moved_away(jobs_folder):
@@ -75,12 +49,6 @@ def test_no_jobs_and_a_new_database(tmp_path):
     (tmp_path / "data" / "jobs.sqlite").unlink()
     with service(tmp_path / "data") as context:
         assert context.store.health_problem() is None
-
-
-def test_a_database_in_memory_is_refused(tmp_path):
-    for url in ("sqlite://", "sqlite:///:memory:"):
-        with pytest.raises(SettingsError, match="in memory"):
-            opened(tmp_path / "data", url)
 
 
 # Orphaned folders ---------------------------------------------------------------------------------------------------
@@ -153,39 +121,3 @@ def test_an_interrupted_removal_is_completed(tmp_path):
 def test_only_jobs_are_removed(jobs_folder, name):
     with service(jobs_folder) as context, pytest.raises(ValueError, match="not a job id"):
         context.storage.remove_job(name)
-
-
-# PostgreSQL ----------------------------------------------------------------------------------------------------------
-
-
-def test_starts_with_postgresql(postgresql, tmp_path):
-    with service(tmp_path / "data", postgresql) as context:
-        job = finish_a_job(context)
-        assert context.store.health_problem() is None
-    with service(tmp_path / "data", postgresql) as context:
-        assert context.storage.job_ids() == {job}
-    before = listing(tmp_path / "data")
-    with pytest.raises(SettingsError, match="another data folder"):
-        opened(tmp_path / "other", postgresql)
-    engine = sa.create_engine(postgresql)
-
-    def assert_refused(*statements, message):
-        with engine.begin() as connection:
-            for statement in statements:
-                connection.execute(sa.text(statement))
-        with pytest.raises(SettingsError, match=message) as caught:
-            opened(tmp_path / "data", postgresql)
-        assert "\n" not in str(caught.value)
-
-    assert_refused("UPDATE meta SET value = 99 WHERE name = 'schema'", message="schema version 99")
-    assert_refused(
-        f"UPDATE meta SET value = {SCHEMA_VERSION} WHERE name = 'schema'",
-        "DROP TABLE events",
-        message="no table events",
-    )
-    assert_refused("DELETE FROM jobs", "DELETE FROM meta", message="is new and has none of them")
-    assert_refused("DROP TABLE jobs, meta", message="is new and has none of them")
-    with engine.connect() as connection:
-        assert sa.inspect(connection).get_table_names() == []  # none was created
-    engine.dispose()
-    assert listing(tmp_path / "data") == before

@@ -1,4 +1,4 @@
-"""The job store on SQLite and PostgreSQL; oracle: a table of allowed state transitions."""
+"""The job store; oracle: a table of allowed state transitions."""
 
 import contextlib
 import itertools
@@ -18,18 +18,10 @@ ALLOWED = {
 }
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.exhaustive)])
-def url(request, tmp_path):
-    if request.param == "sqlite":
-        yield f"sqlite:///{tmp_path / 'jobs.sqlite'}"
-        return
-    yield request.getfixturevalue("postgresql")
-
-
 @pytest.fixture
-def store(url):
+def store(tmp_path):
     ticks = itertools.count(1000)
-    opened = Store(url, lambda: float(next(ticks)))
+    opened = Store(tmp_path / "jobs.sqlite", lambda: float(next(ticks)))
     yield opened
     opened.close()
 
@@ -45,7 +37,6 @@ def set_state(store, number, state):
 
 
 @pytest.mark.parametrize(("before", "after"), list(itertools.product(State, State)))
-@pytest.mark.quick(36)
 def test_state_transitions(store, before, after):
     number = add(store).number
     set_state(store, number, before)
@@ -192,12 +183,12 @@ def test_queries(store):
     assert store.events(jobs[0].number) == []
 
 
-def test_jobs_survive_reopening(url):
-    first = Store(url, lambda: 5.0)
+def test_jobs_survive_reopening(tmp_path):
+    first = Store(tmp_path / "jobs.sqlite", lambda: 5.0)
     number = add(first, name="Schloß \u4e2d", options={"preset": "fast", "encode": {"seed": 2**31 - 1}}).number
     first.heartbeat()
     first.close()
-    second = Store(url, lambda: 6.0)
+    second = Store(tmp_path / "jobs.sqlite", lambda: 6.0)
     (found,) = second.in_state(State.QUEUED)
     assert (found.number, found.name, found.options["encode"]) == (number, "Schloß \u4e2d", {"seed": 2**31 - 1})
     assert second.latest_time() == 5.0

@@ -15,7 +15,7 @@ import kissgs
 from kissgs import CompactSettings
 from kissgs.compaction.result import CompactionStep
 from kissgs.core.errors import OutputError
-from service.core.disk_estimates import STEPS_BYTES, checkpoint_bytes
+from service.core.files import STEPS_BYTES, checkpoint_bytes
 from service.jobs import job_process
 
 pytest.importorskip("torch")
@@ -149,15 +149,15 @@ def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, saved):
     work = tmp_path / "work"
     work.mkdir()
     (tmp_path / "scene.ply").write_bytes(SMALL)
-    monkeypatch.chdir(work)
+    monkeypatch.chdir(tmp_path)
     task = {
-        "source": str(tmp_path / "scene.ply"),
-        "work": str(work),
+        "source": "scene.ply",
+        "work": "work",
         "settings": BRIEF,
         "format": "sogxt",
         "container": "scene.zip",
         "evaluate": False,
-        "checkpoint": str(tmp_path / "checkpoint.npz"),
+        "checkpoint": "checkpoint.npz",
         "threads": 0,
         "device": "cpu",
     }

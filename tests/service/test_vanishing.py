@@ -11,13 +11,12 @@ import time
 from functools import partial
 
 import pytest
-import sqlalchemy as sa
 from helpers.running import wait_until
 from helpers.service import SLOW, SMALL, Service, problem, read_response, scene_bytes
 
 from service.core.models import State
-from service.storage import database_health
-from service.storage.database_health import DatabaseReplacedError
+from service.storage import database
+from service.storage.database import DatabaseReplacedError
 from service.storage.job_records import Store
 
 HEAD = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n"
@@ -106,7 +105,7 @@ def test_changes_are_detected_before_an_upload_is_read(start, kind):
 )
 def test_damage_in_any_page_is_detected(tmp_path, damage):
     """The damaged pages have rows that no request reads."""
-    store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
+    store = Store(tmp_path / "jobs.sqlite", time.time)
     execute(tmp_path, *[f"INSERT INTO meta VALUES ('{number:032}', 1.0)" for number in range(3000)])
     execute(tmp_path, "PRAGMA wal_checkpoint(TRUNCATE)")
     assert store.health_problem() is None
@@ -175,7 +174,7 @@ def test_no_accepted_job_is_lost(start):
     assert len(running) == 1  # none was started after the removal
     assert "no job is started: jobs.sqlite was removed" in service.log.read_text() or service.children()
     service.kill(signal.SIGKILL)
-    with pytest.raises(AssertionError, match="the job database is new and has none of them; restore"):
+    with pytest.raises(AssertionError, match="is new and has none of them; restore"):
         service.restart()
     assert {path.name for path in (service.folder / "jobs").iterdir()} == stored
     for link in kept:
@@ -270,8 +269,8 @@ def test_a_read_only_database(tmp_path, monkeypatch):
     def read_only(file):
         return sqlite3.connect(f"file:{file}?mode=ro", uri=True, isolation_level=None, check_same_thread=False)
 
-    monkeypatch.setattr(database_health, "_open", read_only)
-    store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
+    monkeypatch.setattr(database, "_open", read_only)
+    store = Store(tmp_path / "jobs.sqlite", time.time)
     assert "readonly" in store.health_problem()
     store.close()
 
@@ -279,7 +278,7 @@ def test_a_read_only_database(tmp_path, monkeypatch):
 def test_nothing_is_started_or_written_after_the_removal(tmp_path):
     from helpers.job_rows import add
 
-    store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
+    store = Store(tmp_path / "jobs.sqlite", time.time)
     waiting, running = add(store), add(store)
     remove(tmp_path)
     for change in (
@@ -304,7 +303,7 @@ def test_nothing_is_started_or_written_after_the_removal(tmp_path):
 def test_a_transaction_during_the_removal_fails(tmp_path, monkeypatch):
     from helpers.job_rows import add
 
-    store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
+    store = Store(tmp_path / "jobs.sqlite", time.time)
     monkeypatch.setattr("service.storage.job_records._add_event", lambda *arguments: remove(tmp_path))
     with pytest.raises(DatabaseReplacedError):
         add(store)
@@ -313,7 +312,7 @@ def test_a_transaction_during_the_removal_fails(tmp_path, monkeypatch):
 
 def test_checks_are_fast(tmp_path):
     """The check runs before every submission; its median duration is measured."""
-    store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
+    store = Store(tmp_path / "jobs.sqlite", time.time)
     spent = []
     for _ in range(100):
         begun = time.perf_counter()
@@ -321,36 +320,3 @@ def test_checks_are_fast(tmp_path):
         spent.append(time.perf_counter() - begun)
     assert sorted(spent)[50] < 0.02
     store.close()
-
-
-def test_a_database_server(postgresql):
-    store = Store(postgresql, time.time)
-    assert store.health_problem() is None
-    engine = sa.create_engine(postgresql)
-
-    def change(statement):
-        with engine.begin() as connection:
-            connection.execute(sa.text(statement))
-
-    with engine.connect() as other:
-        other.execute(sa.text("LOCK TABLE meta"))
-        assert "lock timeout" in store.health_problem()
-    assert store.health_problem() is None
-    change("ALTER DATABASE postgres SET default_transaction_read_only = on")
-    store._engine.dispose()
-    try:
-        assert "read-only transaction" in store.health_problem()
-    finally:
-        change("BEGIN; SET TRANSACTION READ WRITE; ALTER DATABASE postgres RESET default_transaction_read_only")
-        engine.dispose()
-        store._engine.dispose()
-    assert store.health_problem() is None
-    change("UPDATE meta SET value = 7 WHERE name = 'identity'")
-    assert store.health_problem() == "it was replaced by another database"
-    with pytest.raises(DatabaseReplacedError):
-        store.heartbeat()
-    change("ALTER TABLE jobs DROP COLUMN note")
-    change("DROP TABLE events")
-    assert store.health_problem() is not None
-    store.close()
-    engine.dispose()

@@ -10,8 +10,7 @@ from helpers.service import FAST, SMALL, problem, read_response
 
 from service.core.problems import ProblemError
 from service.core.settings import ServiceSettings
-from service.http.multipart import MAX_PREAMBLE_BYTES, PartBegin, PartData, parts
-from service.http.uploads import Spool, scene_name
+from service.http.uploads import MAX_PREAMBLE_BYTES, PartBegin, PartData, Spool, parts, scene_name
 from service.jobs.admission import Admission
 
 HEAD = SMALL.index(b"end_header\n") + 11

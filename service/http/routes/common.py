@@ -29,10 +29,7 @@ def problems(*codes: str) -> dict[int | str, dict[str, Any]]:
     for code in ("unauthorized", "invalid-request", "internal", "database", *codes):
         answer = answers.setdefault(
             PROBLEM_TYPES[code].status,
-            {
-                "description": "",
-                "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-            },
+            {"description": "", "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}},
         )
         answer["description"] = ". ".join(
             filter(None, (answer["description"], f"{PROBLEM_TYPES[code].title} (`{code}`)"))

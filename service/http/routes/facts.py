@@ -10,13 +10,13 @@ from sqlalchemy.exc import SQLAlchemyError
 
 import kissgs
 
-from ...core.formats import CONTAINER_FILES
+from ...core.files import CONTAINER_FILES
 from ...core.metrics import CONTENT_TYPE
 from ...core.presets import can_train, presets
 from ...core.problems import PROBLEM_TYPES, ProblemError
 from ...core.schemas import Health, Limits, Presets, ProblemKind, Version
 from ...jobs.container import Service, ServiceContainer
-from ...storage.database_health import error_text
+from ...storage.database import error_text
 from .common import MAX_WAIT_SECONDS, NO_STORE, problems
 
 router = APIRouter()

@@ -10,21 +10,11 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from ...core.models import ACTIVE, Job, State
-from ...core.notifier import ended
-from ...core.problems import ProblemError, unusable_storage
+from ...core.problems import ProblemError
 from ...core.schemas import JobPage, JobStatus
 from ...jobs.container import Owner, Service, ServiceContainer
 from ..submission import RAW_TYPES, submit
-from .common import (
-    MAX_WAIT_SECONDS,
-    NO_STORE,
-    RequestedJob,
-    accepts,
-    problems,
-    reload,
-    statuses,
-    wait_for_end,
-)
+from .common import MAX_WAIT_SECONDS, NO_STORE, RequestedJob, accepts, problems, reload, statuses, wait_for_end
 from .results import CONTAINER_TYPES, container
 
 log = logging.getLogger("kissgs.service")
@@ -55,14 +45,11 @@ IdempotencyKey = Annotated[
         pattern="^[!-~]+$",
     ),
 ]
-Wait = Annotated[
-    float,
-    Query(description="Maximum wait for the end of the job, seconds.", ge=0, le=MAX_WAIT_SECONDS),
-]
+Wait = Annotated[float, Query(description="Maximum wait for the end of the job, seconds.", ge=0, le=MAX_WAIT_SECONDS)]
 
 _REFUSALS = (
     *("invalid-scene", "unsupported", "key-reused", "media-type", "too-large", "upload-timeout", "upload-aborted"),
-    *("queue-full", "too-many-jobs", "too-many-uploads", "disk-full", "stopping", "storage"),
+    *("queue-full", "too-many-jobs", "too-many-uploads", "disk-full", "stopping"),
 )
 
 _BODY: dict[str, Any] = {
@@ -292,18 +279,16 @@ async def cancel_job(context: Service, job: RequestedJob, response: Response) ->
     status_code=204,
     operation_id="delete",
     summary="Delete a job",
-    responses={204: {"description": "The job was deleted."}, **problems("not-found", "storage")},
+    responses={204: {"description": "The job was deleted."}, **problems("not-found")},
 )
 async def delete_job(context: Service, job: RequestedJob) -> Response:
     """Cancel a job if it has not ended, and remove all its data."""
     await context.worker.cancel(job)
     context.decoder.stop(job.id)
     completion = context.worker.completion
-    if not await run_sync(completion.expire, job.number, job.id):  # first, as a folder without a job would be kept
-        raise unusable_storage()
+    await run_sync(completion.expire, job.number, job.id)  # first, as a folder without a job would be kept
     await run_sync(completion.forget, job.number)
-    context.notifier.notify(job.id)
-    context.notifier.notify(ended(job.id))
+    context.notifier.notify_end(job.id)
     log.info("job %s deleted", job.id)
     return Response(status_code=204)
 

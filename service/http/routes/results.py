@@ -1,26 +1,122 @@
-"""Routes of a job's files: container, its single files, decoded scene, upload, report."""
+"""Routes of results, whose files are sent with ranges, conditional requests and checksums."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from pathlib import PurePath
+import base64
+import re
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import quote
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, Path, Response
+from fastapi import APIRouter, Response
+from fastapi import Path as PathParameter
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import FileResponse
+from starlette.types import Message, Receive, Scope, Send
 
-from ...core.formats import CONTAINER_FILES, container_file
+from ...core.files import CONTAINER_FILES, container_file
 from ...core.models import Job, State
-from ...core.problems import ProblemError, unusable_storage
-from ...jobs.completion import result_folder
+from ...core.problems import ProblemError
 from ...jobs.container import Service, ServiceContainer
-from ...storage.job_storage import StoredObject
-from ...storage.object_store import ObjectStoreError
-from ..file_response import StoredFile, described, removed
 from .common import RequestedJob, problems
 
-log = logging.getLogger("kissgs.service")
+
+class StoredFile(FileResponse):
+    """Starlette's response for an immutable file, with a strong ETag, digests and ``If-None-Match``.
+
+    Of ranges, it sends a single valid one; others are ignored, as RFC 9110 permits. ``download`` is the file name for
+    saving in a browser; None lets the browser show the file.
+
+    Raises:
+        ProblemError: it was removed.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        sha256: str,
+        media_type: str,
+        download: str | None = None,
+        headers: dict[str, str] | None = None,
+    ) -> None:
+        digest = f"sha-256=:{base64.b64encode(bytes.fromhex(sha256)).decode()}:"
+        fixed = {"ETag": f'"{sha256}"', "Content-Digest": digest, "Repr-Digest": digest, **(headers or {})}
+        if download is not None:
+            fixed["Content-Disposition"] = _attachment(download)
+        try:
+            found = path.stat()
+        except FileNotFoundError as error:
+            raise removed() from error
+        super().__init__(path, media_type=media_type, headers=fixed, stat_result=found)
+        self._size = found.st_size
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send 304 if the client has the current file, else the file or the requested range of it."""
+        asked = Headers(scope=scope)
+        reads = scope["method"] in ("GET", "HEAD")
+        if reads and _names(", ".join(asked.getlist("if-none-match")), self.headers["etag"]):
+            kept = ("etag", "cache-control", "content-location")
+            same = {name: value for name, value in self.headers.items() if name in kept}
+            await Response(status_code=304, headers=same)(scope, receive, send)
+            return
+
+        async def corrected(message: Message) -> None:
+            if message["type"] == "http.response.start" and message["status"] != 200:
+                if message["status"] == 416:
+                    text = f"the range is outside the file, which has {self._size} bytes; request a range within it"
+                    raise ProblemError("range", text, headers={"Content-Range": f"bytes */{self._size}"})
+                del MutableHeaders(raw=message["headers"])["content-digest"]  # it would be that of the whole file
+            await send(message)
+
+        if not _is_range(asked.getlist("range")):
+            scope = {**scope, "headers": [(name, value) for name, value in scope["headers"] if name != b"range"]}
+        await super().__call__(scope, receive, corrected)
+
+
+def described(summary: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """Return the entry of a job's summary at a path of names.
+
+    Raises:
+        ProblemError: it does not exist.
+    """
+    entry: Any = summary
+    for name in names:
+        if not isinstance(entry, dict) or name not in entry:
+            raise ProblemError(
+                "not-found", f"the job has no file {name[:80]!r}; sizes.files of its status lists all files"
+            )
+        entry = entry[name]
+    return dict(entry)
+
+
+def removed() -> ProblemError:
+    """Return the problem of a file that has expired or was reclaimed since the job was read."""
+    return ProblemError("gone", "the file was removed during the request; submit the scene again")
+
+
+def _attachment(name: str) -> str:
+    """Format a Content-Disposition header (RFC 6266) with an ASCII fallback of the name."""
+    plain = name.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_").replace("\\", "_")
+    return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"
+
+
+def _names(header: str, etag: str) -> bool:
+    tags = [tag.strip().removeprefix("W/") for tag in header.split(",")]
+    return header.strip() == "*" or etag in tags
+
+
+def _is_range(headers: list[str]) -> bool:
+    """Return whether this is a single range of bytes."""
+    pattern = r"\s*bytes\s*=\s*([0-9]{0,18})\s*-\s*([0-9]{0,18})\s*"
+    found = re.fullmatch(pattern, headers[0], re.IGNORECASE) if len(headers) == 1 else None
+    if not found or not (found[1] or found[2]):
+        return False
+    return not (found[1] and found[2] and int(found[1]) > int(found[2]))
+
 
 router = APIRouter(prefix="/v1/jobs/{id}", tags=["results"])
 
@@ -33,7 +129,7 @@ _PRIVATE = {"Cache-Control": "private, no-cache"}
 _FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 """Headers of container files, which never change."""
 
-_UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range", "storage")
+_UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range")
 
 
 def _file_answers(media_types: str, *codes: str) -> dict[int | str, dict[str, Any]]:
@@ -66,14 +162,16 @@ async def get_result(context: Service, job: RequestedJob) -> Response:
 
 
 async def get_file(
-    context: Service, job: RequestedJob, name: Annotated[str, Path(description="One of `sizes.files` of the job.")]
+    context: Service,
+    job: RequestedJob,
+    name: Annotated[str, PathParameter(description="One of `sizes.files` of the job.")],
 ) -> Response:
     """One file of the container, for readers that need only some. It never changes and may be cached."""
     _ready(job)
     entry = described(job.result or {}, ("files", name))
-    media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
-    file = await _open(context, job, f"{result_folder(job)}/files/{name}")
-    return StoredFile(file, sha256=entry["sha256"], media_type=media_type, headers=_FOREVER)
+    media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+    file = context.storage.result(job.id) / "files" / name
+    return await _stored(file, sha256=entry["sha256"], media_type=media_type, headers=_FOREVER)
 
 
 async def get_decoded(context: Service, job: RequestedJob) -> Response:
@@ -82,26 +180,25 @@ async def get_decoded(context: Service, job: RequestedJob) -> Response:
     file, entry = await context.decoder.scene(job)
     media_type = "application/octet-stream"
     download = f"{job.name}.decoded.ply"
-    return StoredFile(file, sha256=entry["sha256"], media_type=media_type, download=download, headers=_PRIVATE)
+    return await _stored(file, sha256=entry["sha256"], media_type=media_type, download=download, headers=_PRIVATE)
 
 
 async def get_source(context: Service, job: RequestedJob) -> Response:
     """The uploaded scene, for comparisons, unless it was removed to free disk space."""
     _ready(job)
-    name = await run_sync(context.storage.upload_name, job.id) if job.upload_kept else None
-    if name is None:
+    file = await run_sync(context.storage.upload, job.id)
+    if not job.upload_kept:
         raise ProblemError("gone", "the upload was removed to free disk space; the result is still available")
-    media_type, download = "application/octet-stream", f"{job.name}{PurePath(name).suffix}"
-    file = await _open(context, job, name)
-    return StoredFile(file, sha256=job.upload_sha256, media_type=media_type, download=download, headers=_PRIVATE)
+    media_type, download = "application/octet-stream", f"{job.name}{file.suffix}"
+    return await _stored(file, sha256=job.upload_sha256, media_type=media_type, download=download, headers=_PRIVATE)
 
 
 async def get_report(context: Service, job: RequestedJob) -> Response:
     """The report of the compression, as from the library."""
     _ready(job)
     entry = described(job.result or {}, ("report",))
-    file = await _open(context, job, f"{result_folder(job)}/report.json")
-    return StoredFile(file, sha256=entry["sha256"], media_type="application/json", headers=_PRIVATE)
+    file = context.storage.result(job.id) / "report.json"
+    return await _stored(file, sha256=entry["sha256"], media_type="application/json", headers=_PRIVATE)
 
 
 async def container(context: ServiceContainer, job: Job) -> StoredFile:
@@ -113,18 +210,12 @@ async def container(context: ServiceContainer, job: Job) -> StoredFile:
     _ready(job)
     entry = described(job.result or {}, ("container",))
     kind = container_file(job.options)
-    file, download = await _open(context, job, f"{result_folder(job)}/{kind.name}"), f"{job.name}{kind.ending}"
-    return StoredFile(file, sha256=entry["sha256"], media_type=kind.media_type, download=download, headers=_PRIVATE)
+    file, download = context.storage.result(job.id) / kind.name, f"{job.name}{kind.ending}"
+    return await _stored(file, sha256=entry["sha256"], media_type=kind.media_type, download=download, headers=_PRIVATE)
 
 
-async def _open(context: ServiceContainer, job: Job, name: str) -> StoredObject:
-    try:
-        return await run_sync(context.storage.open, job.id, name)
-    except FileNotFoundError as error:
-        raise removed() from error
-    except ObjectStoreError as error:
-        log.error("job %s: %s cannot be read: %s", job.id, name, error)
-        raise unusable_storage() from error
+async def _stored(path: Path, **values: Any) -> StoredFile:  # noqa: ANN401
+    return await run_sync(partial(StoredFile, path, **values))  # it reads the file's size
 
 
 def _ready(job: Job) -> None:
@@ -158,12 +249,7 @@ def _add(endpoint: Callable[..., Any], path: str, summary: str, media_types: str
         )
 
 
-_add(
-    get_result,
-    "/result",
-    "Download the container",
-    " ".join(CONTAINER_TYPES),
-)
+_add(get_result, "/result", "Download the container", " ".join(CONTAINER_TYPES))
 _add(get_file, "/files/{name}", "Download one file of the container", " ".join(_MEDIA_TYPES.values()))
 _add(
     get_decoded,

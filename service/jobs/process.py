@@ -1,12 +1,13 @@
-"""``JobRunner`` and ``JobProcess``: jobs as work items of a runner, on this machine or on a Ray cluster."""
+"""``JobProcess``: one start of a job, or a decoding, as a work item of a runner on this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import kissgs
 from kissgs import runners
@@ -17,6 +18,7 @@ from kissgs.runners import (
     NOT_STARTED,
     TIME_LIMIT,
     UNREACHABLE,
+    Outcome,
     Resources,
     RunHandle,
     Runner,
@@ -28,14 +30,8 @@ from .job_process import without_paths
 
 log = logging.getLogger("kissgs.service")
 
-COMPRESS, COMPRESS_IN_BUCKET, DECODE = "job_process:compress", "bucket_job:compress", "job_process:decode"
-"""Functions of this package that tasks name. The second has no folder here: its node makes a temporary one."""
-
-NODE_ERRORS = {
-    "storage": "the machines that run jobs cannot use the storage of the jobs' files; try again later",
-    "disk-full": "the machines that run jobs have no disk space for this one; try again later",
-}
-"""Sentences for clients by code, for errors of a node that another start of the job may not meet."""
+COMPRESS, DECODE = "job_process:compress", "job_process:decode"
+"""Functions of this package that tasks name."""
 
 UNUSABLE_NODES = "the machines that run jobs cannot work on this one; try again later"
 UNUSABLE_MACHINE = "the job's files cannot be used on this machine; try again later"
@@ -45,30 +41,20 @@ OnProgress = Callable[[str, float, str], Awaitable[None]]
 """Callback with a stage, its completed fraction (0 to 1), and a note, which may be empty."""
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a job process ended.
+POSTPONED = (UNREACHABLE, NOT_STARTED)
+"""Codes of "lost" outcomes of jobs that cannot run at the moment; the message, if any, is for the log."""
 
-    Attributes:
-        kind: "done" after success; "error" after an expected error; "crashed" if the process ended otherwise; "lost"
-            if its node was lost, or could not work; "stopped" after :meth:`JobProcess.kill`; "postponed" if the job
-            cannot run at the moment.
-        data: the result for "done"; ``code`` and ``detail`` of the problem for "error", "crashed" and "lost"; for
-            "postponed", a ``reason`` for the log, if it is not known otherwise.
-    """
 
-    kind: Literal["done", "error", "crashed", "lost", "stopped", "postponed"]
-    data: dict[str, Any] = field(default_factory=dict)
+def postponed(reason: str = "") -> Outcome:
+    """Return the outcome of a job that cannot run at the moment."""
+    return Outcome("lost", code=NOT_STARTED, message=reason)
 
 
 @dataclass(frozen=True, slots=True)
-class JobRunner:
+class JobRunners:
     """The runners of all jobs, and what each of them requests.
 
-    Attributes:
-        settings: settings of the service.
-        runner: runner of compressions; it starts all at once where the machines allow: the service counts its jobs.
-        local: runner of decoding, which is quick and for which a request waits: no job of a cluster delays it.
+    ``local`` decodes, which is quick and for which a request waits: no job of a cluster delays it.
     """
 
     settings: ServiceSettings
@@ -76,20 +62,16 @@ class JobRunner:
     local: Runner
 
     @classmethod
-    def open(cls, settings: ServiceSettings) -> JobRunner:
+    def open(cls, settings: ServiceSettings) -> JobRunners:
         """Open the runner that the settings name.
 
         Raises:
             kissgs.RunnerError: Ray is not installed or its cluster cannot be reached.
         """
         local = runners.open_runner("local", unlimited=True)
-        if settings.runner == "local":
+        if settings.ray_address is None:
             return cls(settings, local, local)
         return cls(settings, runners.open_runner("ray", settings.ray_address), local)
-
-    def process(self) -> JobProcess:
-        """Return a process for one task."""
-        return JobProcess(self)
 
     def health_problem(self) -> str | None:
         """Return why no job can run at the moment; None if jobs can."""
@@ -108,7 +90,7 @@ class JobRunner:
         """Return what a job requests: on a cluster, by default all processors of its smallest node."""
         settings = self.settings
         cpus = settings.job_threads or 1
-        if settings.runner == "ray" and not settings.job_threads:
+        if settings.ray_address is not None and not settings.job_threads:
             cpus = max(1, int(self.runner.stats().smallest_cpus))
         return Resources(cpus, int(settings.job_memory), settings.job_gpus if trains else 0)
 
@@ -125,7 +107,8 @@ class JobRunner:
             requested,
             seconds=self.settings.job_seconds,
             memory_limit=int(self.settings.job_memory),
-            folder=task.get("work"),
+            folder=task["folder"],
+            files=tuple(task["files"]),
             retries=0,
         )
 
@@ -136,13 +119,14 @@ def _trains(task: dict[str, Any]) -> bool:
 
 
 class JobProcess:
-    """One job process; call :meth:`run` once."""
+    """One job process; call :meth:`run` once. Its result goes to ``work``."""
 
-    def __init__(self, runner: JobRunner) -> None:
-        self._runner = runner
+    def __init__(self, job_runners: JobRunners) -> None:
+        self._runner = job_runners
         self._handle: RunHandle | None = None
-        self._used = runner.local
+        self._used = job_runners.local
         self._killed = False
+        self.work: Path | None = None
         self.ended = asyncio.Event()
 
     @property
@@ -166,7 +150,7 @@ class JobProcess:
         """
         if self._killed:
             self.ended.set()
-            return Outcome("stopped")
+            return Outcome("cancelled")
         item, self._used = self._runner.item(task), self._runner.runner_of(task)
         if item.resources.gpus and self._used.refusal(item.resources):
             self.ended.set()
@@ -191,44 +175,37 @@ class JobProcess:
     def _refused(self, resources: Resources) -> Outcome:
         """Return the outcome of training that no node can run: an error only if the cluster answers and has nodes."""
         if problem := self._runner.health_problem():
-            return Outcome("postponed", {"reason": problem})
+            return postponed(problem)
         refusal = self._used.refusal(resources)  # once more, because the cluster may have been connected again only now
         if refusal is None or self._runner.health_problem():
-            return Outcome("postponed")
-        detail = f"training is not possible at the moment: {refusal}; try again later"
-        return Outcome("error", {"code": "unsupported", "detail": detail})
+            return postponed()
+        message = f"training is not possible at the moment: {refusal}; try again later"
+        return Outcome("error", code="unsupported", message=message)
 
-    def _outcome(self, outcome: runners.Outcome, task: dict[str, Any]) -> Outcome:
+    def _outcome(self, outcome: Outcome, task: dict[str, Any]) -> Outcome:
         """Return the outcome in the words of the service, without paths of its files."""
         if outcome.log:
             log.error("a job's process failed: %s\n%s", outcome.message, outcome.log)
-        if outcome.kind == "done":
-            return Outcome("done", outcome.result)
-        if outcome.kind == "cancelled":
-            return Outcome("stopped")
-        if outcome.code in (UNREACHABLE, NOT_STARTED):
-            return Outcome("postponed", {"reason": outcome.message})
+        if outcome.kind in ("done", "cancelled") or outcome.code in POSTPONED:
+            return outcome
         if outcome.code == NODE_UNUSABLE:
             return self._unusable(outcome)
         if outcome.kind == "lost":
             log.warning("a job was lost: %s", outcome.message)
-            detail = "the machine that ran the job was lost; submit the scene again"
-            return Outcome("lost", {"code": "crashed", "detail": detail})
-        if outcome.code in NODE_ERRORS:
-            log.warning("a job could not run: %s", outcome.message)
-            return Outcome("lost", {"code": outcome.code, "detail": NODE_ERRORS[outcome.code]})
+            message = "the machine that ran the job was lost; submit the scene again"
+            return replace(outcome, code="crashed", message=message)
         if outcome.kind == "crashed":
-            return Outcome("crashed", {"code": "crashed", "detail": f"{outcome.message}; submit the scene again"})
-        return Outcome("error", {"code": outcome.code, "detail": self._detail(outcome, task)})
+            return replace(outcome, code="crashed", message=f"{outcome.message}; submit the scene again")
+        return replace(outcome, message=self._detail(outcome, task))
 
-    def _unusable(self, outcome: runners.Outcome) -> Outcome:
+    def _unusable(self, outcome: Outcome) -> Outcome:
         """Return the outcome on a machine that cannot work: another node of a cluster may be able to."""
         log.warning("a job could not run on %s: %s", outcome.node or "its machine", outcome.message)
         if self._used is self._runner.local:
-            return Outcome("error", {"code": "output", "detail": UNUSABLE_MACHINE})
-        return Outcome("lost", {"code": "internal", "detail": UNUSABLE_NODES})
+            return Outcome("error", code="output", message=UNUSABLE_MACHINE)
+        return Outcome("lost", code="internal", message=UNUSABLE_NODES)
 
-    def _detail(self, outcome: runners.Outcome, task: dict[str, Any]) -> str:
+    def _detail(self, outcome: Outcome, task: dict[str, Any]) -> str:
         if outcome.code == TIME_LIMIT:
             seconds = self._runner.settings.job_seconds
             return f"the job took longer than {seconds:g} s; choose a faster preset or fewer Gaussians"
@@ -236,4 +213,4 @@ class JobProcess:
             return "the job exceeded its memory limit; submit a scene with fewer Gaussians"
         if outcome.code == INTERNAL:
             return "the job failed because of an error in kissgs; please report it with the scene"
-        return without_paths(outcome.message, task) if "work" in task else outcome.message
+        return without_paths(outcome.message, task)

@@ -1,4 +1,4 @@
-"""Start the service, ask whether it is well, measure it, make keys."""
+"""Start the service, ask whether it is well, make keys."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import NoReturn
 
 import kissgs
 
-from ..core.paths import VENDOR_SCRIPT
-from ..core.settings import OWNER, ServiceSettings, SettingsError
+from .core.files import VENDOR_SCRIPT
+from .core.settings import OWNER, ServiceSettings, SettingsError
 
 EPILOG = """\
 Settings are environment variables; `kissgs-serve settings` lists them all. The first ones to know:
@@ -64,11 +64,9 @@ def _settings() -> ServiceSettings:
 
 
 def _run(settings: ServiceSettings) -> None:
-    logging.basicConfig(
-        level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s %(message)s", stream=sys.stderr
-    )
-    from ..http.app import create_app
-    from ..http.server import Server, allow_connections, listen
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s %(message)s", stream=sys.stderr)
+    from .http.app import create_app
+    from .http.server import Server, allow_connections, listen
 
     allow_connections()
     try:

@@ -1,0 +1,81 @@
+"""Names of uploads and containers, bounds for their sizes, and paths of files that belong to no Python package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import kissgs
+
+Format = Literal["sogxt", "sog"]
+"""Names of the library's containers."""
+
+DEFAULT: Format = "sogxt"
+
+
+@dataclass(frozen=True, slots=True)
+class ContainerFile:
+    """Ending and media type of a container.
+
+    Attributes:
+        ending: ending of the file's name.
+        media_type: type of the response. A ``.sog`` is a zip as well, but some browsers unpack what is called a zip, or
+            change the ending of its name; SOG has no registered type of its own.
+    """
+
+    ending: str
+    media_type: str
+
+    @property
+    def name(self) -> str:
+        """Name of the file in the folder of a result."""
+        return f"scene{self.ending}"
+
+
+CONTAINER_FILES: dict[Format, ContainerFile] = {
+    "sogxt": ContainerFile(".zip", "application/zip"),
+    "sog": ContainerFile(".sog", "application/octet-stream"),
+}
+
+UPLOAD_FILES = ("scene.ply", "scene.sog", "scene.spz", "scene.splat", "scene.ksplat", "scene.glb")
+"""Names of a job's upload, of which it has one: the ending tells formats that are not recognised by their content."""
+
+
+def container_file(options: dict[str, Any]) -> ContainerFile:
+    """Return the container's file for the stored options of a job; jobs without a format made SOG-XT."""
+    return CONTAINER_FILES[options.get("format", DEFAULT)]
+
+
+BYTES_PER_GAUSSIAN = (68, 104, 164, 248)
+"""Bytes per Gaussian of a ``.ply``, by SH degree."""
+
+RESULT_BYTES_PER_GAUSSIAN, RESULT_BYTES = 64, 32 << 20
+"""Upper bound for a result, which has every file of its container twice: per Gaussian, and for codebooks and report."""
+
+STEPS_BYTES = 300_000
+"""Upper bound for a checkpoint's record of completed steps, at the largest step count that the settings allow."""
+
+FINETUNE_BYTES, ENTRY_BYTES, MAX_ENTRIES = 12 * 14, 12 * 45, 1 << 16
+"""Fine-tuning state in bytes per Gaussian and per codebook entry, and the approximate maximum number of entries."""
+
+
+def checkpoint_bytes(gaussians: int, sh_degree: int, *, compact: bool = True, finetune: bool = False) -> int:
+    """Return an upper bound in bytes for the checkpoints of a scene's compaction and fine-tuning.
+
+    A compaction checkpoint holds each parameter and its two Adam moments, for at most all Gaussians of the scene. A
+    fine-tuning checkpoint holds the levels and the codebook entries, also with their moments. The larger of the two is
+    counted twice, because the previous checkpoint exists until the next one is complete.
+    """
+    first = compact * (STEPS_BYTES + 3 * BYTES_PER_GAUSSIAN[sh_degree] * gaussians)
+    second = finetune * (STEPS_BYTES + FINETUNE_BYTES * gaussians + ENTRY_BYTES * min(max(gaussians, 64), MAX_ENTRIES))
+    return first + second + max(first, second)
+
+
+_PACKAGE = Path(kissgs.__file__).parent
+
+ROOT = _PACKAGE if (_PACKAGE / "web_decoder").is_dir() else _PACKAGE.parent
+"""Folder of these files: the package ``kissgs`` in a wheel, the folder around it in a checkout."""
+
+WEB_DECODER = ROOT / "web_decoder"
+VENDOR_SCRIPT = ROOT / "scripts" / "vendor"
