@@ -207,7 +207,7 @@ def _suffix(file: str, output: str | None) -> str:
         raise UnsupportedError("kissgs render reads a file, not standard input")
     from kissgs.io.container_names import names_folder
 
-    if output is None or names_folder(output):
+    if output in (None, "-") or names_folder(output):
         return ".png"
     suffix = Path(output).suffix.lower()
     if suffix not in (".png", ".webp"):

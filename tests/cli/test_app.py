@@ -246,9 +246,9 @@ def test_an_unknown_ending_makes_no_folder(scene: Path, tmp_path: Path, words: s
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
 
 
-@pytest.mark.parametrize("name", ["x.usdz/", "v1.2", "a/v1.2", "new.v2/x/", "made.d"])
+@pytest.mark.parametrize("name", ["x.usdz/", "new/", "a/v1.2/", "made.d"])
 def test_names_of_folders(scene: Path, tmp_path: Path, name: str) -> None:
-    """A slash, no ending or one of digits, or a folder that exists."""
+    """A slash, or a folder that exists."""
     (tmp_path / "made.d").mkdir()
     assert run("convert", scene, name, "--to", "ply", "-q", cwd=tmp_path).returncode == 0
     assert [path.parent for path in tmp_path.rglob("*.ply")] == [tmp_path / name]
@@ -305,7 +305,7 @@ def test_a_command_that_fails_leaves_the_folder_of_another(tmp_path: Path) -> No
 
     def failing() -> None:
         with contextlib.suppress(kissgs.InvalidSceneError):
-            for_each_input([str(tmp_path / "a.ply")], tmp_path / "new/out", ".zip", False, fail)
+            for_each_input([str(tmp_path / "a.ply")], f"{tmp_path}/new/out/", ".zip", False, fail)
 
     def write(name: str, target: Path) -> dict[str, Any]:
         end.set()
@@ -316,7 +316,7 @@ def test_a_command_that_fails_leaves_the_folder_of_another(tmp_path: Path) -> No
     other = threading.Thread(target=failing)
     other.start()
     assert begun.wait(60)
-    for_each_input([str(tmp_path / "b.ply")], tmp_path / "new/out", ".zip", False, write)
+    for_each_input([str(tmp_path / "b.ply")], f"{tmp_path}/new/out/", ".zip", False, write)
     assert (tmp_path / "new" / "out" / "b.zip").read_bytes() == b"result"
 
 

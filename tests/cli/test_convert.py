@@ -78,14 +78,14 @@ def test_pipes(scene: Path, tmp_path: Path) -> None:
 def test_several_files_into_a_folder(scene: Path, tmp_path: Path) -> None:
     for name in ("one.ply", "two.ply"):
         (tmp_path / name).write_bytes(scene.read_bytes())
-    done = run("convert", tmp_path / "*.ply", tmp_path / "out", "--to", "compressed.ply", "--json")
+    done = run("convert", tmp_path / "*.ply", f"{tmp_path}/out/", "--to", "compressed.ply", "--json")
     assert [Path(report["output"]).name for report in json.loads(done.stdout)] == [
         "one.compressed.ply",
         "two.compressed.ply",
     ]
     assert "cannot all become" in failure("convert", tmp_path / "*.ply", tmp_path / "a.spz")
     (tmp_path / "boxes").mkdir()
-    message = failure("convert", tmp_path / "boxes", tmp_path / "two.ply", tmp_path / "more", "--to", "spz")
+    message = failure("convert", tmp_path / "boxes", tmp_path / "two.ply", f"{tmp_path}/more/", "--to", "spz")
     assert message.startswith(f"kissgs: {tmp_path}/boxes is a folder without a scene")
 
 
@@ -94,7 +94,7 @@ def test_compressed_ply_is_an_ending(scene: Path, tmp_path: Path) -> None:
     packed = tmp_path / "a.compressed.ply"
     assert run("convert", scene, packed).returncode == 0
     for kind in ("ply", "compressed.ply", "spz"):
-        assert run("convert", packed, tmp_path / "out", "--to", kind, "-q").returncode == 0
+        assert run("convert", packed, f"{tmp_path}/out/", "--to", kind, "-q").returncode == 0
     assert not kissgs.read_ply_info(tmp_path / "out" / "a.ply").compressed
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.compressed.ply", "a.ply", "a.spz"]
     assert run("compress", packed, "-p", "fast", "-q").returncode == 0
