@@ -1,12 +1,14 @@
-"""Compilation of inner loops by numba, on import, without the GIL and without threads of their own.
+"""Compilation of inner loops by numba, at their first call, without the GIL and without threads of their own.
 
-Kernels have explicit signatures, so importing their module compiles them or loads them from numba's per-user cache.
-Constants are literals inside the functions, because that cache does not notice a changed global.
+Each kernel has one signature, so that its bits do not depend on who calls it first; the first call compiles it or loads
+it from numba's per-user cache. Constants are literals inside the functions, because that cache does not notice a changed
+global.
 """
 
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar, cast
 
@@ -15,22 +17,57 @@ from numba.core.event import Event, Listener, install_listener
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
+kernels: list[Any] = []
+"""All kernels of the modules that are imported; the method ``load`` of each compiles it without a call."""
+
+_compiling = threading.RLock()
 _uncached: list[str] = []
 """Names of kernels for which numba found no folder to cache them in."""
 
 
 def compiled(signature: str, **options: Any) -> Callable[[Kernel], Kernel]:  # noqa: ANN401
-    """Compile with numba's njit; cached if numba finds a writable folder, else compiled by every process."""
+    """Compile with numba's njit at the first call; cached if numba finds a writable folder, else once per process."""
 
     def decorate(function: Kernel) -> Kernel:
         common = {"nogil": True, "error_model": "numpy", **options}
         try:
-            return cast("Kernel", njit(signature, cache=True, **common)(function))
+            kernel = njit(cache=True, **common)(function)
         except RuntimeError:
             _uncached.append(function.__name__)
-            return cast("Kernel", njit(signature, **common)(function))
+            kernel = njit(**common)(function)
+        _defer(kernel, signature)
+        kernels.append(kernel)
+        return cast("Kernel", kernel)
 
     return decorate
+
+
+def _defer(kernel: Any, signature: str) -> None:  # noqa: ANN401
+    """Let a kernel compile its signature, and no other, when Python or another kernel calls it first."""
+    template = kernel.get_call_template
+
+    def compile_signature() -> Any:  # noqa: ANN401
+        with _compiling:
+            if not kernel.signatures:
+                kernel.compile(signature)
+                kernel.disable_compile()
+            return next(iter(kernel.overloads.values()))
+
+    def called_by_python(*arguments: Any) -> Any:  # noqa: ANN401
+        overload = compile_signature()
+        given = [kernel.typeof_pyval(argument) for argument in arguments]
+        wanted = overload.signature.args
+        if len(given) != len(wanted) or None in map(kernel.typingctx.can_convert, given, wanted):
+            raise TypeError(f"{kernel.__name__} takes {wanted}, not {given}")
+        return overload.entry_point
+
+    def called_by_kernel(args: Any, kws: Any) -> Any:  # noqa: ANN401
+        compile_signature()
+        return template(args, kws)
+
+    # numba asks these two when it finds no compiled version of a kernel.
+    kernel._compile_for_args, kernel.get_call_template = called_by_python, called_by_kernel
+    kernel.load = compile_signature
 
 
 @contextlib.contextmanager
