@@ -16,12 +16,10 @@ import numpy as np
 from bench.common import arguments, fraction, head, row, run, training_views
 from kissgs import Splats, load
 from kissgs.cli.options import chosen
-from kissgs.compaction.evaluate import evaluate_scene
 from kissgs.compaction.merging import merge_gaussians
-from kissgs.compaction.popspa import Popspa
+from kissgs.compaction.popspa import Popspa, evaluate_scene
 from kissgs.compaction.scoring import highest_indices
-from kissgs.training.supervision import SCORING_STRIDE, supervision_views
-from kissgs.training.targets import training_targets
+from kissgs.training.supervision import SCORING_STRIDE, supervision_views, training_targets
 
 
 def random_subset(splats: Splats, count: int) -> Splats:

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt8
+from kissgs.core.resources import blas_workers
 from kissgs.core.splats import Splats
-from kissgs.core.threads import blas_workers
 from kissgs.io.planes import compress_images
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.planner import plan_encoding

@@ -16,19 +16,17 @@ import torch
 
 from bench.common import arguments, head, positive, row, run
 from kissgs import CompactSettings, Splats, load, virtual_views
-from kissgs.core.deadline import Pace
-from kissgs.core.free_memory import keep_free_memory
+from kissgs.core.progress import Pace
+from kissgs.core.resources import Workers, keep_free_memory
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
+from kissgs.rendering.cpu.backward import Gradients
 from kissgs.rendering.cpu.frame import draw
-from kissgs.rendering.cpu.gradients import Gradients
-from kissgs.rendering.differentiable import rasterize
-from kissgs.rendering.losses import photometric_loss
+from kissgs.rendering.differentiable import photometric_loss, rasterize
 from kissgs.rendering.rasterizer import load_kernels, removal_scores, render
 from kissgs.training.loop import TrainingPlan, torch_threads, train
 from kissgs.training.model import GaussianModel
-from kissgs.training.targets import TrainingTargets
+from kissgs.training.supervision import TrainingTargets
 
 REPEATS = 5
 NO_RATES = dict.fromkeys(ATTRIBUTES, 0.0)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from kissgs.cameras.captures.load import load_views
     from kissgs.cameras.views import View, Views
     from kissgs.cameras.virtual.select import virtual_views
-    from kissgs.client.remote import Remote
+    from kissgs.client import Remote
     from kissgs.compaction.result import Compacted, CompactionReport
     from kissgs.core.errors import (
         Cancelled,
@@ -38,16 +38,14 @@ if TYPE_CHECKING:
     from kissgs.pipeline.decompress import decompress
     from kissgs.pipeline.inspect import SceneInfo, read_scene_info
     from kissgs.pipeline.pipeline import Compressed, compact, compress
-    from kissgs.pipeline.read_options import ReadOptions
     from kissgs.pipeline.report import Report
-    from kissgs.pipeline.scene_files import load, save
-    from kissgs.pipeline.scene_formats import recognise
+    from kissgs.pipeline.scene_files import ReadOptions, load, recognise, save
     from kissgs.rendering.camera import Camera
     from kissgs.rendering.rasterizer import render
     from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
     from kissgs.settings import CompactSettings, EncodeSettings, FinetuneSettings, Preset, Settings
     from kissgs.streaming.compress import StreamedReport, compress_streamed
-    from kissgs.synthetic.scene import sample_scene
+    from kissgs.synthetic import sample_scene
 
 _HOMES = {
     "Camera": "rendering.camera",
@@ -71,8 +69,8 @@ _HOMES = {
     "PlyInfo": "io.ply",
     "Preset": "settings",
     "Progress": "core.progress",
-    "ReadOptions": "pipeline.read_options",
-    "Remote": "client.remote",
+    "ReadOptions": "pipeline.scene_files",
+    "Remote": "client",
     "RemoteError": "core.errors",
     "RunnerError": "core.errors",
     "Report": "pipeline.report",
@@ -94,9 +92,9 @@ _HOMES = {
     "measure_sensitivity": "rendering.sensitivity",
     "read_ply_info": "io.ply",
     "read_scene_info": "pipeline.inspect",
-    "recognise": "pipeline.scene_formats",
+    "recognise": "pipeline.scene_files",
     "render": "rendering.rasterizer",
-    "sample_scene": "synthetic.scene",
+    "sample_scene": "synthetic",
     "save": "pipeline.scene_files",
     "virtual_views": "cameras.virtual.select",
 }

@@ -7,17 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.cameras.captures.select_view import is_camera_file, pick_view, view_of_file
+from kissgs.cameras.captures.camera_json import is_camera_file, pick_view, view_of_file
 from kissgs.cameras.views import View, Views
-from kissgs.cameras.virtual.orbit_search import find_orbit
+from kissgs.cameras.virtual.orbit import find_orbit
 from kissgs.cameras.virtual.select import best_view, virtual_views
 from kissgs.core.array_types import UInt8
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.contact_sheet import Label, contact_sheet
-from kissgs.rendering.images import reframed, render_all
+from kissgs.rendering.images import Label, contact_sheet, reframed, render_all
 from kissgs.rendering.rasterizer import BLACK, Colour, Device, load_kernels
 
 IMAGE_SIZE, FRAME_SIZE, CELL_SIZE = (1280, 960), (640, 480), (320, 240)

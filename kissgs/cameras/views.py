@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kissgs.cameras.pixels import read_photo
-from kissgs.cameras.undistort import Lens, Window, undistort
+from kissgs.cameras.photographs import Lens, Window, read_photo, undistort
 from kissgs.core.array_types import Float32, Float64, UInt8
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.origin import WORLD, Origin

@@ -25,9 +25,8 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from kissgs.cli.arguments import ForceOption, ViewsOption
 from kissgs.cli.files import show
-from kissgs.cli.options import chosen, open_views
+from kissgs.cli.options import ForceOption, ViewsOption, chosen, open_views
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 
     from kissgs.cameras.views import Views
     from kissgs.evaluation.results import Evaluation
-    from kissgs.io.container_names import ContainerName
+    from kissgs.io.containers import ContainerName
     from kissgs.pipeline.report import Report
     from kissgs.settings import Settings
 
@@ -133,7 +132,7 @@ def bench(
 
 def _plot_beside(output: Path, force: bool) -> Path | None:
     """Check that the outputs can be written, before a long measurement; return the path of the plot, if any."""
-    from kissgs.io.atomic import refuse_existing
+    from kissgs.io.files import refuse_existing
 
     if output.suffix.lower() != ".csv":
         raise OutputError(f"{output!s:.100} is no name of a table; end it in .csv")
@@ -157,7 +156,7 @@ def measured(
 
 
 def _measure(scene: Path, settings: Settings, container: ContainerName, views: Views | None) -> Measurement:
-    from kissgs.core.timing import peak_memory
+    from kissgs.core.resources import peak_memory
     from kissgs.evaluation.evaluate import evaluate
     from kissgs.pipeline.decompress import decompress
     from kissgs.pipeline.pipeline import compress
@@ -224,7 +223,7 @@ def row_of(name: str, found: Measurement) -> Row:
 
 def _print_and_write(rows: Sequence[Row], output: Path | None, plot: Path | None, force: bool) -> None:
     """Print the table, write it and plot it; what cannot be printed is written nevertheless."""
-    from kissgs.io.atomic import atomic_file
+    from kissgs.io.files import atomic_file
 
     try:
         show(_table(rows))

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from kissgs.cli.arguments import (
+from kissgs.cli.files import for_each_input, say_notes, show, sibling, source, stdout
+from kissgs.cli.options import (
     AntialiasedOption,
     ForceOption,
     ForceViewsOption,
@@ -19,9 +20,13 @@ from kissgs.cli.arguments import (
     ScenesArgument,
     SetOption,
     ThreadsOption,
+    chosen,
+    count_of,
+    device_of,
+    open_views,
+    refuse_without_training,
+    share_of,
 )
-from kissgs.cli.files import for_each_input, say_notes, show, sibling, source, stdout
-from kissgs.cli.options import chosen, count_of, device_of, open_views, refuse_without_training, share_of
 from kissgs.core.errors import UnsupportedError
 
 CHECKPOINT = ".checkpoint.npz"
@@ -97,7 +102,7 @@ def compact(
     from kissgs.cli.signals import stoppable
     from kissgs.io.ply import write_ply
     from kissgs.pipeline.pipeline import compact as run
-    from kissgs.pipeline.read_options import ReadOptions
+    from kissgs.pipeline.scene_files import ReadOptions
     from kissgs.training.checkpoint import delete_checkpoints
 
     settings = chosen(

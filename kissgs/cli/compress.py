@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from kissgs.cli.arguments import (
+from kissgs.cli.files import for_each_input
+from kissgs.cli.options import (
     AntialiasedOption,
     ContainerOption,
     ForceOption,
@@ -31,9 +32,13 @@ from kissgs.cli.arguments import (
     TargetSizeOption,
     ThreadsOption,
     TimeOption,
+    budget_of,
+    chosen,
+    device_of,
+    open_views,
+    reading_options,
+    refuse_without_training,
 )
-from kissgs.cli.files import for_each_input
-from kissgs.cli.options import budget_of, chosen, device_of, open_views, reading_options, refuse_without_training
 
 CompactOption = Annotated[
     str | None,
@@ -114,8 +119,8 @@ def compress(
     quiet: QuietOption = False,
 ) -> None:
     """Compress each scene into a SOG-XT container, into SOG, or into a folder with levels of detail."""
-    from kissgs.cli.compress_options import CompressOptions
-    from kissgs.io.container_names import ending_of, named_container, named_manifest
+    from kissgs.cli.options import CompressOptions
+    from kissgs.io.containers import ending_of, named_container, named_manifest
     from kissgs.pipeline.training_choice import decided
 
     named = None if output is None else Path(output)

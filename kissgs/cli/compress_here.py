@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from kissgs.cameras.views import Views
-    from kissgs.cli.compress_options import CompressOptions
+    from kissgs.cli.options import CompressOptions
 
 
 def compress_here(options: CompressOptions, capture: Views | None, scene: str, target: Path) -> dict[str, Any]:

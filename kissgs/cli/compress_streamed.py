@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from kissgs.cli.compress_options import CompressOptions
+    from kissgs.cli.options import CompressOptions
 
 
 def refuse_options(manifest: Path, options: CompressOptions, *, container: str | None, unpacked: bool) -> None:

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kissgs.cli.arguments import (
+from kissgs.cli.console import progress_bar
+from kissgs.cli.files import for_each_input, say_notes, show, source, stdout
+from kissgs.cli.options import (
     AntialiasedOption,
     ForceOption,
     JsonOption,
@@ -18,14 +20,12 @@ from kissgs.cli.arguments import (
     QuietOption,
     RawAxesOption,
     ThreadsOption,
+    reading_options,
 )
-from kissgs.cli.console import progress_bar
-from kissgs.cli.files import for_each_input, say_notes, show, source, stdout
-from kissgs.cli.options import reading_options
 from kissgs.core.errors import InvalidSceneError, OutputError
 
 if TYPE_CHECKING:
-    from kissgs.pipeline.scene_output import OutputFormat
+    from kissgs.pipeline.scene_files import OutputFormat
 
 
 def convert(
@@ -54,9 +54,8 @@ def convert(
     """Convert scenes into .ply, .compressed.ply, .spz, .splat, .glb or .spz.glb; the ending of OUT decides."""
     from kissgs.core.origin import in_world
     from kissgs.core.splats import clean
-    from kissgs.io.atomic import atomic_file, refuse_existing
-    from kissgs.pipeline.scene_files import read_scene
-    from kissgs.pipeline.scene_output import write_scene
+    from kissgs.io.files import atomic_file, refuse_existing
+    from kissgs.pipeline.scene_files import read_scene, write_scene
 
     *inputs, output = files
     if not inputs:
@@ -89,8 +88,8 @@ def convert(
 
 def _output_format(output: str, to: str | None) -> OutputFormat:
     """Return the format of the outputs: ``--to``, or what the ending of the output stands for."""
-    from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS
-    from kissgs.pipeline.scene_output import OUTPUT_FORMATS, output_format
+    from kissgs.io.containers import ENDINGS, SCENE_ENDINGS
+    from kissgs.pipeline.scene_files import OUTPUT_FORMATS, output_format
 
     if to is None:
         if output == "-":

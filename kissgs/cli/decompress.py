@@ -8,7 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from kissgs.cli.arguments import (
+from kissgs.cli.console import progress_bar
+from kissgs.cli.files import for_each_input, say_notes, show, source, stdout
+from kissgs.cli.options import (
     AntialiasedOption,
     ForceOption,
     JsonOption,
@@ -19,8 +21,6 @@ from kissgs.cli.arguments import (
     ScenesArgument,
     ThreadsOption,
 )
-from kissgs.cli.console import progress_bar
-from kissgs.cli.files import for_each_input, say_notes, show, source, stdout
 from kissgs.core.errors import InvalidContainerError
 
 

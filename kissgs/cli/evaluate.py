@@ -10,7 +10,8 @@ from typing import Annotated, cast
 
 import typer
 
-from kissgs.cli.arguments import (
+from kissgs.cli.files import print_json, say_notes, show
+from kissgs.cli.options import (
     AntialiasedOption,
     ForceOption,
     ImagesOption,
@@ -24,9 +25,10 @@ from kissgs.cli.arguments import (
     ScaleOption,
     SplitOption,
     ViewsOption,
+    choice,
+    device_of,
+    open_views,
 )
-from kissgs.cli.files import print_json, say_notes, show
-from kissgs.cli.options import choice, device_of, open_views
 
 
 def evaluate(
@@ -70,7 +72,7 @@ def evaluate(
     from kissgs.evaluation.evaluate import evaluate as measure
     from kissgs.evaluation.html import ReportScene, html_report
     from kissgs.evaluation.results import Split
-    from kissgs.io.atomic import atomic_file, refuse_existing
+    from kissgs.io.files import atomic_file, refuse_existing
     from kissgs.pipeline.scene_files import load, stored_bytes
 
     used_split = cast(Split, choice("--split", split, Split))
@@ -116,7 +118,7 @@ def evaluate(
     if as_json:
         print_json({**result.as_dict(), "bytes": sizes})
     elif not quiet:
-        from kissgs.cli.evaluation_tables import evaluation_table
+        from kissgs.cli.tables import evaluation_table
 
         show(evaluation_table(result, sides[0], sides[1], asked=split))
         if html is not None:

@@ -100,7 +100,7 @@ def _each(
 
 def check_input(name: str, unreadable: type[KissgsError]) -> None:
     """Check the path of an input, so that an error names it and not the output path derived from it."""
-    from kissgs.io.atomic import reason_of
+    from kissgs.io.files import reason_of
 
     try:
         if name != "-":
@@ -118,7 +118,7 @@ def _entry(name: str, target: Path, writes: bool, report: dict[str, Any]) -> dic
 
 def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folder: bool) -> list[Path]:
     """Return the output path of each input: next to it, in the folder ``output``, or the file ``output``."""
-    from kissgs.io.container_names import FOLDER_ENDING, named_manifest, names_folder
+    from kissgs.io.containers import FOLDER_ENDING, named_manifest, names_folder
 
     if "-" in inputs and (len(inputs) > 1 or output is None):
         raise OutputError("standard input has no name and must be the only input; give the output with -o")
@@ -145,7 +145,7 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
 
 def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:
     """Raise OutputError for ``SCENE.ply NEW.zip``, as other tools name their output; -o names it here."""
-    from kissgs.io.container_names import ENDINGS
+    from kissgs.io.containers import ENDINGS
 
     if len(inputs) != 2 or not os.path.lexists(inputs[0]) or os.path.lexists(inputs[1]):
         return
@@ -156,7 +156,7 @@ def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:
 
 def _refuse_file_name(folder: Path, suffix: str) -> None:
     """Raise OutputError if the name of a folder to be made is that of a scene's file, which somebody expects there."""
-    from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS
+    from kissgs.io.containers import ENDINGS, SCENE_ENDINGS
 
     ending = folder.suffix.lower()
     if not ending:
@@ -209,7 +209,7 @@ def is_folder(path: Path) -> bool:
 
 def _make_folder(folder: Path) -> None:
     """Make a folder and its parents, if they do not exist."""
-    from kissgs.io.atomic import reason_of
+    from kissgs.io.files import reason_of
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -242,7 +242,7 @@ def stdout() -> Iterator[None]:
     except BrokenPipeError:
         os._exit(128 + signal.SIGPIPE)  # the reader has closed the pipe
     except OSError as error:
-        from kissgs.io.atomic import reason_of
+        from kissgs.io.files import reason_of
 
         discard_stdout()
         raise OutputError(f"cannot write to standard output: {reason_of(error)}") from error

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from kissgs.cli.arguments import FilesArgument, JsonOption, LevelOption, MaxGaussiansOption, RawAxesOption
 from kissgs.cli.files import for_each_input, show
+from kissgs.cli.options import FilesArgument, JsonOption, LevelOption, MaxGaussiansOption, RawAxesOption
 
 
 def info(
@@ -19,7 +19,7 @@ def info(
     """Describe scenes of any format and containers: Gaussians, SH degree, bytes per file, value ranges."""
     from kissgs.cli.tables import info_table
     from kissgs.pipeline.inspect import describe
-    from kissgs.pipeline.read_options import ReadOptions
+    from kissgs.pipeline.scene_files import ReadOptions
 
     reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kissgs.cli.arguments import (
+from kissgs.cli.files import for_each_input, print_json, show
+from kissgs.cli.options import (
     ContainerOption,
     MaxPsnrDropOption,
     MaxSsimDropOption,
@@ -16,7 +17,6 @@ from kissgs.cli.arguments import (
     PsnrOption,
     TargetSizeOption,
 )
-from kissgs.cli.files import for_each_input, print_json, show
 
 if TYPE_CHECKING:
     from kissgs.core.progress import Progress
@@ -86,9 +86,9 @@ def compress(
     from kissgs.cli.console import progress_bar
     from kissgs.cli.options import budget_of, chosen, origin_of
     from kissgs.cli.tables import status_table
-    from kissgs.client.remote import Remote
+    from kissgs.client import Remote
     from kissgs.core.errors import UnsupportedError
-    from kissgs.io.container_names import ending_of, named_container
+    from kissgs.io.containers import ending_of, named_container
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
@@ -132,7 +132,7 @@ def list_jobs(
     as_json: Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")] = False,
 ) -> None:
     """List the latest jobs on a server."""
-    from kissgs.client.remote import Remote
+    from kissgs.client import Remote
 
     with Remote(server, key=key) as remote:
         jobs = remote.jobs(limit)
@@ -157,10 +157,10 @@ def get(
     """Wait for a job to finish, and download its container."""
     from kissgs.cli.console import progress_bar
     from kissgs.cli.tables import status_table
-    from kissgs.client.remote import Remote
+    from kissgs.client import Remote
     from kissgs.core.errors import OutputError
-    from kissgs.io.atomic import refuse_existing
-    from kissgs.io.container_names import ENDINGS, ending_of, named_container
+    from kissgs.io.containers import ENDINGS, ending_of, named_container
+    from kissgs.io.files import refuse_existing
 
     if output is not None and output.suffix.lower() not in ENDINGS:
         raise OutputError(f"{output!s:.100} is not the name of a container; end it in {' or '.join(ENDINGS)}")
@@ -182,7 +182,7 @@ def cancel(
     key: KeyOption = None,
 ) -> None:
     """Cancel a job."""
-    from kissgs.client.remote import Remote
+    from kissgs.client import Remote
 
     with Remote(server, key=key) as remote:
         show(f"{job} {remote.cancel(job)['state']}")
@@ -190,7 +190,7 @@ def cancel(
 
 def _announcing(progress: Progress, server: str, quiet: bool) -> Progress:
     """Return a receiver that prints a line when the service refuses a request for the first time."""
-    from kissgs.client.remote import WAIT
+    from kissgs.client import WAIT
 
     said = quiet
 

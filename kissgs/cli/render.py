@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kissgs.cli.arguments import (
+from kissgs.cli.files import for_each_input, say_notes, show, write_stdout
+from kissgs.cli.options import (
     AntialiasedOption,
     ForceOption,
     ImagesOption,
@@ -21,9 +22,9 @@ from kissgs.cli.arguments import (
     ResolutionOption,
     ScaleOption,
     ViewsOption,
+    device_of,
+    open_views,
 )
-from kissgs.cli.files import for_each_input, say_notes, show, write_stdout
-from kissgs.cli.options import device_of, open_views
 from kissgs.core.errors import UnsupportedError
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def render(
     from kissgs.cameras.render import RenderJob
     from kissgs.cli.console import progress_bar
     from kissgs.evaluation.capture_fit import in_scene_frame
-    from kissgs.io.atomic import refuse_existing
+    from kissgs.io.files import refuse_existing
     from kissgs.pipeline.scene_files import load
 
     suffix = _suffix(file, output)
@@ -192,7 +193,7 @@ def render(
 
 
 def _deliver(data: bytes, target: Path, *, force: bool) -> None:
-    from kissgs.io.atomic import atomic_file
+    from kissgs.io.files import atomic_file
 
     if str(target) == "-":
         write_stdout(data)
@@ -205,7 +206,7 @@ def _suffix(file: str, output: str | None) -> str:
     """Return the ending of the output: .png unless ``output`` ends in .webp."""
     if file == "-":
         raise UnsupportedError("kissgs render reads a file, not standard input")
-    from kissgs.io.container_names import names_folder
+    from kissgs.io.containers import names_folder
 
     if output in (None, "-") or names_folder(output):
         return ".png"

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kissgs.cli.arguments import (
+from kissgs.cli.options import (
     ForceOption,
 )
 
@@ -21,6 +21,6 @@ def sample(
 ) -> None:
     """Write a synthetic sample scene: shiny, textured objects on a table."""
     from kissgs.pipeline.scene_files import save
-    from kissgs.synthetic.scene import sample_scene
+    from kissgs.synthetic import sample_scene
 
     save(sample_scene(gaussians, sh_degree=degree, seed=seed), output, overwrite=force)

@@ -13,7 +13,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kissgs.cli.arguments import (
+from kissgs.cli.console import progress_bar
+from kissgs.cli.files import check_input, say_notes, show, source
+from kissgs.cli.interrupts import Interrupted
+from kissgs.cli.options import (
     AntialiasedOption,
     ForceOption,
     MaxGaussiansOption,
@@ -21,15 +24,11 @@ from kissgs.cli.arguments import (
     RawAxesOption,
     ThreadsOption,
 )
-from kissgs.cli.console import progress_bar
-from kissgs.cli.files import check_input, say_notes, show, source
-from kissgs.cli.interrupts import Interrupted
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 
 if TYPE_CHECKING:
-    from kissgs.pipeline.read_options import ReadOptions
-    from kissgs.preview.page_scene import PageScene
-    from kissgs.preview.streamed_folder import StreamedFolder
+    from kissgs.pipeline.scene_files import ReadOptions
+    from kissgs.preview.page_scene import PageScene, StreamedFolder
 
 
 def view(
@@ -68,8 +67,8 @@ def view(
     quiet: QuietOption = False,
 ) -> None:
     """Show a scene in the browser, from a server on this machine that Ctrl-C ends; -o writes a page instead."""
-    from kissgs.pipeline.read_options import ReadOptions
-    from kissgs.preview.page_files import fetch_viewer, page_files
+    from kissgs.pipeline.scene_files import ReadOptions
+    from kissgs.preview.page_scene import fetch_viewer, page_files
 
     reading = ReadOptions(max_gaussians=max_gaussians, level=level or 0, raw_axes=raw_axes, antialiased=antialiased)
     check_input(scene, InvalidSceneError)
@@ -87,10 +86,9 @@ def view(
 def _write(
     scene: str, reading: ReadOptions, any_level: bool, output: Path, threads: int, force: bool, quiet: bool
 ) -> None:
-    from kissgs.io.atomic import atomic_file, refuse_existing
-    from kissgs.preview.page_scene import page_container
+    from kissgs.io.files import atomic_file, refuse_existing
+    from kissgs.preview.page_scene import fitting_level, is_streamed, page_container
     from kissgs.preview.standalone_page import standalone_page
-    from kissgs.preview.streamed_folder import fitting_level, is_streamed
 
     if output.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{output!s:.100} is not the name of a page: end it in .html")
@@ -129,8 +127,7 @@ def _prepare(
     scene: str, reading: ReadOptions, all_levels: bool, threads: int, quiet: bool
 ) -> PageScene | StreamedFolder:
     """Return what the server gets: a scene in memory, or the folder of a streamed one."""
-    from kissgs.preview.page_scene import page_scene
-    from kissgs.preview.streamed_folder import is_streamed_folder, streamed_folder
+    from kissgs.preview.page_scene import is_streamed_folder, page_scene, streamed_folder
 
     content = source(scene)
     if all_levels and isinstance(content, Path) and is_streamed_folder(content):

@@ -24,7 +24,7 @@ def warmup() -> None:
         from kissgs.compaction import merging  # noqa: F401
         from kissgs.finetuning import kernels  # noqa: F401
         from kissgs.planning import rdo_kernels, table_kernels  # noqa: F401
-        from kissgs.training import adam_kernels  # noqa: F401
+        from kissgs.training import optimizer as adam_kernels  # noqa: F401
 
         progress("kernels", 1.0)
         try:
@@ -35,10 +35,10 @@ def warmup() -> None:
 
 def _measure_speed() -> None:
     """Encode a synthetic scene twice, the first time to load what is needed, and save the time of the second."""
-    from kissgs.pipeline.machine_speed import save_speed
     from kissgs.pipeline.pipeline import compress
+    from kissgs.pipeline.search_time import save_speed
     from kissgs.settings import Preset, Settings
-    from kissgs.synthetic.scene import sample_scene
+    from kissgs.synthetic import sample_scene
 
     scene, settings = sample_scene(SAMPLE_COUNT), Settings(preset=Preset.BALANCED)
     compress(scene, settings=settings)

@@ -2,28 +2,135 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kissgs.compaction.checkpoint_state import State, Status, work_key
-from kissgs.compaction.evaluate import step_log
-from kissgs.compaction.result import Compacted, CompactionReport
-from kissgs.compaction.scene_training import SceneTraining
-from kissgs.compaction.schedule import Phase, first_pruning_count, stage_progress, training_phases
-from kissgs.compaction.step_log import StepLog
+from kissgs.cameras.views import Views
+from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
+from kissgs.compaction.scene_training import (
+    Phase,
+    SceneTraining,
+    State,
+    Status,
+    first_pruning_count,
+    stage_progress,
+    training_phases,
+    work_key,
+)
 from kissgs.core.errors import OutputError
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import Splats
+from kissgs.evaluation.cameras import evaluation_views
+from kissgs.evaluation.evaluate import compare_images
+from kissgs.evaluation.results import ImageMetrics
 from kissgs.rendering.rasterizer import Device, load_kernels
-from kissgs.settings import CompactSettings
+from kissgs.settings import CompactSettings, Preset, Settings
+from kissgs.sogxt.container import zip_bytes
+from kissgs.sogxt.encode import encode
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.supervision import SupervisionViews
 
 if TYPE_CHECKING:
-    from kissgs.compaction.sparsify import AdmmSparsifier
-    from kissgs.training.targets import TrainingTargets
+    from kissgs.compaction.regularizers import AdmmSparsifier
+    from kissgs.training.supervision import TrainingTargets
+
+
+# ``StepLog``: the steps of a compaction for the report.
+
+
+@dataclass(slots=True, eq=False)
+class StepLog:
+    """Records each step with its wall time and, if requested, its quality and size.
+
+    Attributes:
+        evaluate: function that returns image metrics and compressed bytes of a scene, see
+            :func:`kissgs.compaction.popspa.evaluate_scene`; None to leave them out. Its time does not count.
+        steps: recorded steps.
+    """
+
+    evaluate: Callable[[Splats], tuple[ImageMetrics, int]] | None
+    steps: list[CompactionStep] = field(default_factory=list)
+    _started: float = field(default_factory=time.perf_counter)
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since the last step ended, seconds."""
+        return time.perf_counter() - self._started
+
+    def record(self, name: str, scene: Splats) -> None:
+        """Add the step that has just ended with ``scene``."""
+        seconds = self.seconds
+        metrics, size = (None, None) if self.evaluate is None else self.evaluate(scene)
+        self.steps.append(
+            CompactionStep(
+                name=name,
+                count=len(scene),
+                seconds=seconds,
+                psnr=None if metrics is None else metrics.psnr,
+                ssim=None if metrics is None else metrics.ssim,
+                ms_ssim=None if metrics is None else metrics.ms_ssim,
+                bytes=size,
+            )
+        )
+        self._started = time.perf_counter()
+
+    def restore(self, steps: Sequence[CompactionStep], seconds: float) -> None:
+        """Continue after ``steps``, with ``seconds`` of the next one spent before the interruption."""
+        self.steps = list(steps)
+        self._started -= seconds
+
+
+# Evaluation of compacted scenes: image quality in views that no training used, and the size of the container.
+
+
+def evaluate_scene(
+    scene: Splats, reference: Splats, supervision: SupervisionViews, threads: int = 0, progress: Progress = silent
+) -> tuple[ImageMetrics, int]:
+    """Return the image metrics of a scene and its compressed size.
+
+    Args:
+        scene: the scene to evaluate, clean.
+        reference: the original scene; its renderings are compared with if there are no photographs.
+        supervision: its evaluation views are used if they have photographs, else cameras drawn over all of
+            ``reference``.
+        threads: number of threads; 0 means one per processor. The result does not depend on it.
+        progress: receives the stage ``"evaluate"``.
+
+    Returns:
+        Metrics to photographs if there are any, means over the views, and the bytes of a container with the preset
+        ``fast``, as a zip.
+
+    Raises:
+        InvalidViewsError: a photograph cannot be read.
+        UnsupportedError: an image would take too much memory.
+    """
+    as_evaluate = as_stage("evaluate", progress)
+    views = _views(reference, supervision, threads, as_evaluate)
+    evaluation = compare_images(reference, scene, views, threads=threads, progress=as_evaluate)
+    encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=as_evaluate)
+    return evaluation.mean.candidate, len(zip_bytes(encoded.files))
+
+
+def step_log(
+    evaluate: bool, reference: Splats, supervision: SupervisionViews, threads: int, progress: Progress
+) -> StepLog:
+    """Return an empty log, which evaluates each step if ``evaluate``; see :func:`evaluate_scene`."""
+    if not evaluate:
+        return StepLog(None)
+    return StepLog(
+        partial(evaluate_scene, reference=reference, supervision=supervision, threads=threads, progress=progress)
+    )
+
+
+def _views(reference: Splats, supervision: SupervisionViews, threads: int, progress: Progress) -> Views:
+    """Return the evaluation views of a capture with photographs, else cameras drawn over the whole scene."""
+    if any(view.photo is not None for view in supervision.test):
+        return supervision.eval_views
+    return evaluation_views(reference, threads=threads, progress=progress)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +189,7 @@ class Popspa:
 
     def load_targets(self) -> TrainingTargets:
         """Return the target images, loaded or rendered unless :attr:`targets` are given."""
-        from kissgs.training.targets import training_targets
+        from kissgs.training.supervision import training_targets
 
         return self.targets or training_targets(
             self.original, self.supervision, threads=self.threads, device=self.device, progress=self.progress
@@ -174,7 +281,7 @@ class _Run:
             self.log.record("prune", training.splats())
 
     def _sparsifier(self, phase: Phase, state: State) -> AdmmSparsifier | None:
-        from kissgs.compaction.sparsify import AdmmSparsifier
+        from kissgs.compaction.regularizers import AdmmSparsifier
 
         settings = self.task.settings
         if phase.name != "sparsify" or not settings.admm_rho:

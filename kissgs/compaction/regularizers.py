@@ -1,12 +1,17 @@
-"""Regularization of the shapes of Gaussians during training: neither needles nor balls."""
+"""Regularization in training: of the shapes of Gaussians, and of opacities, by ADMM."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from kissgs.core.array_types import Float
 from kissgs.training.loop import Parameters, TrainableScene
+
+# Regularization of the shapes of Gaussians during training: neither needles nor balls.
 
 EPSILON = 1e-7
 """Added to effective rank - 1: the loss of a perfect needle is 16.1."""
@@ -56,3 +61,71 @@ class ShapeRegularizer:
 
     def update(self, step: int, scene: TrainableScene) -> None:
         """Do nothing: the loss has no state."""
+
+
+# Sparsification of opacities by ADMM: opacities of the candidates for pruning are pulled to 0 during training.
+
+
+class AdmmSparsifier:
+    """Regularizer: minimise the loss subject to at most ``count`` opacities other than 0.
+
+    Zhang et al., "GaussianSpa: An Optimizing-Sparsifying Simplification Framework for Compact and High-Quality 3D
+    Gaussian Splatting" (CVPR 2025), section 4, as scaled ADMM: with the opacities o, 0 to 1, their sparse copy z and
+    the dual variable u, every ``interval`` steps
+
+    - the loss of the step has the penalty rho/2 · ‖o - z + u‖²,
+    - after the step, z becomes o + u with all but its ``count`` largest entries set to 0, and u becomes u + o - z.
+
+    Attributes:
+        z: ``(N,)`` float32, sparse copy of the opacities.
+        u: ``(N,)`` float32, dual variable.
+    """
+
+    def __init__(self, opacities: Float[Tensor, " N"], count: int, rho: float, interval: int) -> None:
+        """Start with z from the current opacities and u = 0.
+
+        Args:
+            opacities: ``(N,)`` logits, as stored.
+            count: number of opacities that may differ from 0.
+            rho: weight of the penalty.
+            interval: number of steps between two updates, 1 or more.
+        """
+        self._count, self._rho, self._interval = count, rho, interval
+        activated = _sigmoid(opacities.detach())
+        self.z, self.u = keep_largest(activated, count), torch.zeros_like(activated)
+
+    def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
+        """Return the penalty in every ``interval``-th step, as in the published code; None in the others."""
+        if (step + 1) % self._interval:
+            return None
+        return 0.5 * self._rho * (_sigmoid(parameters["opacities"]) - self.z + self.u).square().sum()
+
+    def update(self, step: int, scene: TrainableScene) -> None:
+        """Update z and u after every ``interval``-th step."""
+        if (step + 1) % self._interval:
+            return
+        with torch.no_grad():
+            activated = _sigmoid(scene.gaussians()["opacities"])
+            self.z = keep_largest(activated + self.u, self._count)
+            self.u += activated - self.z
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return z and u for a checkpoint, see :meth:`restore`."""
+        return {"z": self.z.cpu().numpy(), "u": self.u.cpu().numpy()}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from a :meth:`state`."""
+        self.z, self.u = (torch.from_numpy(state[name].copy()).to(self.z.device) for name in ("z", "u"))
+
+
+def keep_largest(values: Float[Tensor, " N"], count: int) -> Float[Tensor, " N"]:
+    """Return a copy with all but the ``count`` largest entries set to 0; of equal entries the first are kept."""
+    largest = torch.argsort(values, descending=True, stable=True)[:count]
+    sparse = torch.zeros_like(values)
+    sparse[largest] = values[largest]
+    return sparse
+
+
+def _sigmoid(logits: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """Return the sigmoid; the last bit of torch's own depends on the number of threads."""
+    return 1 / (1 + torch.exp(-logits))

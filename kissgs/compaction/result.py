@@ -42,8 +42,8 @@ class CountTrial:
 
     Attributes:
         count: number of Gaussians.
-        drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.psnr_loss.drop_of`).
-        ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.psnr_loss.ssim_drop_of`); None where that is
+        drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.results.drop_of`).
+        ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.results.ssim_drop_of`); None where that is
             no goal.
         ssim_decides: whether the limit of SSIM leaves the least room.
     """

@@ -1,29 +1,190 @@
-"""``SceneTraining``: a scene that is pruned and trained in turn, and its state."""
+"""``SceneTraining``: a scene that is pruned and trained in turn, by a schedule (KISS-GS, section 3.1)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from kissgs.cameras.virtual.scene_bounds import scene_bounds
-from kissgs.compaction.schedule import BASE_LR, Phase, lr_schedule
+from kissgs._version import __version__
+from kissgs.cameras.captures.posed_image import open_file
+from kissgs.cameras.virtual.candidates import scene_bounds
+from kissgs.compaction.result import CompactionStep
 from kissgs.compaction.scoring import prune_by_score
 from kissgs.core.array_types import Float32, Int
-from kissgs.core.deadline import Deadline, Pace
-from kissgs.core.progress import Progress
-from kissgs.core.splats import Splats
+from kissgs.core.progress import Deadline, Pace, Progress
+from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import CompactSettings
 from kissgs.training.supervision import SupervisionViews
 
 if TYPE_CHECKING:
-    from kissgs.compaction.checkpoint_state import State
-    from kissgs.training.loop import Regularizer
+    from kissgs.training.loop import LrSchedule, Regularizer
     from kissgs.training.model import GaussianModel
-    from kissgs.training.targets import TrainingTargets
+    from kissgs.training.supervision import TrainingTargets
+
+
+# Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.1).
+
+BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
+"""Learning rates of 3DGS by parameter; that of positions is in units of the extent of the cameras around each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """Training steps, and the number of Gaussians that the pruning after them leaves.
+
+    Attributes:
+        name: name in progress events and of the steps in the report.
+        steps: number of training steps.
+        count: number of Gaussians left.
+    """
+
+    name: Literal["sparsify", "refine"]
+    steps: int
+    count: int
+
+
+def first_pruning_count(settings: CompactSettings, source_count: int, count: int) -> int:
+    """Return the number of Gaussians that the first pruning leaves, before any training.
+
+    Args:
+        settings: settings of compaction.
+        source_count: number of Gaussians of the scene.
+        count: number of Gaussians to keep in the end, from 1 to ``source_count``.
+    """
+    fraction = settings.initial_prune_fraction if settings.sparsify_steps else 1.0
+    return round(source_count * (count / source_count) ** fraction)
+
+
+def training_phases(settings: CompactSettings, source_count: int, count: int) -> list[Phase]:
+    """Return all phases of training: one before each further pruning, then refinement; none if nothing is trained.
+
+    The prunings are spread evenly over ``sparsify_steps``, and each keeps the same share of the Gaussians.
+    Arguments are those of :func:`first_pruning_count`.
+    """
+    phases = []
+    if settings.sparsify_steps:
+        rounds = min(settings.prune_rounds, settings.sparsify_steps)
+        first, fractions = first_pruning_count(settings, source_count, count), np.arange(1, rounds + 1) / rounds
+        counts = np.rint(first * (count / first) ** fractions).astype(int)
+        ends = np.rint(settings.sparsify_steps * np.concatenate([[0], fractions])).astype(int)
+        phases = [Phase("sparsify", int(steps), int(left)) for steps, left in zip(np.diff(ends), counts, strict=True)]
+    if settings.refine_steps:
+        phases.append(Phase("refine", settings.refine_steps, count))
+    return phases
+
+
+def stage_progress(progress: Progress, phases: Sequence[Phase], number: int) -> Progress:
+    """Return a receiver that reports phase ``number`` and the pruning after it as a part of one stage.
+
+    All phases of the same name, and the prunings after them, are one stage of that name.
+    """
+    name = phases[number].name
+    before = sum(phase.steps for phase in phases[:number] if phase.name == name)
+    total = sum(phase.steps for phase in phases if phase.name == name)
+
+    def receive(stage: str, fraction: float, note: str = "") -> None:
+        done = phases[number].steps * (fraction if stage == name else 1.0)
+        progress(name, (before + done) / total, note)
+
+    return receive
+
+
+def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> LrSchedule:
+    """Return learning rates: constant while Gaussians are pruned, falling exponentially during refinement.
+
+    3DGS does the latter for positions only. ``target_source`` is that of the training targets: "photos" or
+    "renderings".
+    """
+    from kissgs.training.loop import exponential_lr
+
+    base = dict(BASE_LR)
+    if target_source == "renderings":
+        base = {name: rate * settings.synthetic_lr_scale for name, rate in base.items()}
+    begin = {name: settings.means_lr_scale if name == "means" else settings.lr_scale for name in base}
+    end = {name: settings.final_means_lr_scale if name == "means" else settings.final_lr_scale for name in base}
+    return exponential_lr(base, begin, end if phase.name == "refine" else begin)
+
+
+# Checkpoint of a compaction: the key that identifies the work, and the status beside the state of the training.
+
+State = Mapping[str, np.ndarray]
+"""Arrays of a checkpoint by name."""
+
+STATUS_ENTRY = "status"
+"""Name of the array that holds the status as JSON; part of the file format."""
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Progress of a compaction.
+
+    Attributes:
+        phase: number of the current phase of training; the number of phases once all are done.
+        done: number of steps done in this phase.
+        seconds: wall time since the last recorded step, seconds.
+        steps: recorded steps.
+    """
+
+    phase: int
+    done: int
+    seconds: float
+    steps: Sequence[CompactionStep]
+
+    def as_state(self) -> State:
+        """Return the status as an array for the checkpoint, see :meth:`from_state`."""
+        return {STATUS_ENTRY: np.frombuffer(json.dumps(asdict(self)).encode(), np.uint8)}
+
+    @classmethod
+    def from_state(cls, state: State) -> Status:
+        """Return the status in a checkpoint."""
+        values = json.loads(state[STATUS_ENTRY].tobytes())
+        return cls(**{**values, "steps": [CompactionStep(**step) for step in values["steps"]]})
+
+
+def work_key(
+    scenes: Sequence[Splats],
+    count: int,
+    settings: CompactSettings,
+    supervision: SupervisionViews,
+    evaluate: bool,
+    device: Device,
+) -> str:
+    """Return the key of the work's checkpoint: equal only for equal results.
+
+    Args:
+        scenes: the scene and the original scene.
+        count: number of Gaussians to keep.
+        settings: settings of compaction.
+        supervision: all views; their photographs are read.
+        evaluate: whether steps are evaluated; a report without evaluations cannot be completed later.
+        device: device of the training.
+
+    Raises:
+        InvalidViewsError: a photograph cannot be read.
+    """
+    text = f"{__version__} {count} {evaluate} {device} {settings.model_dump_json()} {supervision.background} "
+    key = hashlib.sha256(f"{text}{supervision.synthetic} {supervision.synthetic_per_epoch}".encode())
+    for view in (*supervision.train, *supervision.score, *supervision.test):
+        camera = view.camera
+        key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
+        key.update(f"{camera.dilation} {view.background} {view.undistortion} {view.sampling}".encode())
+        if view.photo is not None:
+            with open_file(view.photo) as (file, _):
+                key.update(file.read())
+    for scene in scenes:
+        for name in ATTRIBUTES:
+            key.update(getattr(scene, name).tobytes())
+        key.update(b"antialiased" * scene.antialiased)
+    return key.hexdigest()
+
+
+# ``SceneTraining``: a scene that is pruned and trained in turn, and its state.
 
 MIN_RELATIVE_EXTENT = 1e-4
 """Extent of the cameras, in radii of the scene, up to which they count as being at one position: a rotating camera,

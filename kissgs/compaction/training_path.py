@@ -10,15 +10,14 @@ import numpy as np
 
 from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.result import Compacted, CompactionReport
-from kissgs.compaction.scene_training import SceneTraining
-from kissgs.compaction.schedule import Phase
+from kissgs.compaction.scene_training import Phase, SceneTraining
 from kissgs.core.array_types import Int
-from kissgs.core.deadline import Deadline
+from kissgs.core.progress import Deadline
 from kissgs.core.splats import Splats
 from kissgs.rendering.rasterizer import load_kernels
 
 if TYPE_CHECKING:
-    from kissgs.training.targets import TrainingTargets
+    from kissgs.training.supervision import TrainingTargets
 
 REFINEMENT = 1_000_000
 """Number of the refinement in seeds: no path has as many points."""

@@ -1,4 +1,4 @@
-"""``Splats``: a Gaussian scene in memory, and its cleaning."""
+"""``Splats``: a Gaussian scene in memory, its largest size, and its cleaning."""
 
 from __future__ import annotations
 
@@ -10,6 +10,15 @@ import numpy as np
 
 from kissgs.core.array_types import Bool, Float, Float32, Float64, Int
 from kissgs.core.errors import InvalidSceneError
+
+MAX_GRID_SIDE = 13_376
+"""Largest side of the grid, pixels: Pillow refuses larger images as decompression bombs; WebP's limit is 16383."""
+
+MAX_CODEBOOK_SIDE = 256
+"""Largest side of the codebook's tiles, pixels: labels have two 8-bit coordinates."""
+
+MAX_GAUSSIANS = 20_000_000
+"""Default limit: 5 GB of arrays. A compressed file of some kilobytes can declare more than any memory holds."""
 
 SH_REST_COUNTS = (0, 3, 8, 15)
 """Number of SH coefficients per colour channel beyond the constant one, for degree 0, 1, 2, 3."""

@@ -12,15 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kissgs.cameras.pixels import orientation
+from kissgs.cameras.photographs import orientation
 from kissgs.cameras.views import Similarity, View, Views
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import InvalidViewsError, KissgsError
 from kissgs.core.origin import Origin
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
-from kissgs.evaluation.prominence import drawn_opacities
-from kissgs.evaluation.visibility import share_shown
+from kissgs.evaluation.scene_parts import drawn_opacities, share_shown
 from kissgs.rendering.metrics import psnr
 from kissgs.rendering.rasterizer import load_kernels, render
 

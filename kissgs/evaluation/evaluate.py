@@ -21,11 +21,9 @@ from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
 from kissgs.evaluation.capture_fit import in_scene_frame
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison
-from kissgs.evaluation.visibility import share_shown
+from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.flip import Flip
-from kissgs.rendering.lpips import Lpips
-from kissgs.rendering.metrics import ms_ssim, psnr, ssim
+from kissgs.rendering.metrics import Flip, Lpips, ms_ssim, psnr, ssim
 from kissgs.rendering.rasterizer import Device, load_kernels, render
 
 NOTHING_VISIBLE = "no rendering shows any of the reference, so these values mean nothing; choose other views"

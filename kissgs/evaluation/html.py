@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -12,23 +14,183 @@ from string import Template
 import numpy as np
 from PIL import Image
 
-from kissgs.core.array_types import Float32, UInt8
+from kissgs.core.array_types import Float32, Float64, UInt8
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
-from kissgs.evaluation.error_maps import INFERNO, full_scale, heat_map, rms_difference, worst_crop
 from kissgs.evaluation.evaluate import background_of, render_clamped
-from kissgs.evaluation.html_tables import (
-    metric_cards,
-    other_metrics,
-    psnr_change,
-    summary_line,
-    views_table,
-    worst_views_text,
-)
 from kissgs.evaluation.metric_text import format_metric
-from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
 from kissgs.rendering.images import to_bytes
 from kissgs.rendering.rasterizer import Device
+
+# Error maps: differences of two images per pixel, as colours, and the crop with the largest error.
+
+INFERNO = (
+    (0, 0, 4),
+    (27, 12, 65),
+    (74, 12, 107),
+    (120, 28, 109),
+    (165, 44, 96),
+    (207, 68, 70),
+    (237, 105, 37),
+    (251, 155, 6),
+    (247, 209, 61),
+    (252, 255, 164),
+)
+"""Matplotlib's colour map "inferno" at ten points, RGB from 0 to 255: its lightness grows evenly."""
+
+FULL_SCALES = (1, 2, 3, 5, 10, 15, 20, 30, 50, 100, 255)
+"""Errors that the brightest colour may stand for, levels of an 8-bit image."""
+
+WINDOW = 32
+"""Side of the square over which the largest error is searched, pixels."""
+
+
+def rms_difference(
+    image: Float32[np.ndarray, "H W 3"], other: Float32[np.ndarray, "H W 3"]
+) -> Float32[np.ndarray, "H W"]:
+    """Return the root mean square error over RGB of each pixel, in levels of an 8-bit image, 0 to 255.
+
+    The images are float32 from 0 to 1.
+    """
+    squares = np.square(image - other).mean(axis=2)
+    return np.asarray(255 * np.sqrt(squares), np.float32)
+
+
+def full_scale(psnr: float) -> int:
+    """Return the error, in levels, of the brightest colour for an image with this PSNR in decibels.
+
+    It is the next of :data:`FULL_SCALES` above four times the root mean square error, which itself would leave most of
+    the image bright; with the largest error, most would be black.
+    """
+    wanted = 4 * 255 * 10 ** (-psnr / 20) if math.isfinite(psnr) else 0.0
+    return next((scale for scale in FULL_SCALES if scale >= wanted), FULL_SCALES[-1])
+
+
+def heat_map(levels: Float32[np.ndarray, "H W"], full: float) -> UInt8[np.ndarray, "H W 3"]:
+    """Return ``levels`` as RGB colours, black for 0 to pale yellow for ``full`` and above; NaN counts as ``full``."""
+    steps = np.linspace(0, 255, len(INFERNO))
+    table = np.stack([np.interp(np.arange(256), steps, channel) for channel in zip(*INFERNO, strict=True)], axis=1)
+    share = np.nan_to_num(levels / full, nan=1.0).clip(0, 1)
+    return np.rint(table).astype(np.uint8)[np.rint(share * 255).astype(np.uint8)]
+
+
+def worst_crop(levels: Float32[np.ndarray, "H W"], side: int) -> tuple[slice, slice]:
+    """Return rows and columns of a square of ``side`` pixels around the largest error, clipped to the image.
+
+    The largest error is the window of :data:`WINDOW` pixels with the largest mean square; without any error, the
+    middle.
+
+    Args:
+        levels: error of each pixel; NaN counts as 255.
+        side: side of the crop, pixels.
+    """
+    height, width = levels.shape
+    down, across = min(WINDOW, height), min(WINDOW, width)
+    sums = _sums(np.square(np.nan_to_num(levels.astype(np.float64), nan=255.0)), down, across)
+    top, left = np.unravel_index(sums.argmax(), sums.shape)
+    if sums[top, left] <= 0:
+        top, left = (height - down) // 2, (width - across) // 2
+    return _interval(int(top) + down // 2, side, height), _interval(int(left) + across // 2, side, width)
+
+
+def _sums(values: Float64[np.ndarray, "H W"], down: int, across: int) -> Float64[np.ndarray, "h w"]:
+    """Return the sums over every rectangle of ``down`` rows and ``across`` columns."""
+    corners = np.pad(values, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+    strips = corners[down:] - corners[:-down]
+    return np.asarray(strips[:, across:] - strips[:, :-across])
+
+
+def _interval(middle: int, side: int, length: int) -> slice:
+    start = max(0, min(middle - side // 2, length - side))
+    return slice(start, min(start + side, length))
+
+
+# Values of an evaluation's HTML page: summary, cards and table.
+
+
+def summary_line(evaluation: Evaluation, shown: int) -> str:
+    """Return what was compared, as plain text to be escaped; ``shown`` is the number of views with images."""
+    rest = " Their images are below" if shown == len(evaluation.views) else f" Images of the worst {shown} are below"
+    rest += ", the worst first."
+    return f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}.{rest}"
+
+
+def metric_cards(evaluation: Evaluation, before: int | None, after: int | None) -> Iterable[str]:
+    """Yield cards with the means, and the bytes of both files if known."""
+    mean = evaluation.mean
+    if mean.reference is not None:
+        change = f"{psnr_change(mean)} dB: the reference has {format_metric(mean.reference.psnr, 2)} dB"
+        yield _card("PSNR, candidate to photographs", f"{format_metric(mean.candidate.psnr, 2)} dB", change)
+        of_reference, of_candidate = mean.reference.texts(), mean.candidate.texts()
+        for name in list(of_candidate)[1:]:
+            remark = f"the reference has {of_reference[name]}"
+            yield _card(f"{name}, candidate to photographs", of_candidate[name], remark)
+    remark = f"of their renderings; {other_metrics(mean.candidate_vs_reference)}"
+    yield _card("PSNR, candidate to reference", f"{format_metric(mean.candidate_vs_reference.psnr, 2)} dB", remark)
+    fifth = f"{format_metric(evaluation.fifth_percentile, 2)} dB is the 5th percentile"
+    yield _card(
+        "PSNR, worst view", f"{format_metric(evaluation.worst.comparison.candidate_vs_reference.psnr, 2)} dB", fifth
+    )
+    counts = f"{evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians"
+    if before and after:
+        change = f"{before / after:.1f}× smaller" if before >= after else f"{after / before:.1f}× larger"
+        yield _card("Size", change, f"{before / 1e6:,.2f} → {after / 1e6:,.2f} MB; {counts}")
+    else:
+        yield _card("Gaussians", f"{evaluation.candidate_count:,}", counts)
+
+
+def worst_views_text(evaluation: Evaluation) -> str:
+    """Return the worst views, those of the surroundings included, as plain text to be escaped."""
+    text, surroundings = f"Candidate to reference: {evaluation.extremes}.", evaluation.surroundings
+    if surroundings is None:
+        return text
+    metrics = surroundings.mean.candidate_vs_reference
+    mean = f"PSNR {format_metric(metrics.psnr, 2)} dB, {other_metrics(metrics)}"
+    return f"{text} Surroundings, {surroundings.views_used} ({surroundings.source}): {mean}; {surroundings.extremes}."
+
+
+def _card(name: str, value: str, remark: str) -> str:
+    return f'<div class="card"><dt>{name}</dt><dd>{value}</dd><dd class="remark">{remark}</dd></div>'
+
+
+def other_metrics(metrics: ImageMetrics) -> str:
+    """Return all metrics but the PSNR, as text."""
+    return ", ".join(f"{name} {text}" for name, text in list(metrics.texts().items())[1:])
+
+
+def psnr_change(comparison: Comparison) -> str:
+    """Return the change of the PSNR to the photograph as HTML, a loss in red."""
+    text = "" if comparison.change is None else format_metric(comparison.change, 2, signed=True)
+    return f'<span class="worse">−{text[1:]}</span>' if text.startswith("-") else text
+
+
+def views_table(evaluation: Evaluation, shown: Sequence[int]) -> str:
+    """Return a table with a row for each view, linked to its images if it is among ``shown``, and the means."""
+    mean = evaluation.mean
+    metrics = list(mean.candidate_vs_reference.texts())
+    renderings = [("candidate to reference", metrics)]
+    photographs = [("reference to photograph", metrics), ("candidate to photograph", metrics), ("change", ["dB"])]
+    groups = renderings if mean.reference is None else photographs + renderings
+    upper = "".join(f'<th colspan="{len(columns)}">{title}</th>' for title, columns in groups)
+    lower = "".join(f"<th>{column}</th>" for _, columns in groups for column in columns)
+    rows = []
+    for i, compared in enumerate(evaluation.views):
+        name = escape(compared.view.name)
+        name = f'<a href="#view-{i}">{name}</a>' if i in shown else name
+        rows.append(f"<tr><td>{name}</td>{_cells(compared.comparison)}</tr>")
+    return (
+        f"<table><thead><tr><th></th>{upper}</tr><tr><th>view</th>{lower}</tr></thead>"
+        f"<tbody>{''.join(rows)}</tbody><tfoot><tr><td>mean</td>{_cells(mean)}</tr></tfoot></table>"
+    )
+
+
+def _cells(comparison: Comparison) -> str:
+    return "".join(
+        f'<td class="worse">−{cell[1:]}</td>' if cell.startswith("-") else f"<td>{cell}</td>"
+        for cell in comparison.cells()
+    )
+
 
 MAX_VIEWS = 12
 """Largest number of views shown with images, about 10 MB in all."""

@@ -1,6 +1,6 @@
 """Numba kernels of fine-tuning: one pass over the levels in place of a dozen operations with arrays in float64.
 
-Values and gradients are those of :class:`kissgs.finetuning.even_plane.EvenPlane` and
+Values and gradients are those of :class:`kissgs.finetuning.planes.EvenPlane` and
 :class:`kissgs.finetuning.losses.RateLoss`.
 """
 
@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from kissgs.core.numba_kernels import compiled
-from kissgs.core.threads import Workers
+from kissgs.core.resources import Workers
 
 T = TypeVar("T")
 
@@ -44,7 +44,7 @@ def even_values(
     """Write the decoded values of rows ``first`` to ``last`` (exclusive).
 
     Args:
-        base, stride, shift, low, step: attributes of an :class:`kissgs.finetuning.even_plane.EvenPlane`.
+        base, stride, shift, low, step: attributes of an :class:`kissgs.finetuning.planes.EvenPlane`.
         latents: ``(R, C)``.
         first: first row.
         last: end of the rows, exclusive.
@@ -86,7 +86,7 @@ def attract(
     """Add the gradient of the quadratic attraction of each latent to its level, rows ``first`` to ``last`` (exclusive).
 
     Args:
-        base, stride, step: attributes of an :class:`kissgs.finetuning.even_plane.EvenPlane`.
+        base, stride, step: attributes of an :class:`kissgs.finetuning.planes.EvenPlane`.
         latents: ``(R, C)``.
         weights: ``(R, 1)`` curvature of the loss by the values.
         factor: factor of the attraction.

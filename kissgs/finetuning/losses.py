@@ -12,24 +12,70 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float32, Float64, Int
-from kissgs.core.deadline import Pace
+from kissgs.core.progress import Pace
 from kissgs.finetuning import kernels
-from kissgs.finetuning.codebook_rate import CodebookRate
-from kissgs.finetuning.even_plane import EvenPlane
-from kissgs.finetuning.planes import Plane
+from kissgs.finetuning.planes import EvenPlane, Plane, TablePlane
 from kissgs.finetuning.quantized_scene import QuantizedScene
-from kissgs.finetuning.table_plane import TablePlane
 from kissgs.planning.layout import Grid
 from kissgs.planning.rdo_quantize import UNUSED_COUNT
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.rendering.tensors import Parameters
 from kissgs.training.loop import TrainableScene
 
+# ``CodebookRate``: estimated bits of the SH codebook's image, for fine-tuning.
+
+DIFFERENCE_OFFSET = 0.3
+"""Added to mean differences, levels; it bounds the bits of a level where neighbours are nearly equal."""
+
+
+class CodebookRate:
+    """Bits of the square image of an SH codebook.
+
+    WebP subtracts green from red and blue, predicts each from its neighbours, and codes the rest. So the bits of a
+    level are those of its difference from the entries beside and above it, in Laplace distributions: the mean of both
+    differences, over ln 2 times the mean difference of its colour and coefficient. Only their derivative matters; the
+    constant is left out.
+
+    Attributes:
+        table: ``(3, 15)`` float32, mean difference by colour and coefficient, plus :data:`DIFFERENCE_OFFSET`,
+            levels; the colours are red - green, green and blue - green.
+    """
+
+    table: Float32[np.ndarray, "3 15"]
+
+    def __init__(self, plane: EvenPlane) -> None:
+        """Prepare the rate of the codebook ``plane``, of S · S entries in row-major order."""
+        self._base = plane.base_multiples.float()
+        self._side = math.isqrt(len(self._base))
+        self.table = np.ones((3, COEFFICIENTS), np.float32)
+
+    def count(self, latents: Float32[Tensor, "entries 45"]) -> None:
+        """Set the table from the current levels."""
+        with torch.no_grad():
+            beside, above = self._differences(torch.round(self._base + latents) - self._base)
+        # By NumPy, whose sums do not depend on the number of threads.
+        means = [difference.abs().cpu().numpy().mean(axis=(0, 1), dtype=np.float64) for difference in (beside, above)]
+        self.table = (np.mean(means, axis=0) + DIFFERENCE_OFFSET).astype(np.float32)
+
+    def bits(self, latents: Float32[Tensor, "entries 45"]) -> Tensor:
+        """Return the bits of all levels together but for a constant, a scalar."""
+        beside, above = self._differences(latents)
+        per_level = torch.from_numpy(0.5 / (math.log(2) * self.table)).to(latents.device)
+        return (beside.abs() * per_level).sum() + (above.abs() * per_level).sum()
+
+    def _differences(self, latents: Float32[Tensor, "entries 45"]) -> tuple[Tensor, Tensor]:
+        """Return the differences of neighbouring entries, ``(S, S - 1, 3, 15)`` and ``(S - 1, S, 3, 15)``."""
+        levels = (self._base + latents).reshape(self._side, self._side, 3, COEFFICIENTS)
+        red, green, blue = levels.unbind(dim=2)
+        colors = torch.stack([red - green, green, blue - green], dim=2)
+        return colors[:, 1:] - colors[:, :-1], colors[1:] - colors[:-1]
+
+
 ENTROPY_FIELDS = ("opacities", "scales", "quaternions", "f_dc")
 """Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that.
 
 Entries of the SH codebook are added where they are a list, sorted by frequency: neighbours then predict nothing.
-In a square they predict each other (:class:`kissgs.finetuning.codebook_rate.CodebookRate`).
+In a square they predict each other (:class:`kissgs.finetuning.losses.CodebookRate`).
 """
 
 RECOUNT_STEPS = 25

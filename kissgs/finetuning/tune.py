@@ -15,11 +15,9 @@ import torch
 
 from kissgs._version import __version__
 from kissgs.cameras.views import Views
-from kissgs.core.deadline import Deadline, Pace
 from kissgs.core.errors import OutputError
-from kissgs.core.limits import MAX_GAUSSIANS
-from kissgs.core.progress import Progress, as_stage, silent
-from kissgs.core.splats import ATTRIBUTES, Splats, clean
+from kissgs.core.progress import Deadline, Pace, Progress, as_stage, silent
+from kissgs.core.splats import ATTRIBUTES, MAX_GAUSSIANS, Splats, clean
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
 from kissgs.finetuning.losses import RateLoss, TotalVariationLoss
@@ -27,10 +25,9 @@ from kissgs.finetuning.planes import FIELDS, TABLES
 from kissgs.finetuning.quantized_scene import QuantizedScene, table_name
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
-from kissgs.planning.encoded import Encoded
-from kissgs.planning.encoding_plan import EncodingPlan
-from kissgs.planning.gaussian_costs import Costs
-from kissgs.planning.quality_estimate import implied_lambda
+from kissgs.planning.encoding_plan import Encoded, EncodingPlan
+from kissgs.planning.rate_distortion import implied_lambda
+from kissgs.planning.rd_criterion import Costs
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import FinetuneSettings
@@ -38,8 +35,7 @@ from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
-from kissgs.training.supervision import SupervisionViews, supervision_views
-from kissgs.training.targets import TrainingTargets, training_targets
+from kissgs.training.supervision import SupervisionViews, TrainingTargets, supervision_views, training_targets
 
 SENSITIVITY_VIEWS = 64
 """Approximate number of training cameras from which costs are measured, if the plan has none."""

@@ -14,12 +14,18 @@ from kissgs.core.array_types import Float, Float32, Float64, Int64, Shaped, UInt
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats, empty_splats
-from kissgs.io.activations import insert_largest, steps
-from kissgs.io.codes import colors_of, note_clamped, opacities_of, split_largest, to_codes
-from kissgs.io.morton import morton_order
-from kissgs.io.ply_body import BLOCK_ALIGNMENT, check_complete, rows
-from kissgs.io.ply_header import MIP_COMMENT, Element, Header, PlyFile, sh_degree
-from kissgs.io.scene_file import BinaryWriter
+from kissgs.io.conventions import (
+    colors_of,
+    insert_largest,
+    morton_order,
+    note_clamped,
+    opacities_of,
+    split_largest,
+    steps,
+    to_codes,
+)
+from kissgs.io.files import BinaryWriter
+from kissgs.io.ply_rows import BLOCK_ALIGNMENT, MIP_COMMENT, Element, Header, PlyFile, check_complete, rows, sh_degree
 
 _CHUNK = BLOCK_ALIGNMENT
 """Gaussians per row of element ``chunk``, given by the format; blocks of rows are multiples of it."""

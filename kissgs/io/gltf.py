@@ -19,10 +19,9 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.origin import WORLD, from_world, origin_for
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
-from kissgs.io.activations import log_scales, opacity_logits, steps
-from kissgs.io.frames import Signs, mirror, move
+from kissgs.io.conventions import Signs, log_scales, mirror, move, opacity_logits, steps
+from kissgs.io.files import listed, marked, open_scene_file, refuse_more_than
 from kissgs.io.gltf_document import GLB_MAGIC, Document, node_matrix
-from kissgs.io.scene_file import listed, marked, open_scene_file, refuse_more_than
 from kissgs.io.spz import largest_spz, read_spz, read_spz_info
 
 EXTENSION = "KHR_gaussian_splatting"

@@ -14,9 +14,8 @@ import numpy as np
 
 from kissgs.core.array_types import Float64, Shaped
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.io.json_files import parse_json
-from kissgs.io.packed_files import is_below
-from kissgs.io.scene_file import SceneFile, open_scene_file
+from kissgs.io.containers import is_below
+from kissgs.io.files import SceneFile, open_scene_file, parse_json
 
 GLB_MAGIC = b"glTF"
 

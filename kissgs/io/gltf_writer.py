@@ -21,14 +21,11 @@ from kissgs.core.errors import UnsupportedError
 from kissgs.core.origin import WORLD, Origin
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
-from kissgs.io.activations import steps
-from kissgs.io.codes import colors_of, note_mark, opacities_of, to_bytes
-from kissgs.io.frames import sh_signs
+from kissgs.io.conventions import colors_of, note_mark, opacities_of, sh_signs, steps, to_bytes
+from kissgs.io.files import BinaryWriter
 from kissgs.io.gltf import EXTENSION, SPZ_EXTENSIONS, TO_PLY
 from kissgs.io.gltf_document import GLB_MAGIC
-from kissgs.io.scene_file import BinaryWriter
-from kissgs.io.spz_values import decode_positions, encode_positions, fractional_bits_for
-from kissgs.io.spz_writer import write_spz
+from kissgs.io.spz import decode_positions, encode_positions, fractional_bits_for, write_spz
 
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}

@@ -16,8 +16,8 @@ from kissgs.core.array_types import Float32, Float64, Int, Int64, Shaped
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
-from kissgs.io.activations import OPACITY_OF_BYTE, SH0_OF_BYTE, log_scales
-from kissgs.io.scene_file import SceneFile, open_scene_file, refuse_more_than
+from kissgs.io.conventions import OPACITY_OF_BYTE, SH0_OF_BYTE, log_scales
+from kissgs.io.files import SceneFile, open_scene_file, refuse_more_than
 
 MAIN_BYTES, SECTION_BYTES = 4096, 1024
 

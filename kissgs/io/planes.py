@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from kissgs.core.array_types import UInt8
-from kissgs.core.threads import Workers
+from kissgs.core.resources import Workers
 from kissgs.io.webp import encode_plane
 from kissgs.settings import EncodeSettings
 

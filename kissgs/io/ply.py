@@ -15,9 +15,18 @@ from kissgs.core.origin import WORLD, Origin, from_world, in_world, origin_for, 
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats, sampled_rows
 from kissgs.io.compressed_ply import PACKED, check_compressed, is_compressed, read_compressed
-from kissgs.io.ply_body import check_complete, rows
-from kissgs.io.ply_header import MIP_COMMENT, Element, Encoding, Header, PlyFile, open_ply, sh_degree
-from kissgs.io.scene_file import BinaryWriter, listed, refuse_more_than
+from kissgs.io.files import BinaryWriter, listed, refuse_more_than
+from kissgs.io.ply_rows import (
+    MIP_COMMENT,
+    Element,
+    Encoding,
+    Header,
+    PlyFile,
+    check_complete,
+    open_ply,
+    rows,
+    sh_degree,
+)
 
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
@@ -135,7 +144,7 @@ def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
     Positions are those of the world: float64 (``property double``) where float32 cannot hold them. An antialiased scene
-    is marked by a comment, :data:`kissgs.io.ply_header.MIP_COMMENT`.
+    is marked by a comment, :data:`kissgs.io.ply_rows.MIP_COMMENT`.
 
     Args:
         file: The stream; it is not flushed or closed, and its OSErrors are not caught.

@@ -11,7 +11,7 @@ import numpy as np
 
 from kissgs.core.errors import OutputError
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
+from kissgs.io.files import atomic_file, reason_of, refuse_existing
 
 
 def read_sensitivity(path: Path, key: str) -> Sensitivity | None:

@@ -14,9 +14,18 @@ from kissgs.core.array_types import Int64, Shaped
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, empty_splats
-from kissgs.io.activations import OPACITY_OF_BYTE, SH0_OF_BYTE, byte_quats, log_scales
-from kissgs.io.codes import colors_of, note_clamped, note_mark, opacities_of, to_bytes
-from kissgs.io.scene_file import BinaryWriter, SceneFile, open_scene_file, refuse_more_than
+from kissgs.io.conventions import (
+    OPACITY_OF_BYTE,
+    SH0_OF_BYTE,
+    byte_quats,
+    colors_of,
+    log_scales,
+    note_clamped,
+    note_mark,
+    opacities_of,
+    to_bytes,
+)
+from kissgs.io.files import BinaryWriter, SceneFile, open_scene_file, refuse_more_than
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 """One Gaussian."""

@@ -1,26 +1,223 @@
-"""The ``.spz`` format, versions 1 to 4: quantised attributes, one stream each, compressed with gzip or (4) zstd.
-
-Axes are x right, y up, z back, unless a file's extension names others. Some tools store those of a ``.ply`` without
-saying so; ``raw_axes`` reads their files.
-"""
+"""The ``.spz`` format, versions 1 to 4: quantised attributes, one stream each, compressed with gzip or (4) zstd."""
 
 from __future__ import annotations
 
 import struct
+import sys
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from kissgs.core.array_types import UInt8
+from kissgs.core.array_types import Float, Float32, UInt8
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
-from kissgs.io import spz_values
-from kissgs.io.activations import OPACITY_OF_BYTE, look_up
-from kissgs.io.frames import axis_signs, mirror
-from kissgs.io.scene_file import SceneFile, listed, open_scene_file, refuse_more_than
-from kissgs.io.spz_streams import inflate, inflate_start, unpack_frame
+from kissgs.io.conventions import (
+    OPACITY_OF_BYTE,
+    Signs,
+    axis_signs,
+    insert_largest,
+    look_up,
+    mirror,
+    note_clamped,
+    opacities_of,
+    quat_signs,
+    sh_signs,
+    split_largest,
+    steps,
+    to_bytes,
+    to_codes,
+)
+from kissgs.io.files import BinaryWriter, SceneFile, listed, open_scene_file, refuse_more_than
+
+# Decompression of ``.spz``: gzip and zstd, bounded by what the header needs.
+
+_GZIP = 16 + zlib.MAX_WBITS
+
+_BLOCK_BYTES = 1 << 20
+
+_MAX_RATIO = 1032
+"""Largest ratio of deflate: 258 bytes of two bits."""
+
+_MIN_WINDOW_LOG = 27
+"""Windows of zstd up to 128 MiB are accepted in any case: its command line makes no larger ones unless asked to."""
+
+
+def inflate_start(head: bytes) -> bytes:
+    """Return what the beginning of a gzip file unpacks to, at most 64 bytes; nothing if it is damaged."""
+    try:
+        return zlib.decompressobj(_GZIP).decompress(head, 64)
+    except zlib.error:
+        return b""
+
+
+def inflate(opened: SceneFile, size: int, most_behind: int) -> tuple[UInt8[np.ndarray, " size"], bytes]:
+    """Unpack a gzip file of ``size`` bytes and up to ``most_behind`` more; return both parts.
+
+    Raises:
+        InvalidSceneError: the file is damaged, or has fewer or more bytes.
+    """
+    if size > _MAX_RATIO * opened.size:
+        raise InvalidSceneError(
+            f"{opened.name} is cut short: {opened.size:,} bytes cannot hold what its header declares; download it again"
+        )
+    body = np.empty(size, np.uint8)
+    behind = bytearray()
+    filled = 0
+    stream = zlib.decompressobj(_GZIP)
+    opened.file.seek(0)
+    try:
+        while not stream.eof:
+            packed = stream.unconsumed_tail or opened.file.read(_BLOCK_BYTES)
+            if not packed:
+                break
+            block = stream.decompress(packed, _BLOCK_BYTES)
+            part = block[: size - filled]
+            body[filled : filled + len(part)] = np.frombuffer(part, np.uint8)
+            filled += len(part)
+            behind += block[len(part) :]
+            if len(behind) > most_behind:
+                raise InvalidSceneError(f"{opened.name} unpacks to more bytes than its header declares; it is damaged")
+    except zlib.error as error:
+        raise InvalidSceneError(f"{opened.name} is damaged: gzip cannot unpack it; download it again") from error
+    if filled < size or not stream.eof:
+        raise InvalidSceneError(
+            f"{opened.name} is cut short: it unpacks to {filled + len(behind):,} bytes of {size:,}; download it again"
+        )
+    return body, bytes(behind)
+
+
+def unpack_frame(frame: bytes, size: int, what: str) -> bytes:
+    """Unpack one zstd frame of exactly ``size`` bytes; ``what`` names it in errors.
+
+    Raises:
+        InvalidSceneError: the frame is damaged, or has fewer or more bytes.
+    """
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd
+
+    window = min(31, max(_MIN_WINDOW_LOG, size.bit_length()))
+    try:
+        stream = zstd.ZstdDecompressor(options={zstd.DecompressionParameter.window_log_max: window})
+        parts = [stream.decompress(frame, max_length=size + 1)]
+        while not stream.eof and parts[-1] and sum(map(len, parts)) <= size:
+            parts.append(stream.decompress(b"", max_length=size + 1))
+    except zstd.ZstdError as error:
+        raise InvalidSceneError(f"{what} is damaged: zstd cannot unpack it; download the file again") from error
+    data = parts[0] if len(parts) == 1 else b"".join(parts)
+    if len(data) != size or not stream.eof or stream.unused_data:
+        raise InvalidSceneError(f"{what} is damaged: it does not unpack to {size:,} bytes; download the file again")
+    return data
+
+
+# Values of the ``.spz`` format: from the bytes of each stream to arrays, and back.
+
+_BYTE = np.arange(256)
+
+SCALE_OF_BYTE = (_BYTE / 16 - 10).astype(np.float32)
+"""Natural logarithm of a standard deviation, in steps of 1/16."""
+
+COLOR_OF_BYTE = ((_BYTE / 255 - 0.5) / 0.15).astype(np.float32)
+"""Constant SH coefficient; 0.15, not the harmonic's value, is the format's factor."""
+
+SH_OF_BYTE = ((_BYTE - 128) / 128).astype(np.float32)
+"""Other SH coefficients."""
+
+SH_STEPS = (4, 8)
+"""Steps of the codes that are written, in the first band and above: 6 and 5 bits. Readers need not know them.
+
+The format's own library writes 5 and 4 bits by default, which lose two decibels of fox to its photographs; the figures
+are in docs/reference/formats.md.
+"""
+
+
+def decode_half_positions(codes: UInt8[np.ndarray, "N 6"], out: Float32[np.ndarray, "N 3"]) -> None:
+    """Decode positions of version 1: half floats."""
+    with np.errstate(all="ignore"):  # values may be any floats; they are not cleaned here
+        out[:] = codes.view("<f2")
+
+
+def decode_positions(codes: UInt8[np.ndarray, "N 9"], fractional_bits: int, out: Float32[np.ndarray, "N 3"]) -> None:
+    """Decode positions of versions 2 and later: 24-bit integers, little-endian, of steps of 2^-fractional_bits."""
+    for part in steps(len(codes)):
+        low, middle, high = (codes[part, i::3].astype(np.int32) for i in range(3))
+        signed = (low << 8 | middle << 16 | high << 24) >> 8
+        out[part] = np.ldexp(signed.astype(np.float64), -fractional_bits)
+
+
+def decode_three_bytes(codes: UInt8[np.ndarray, "N 3"], out: Float32[np.ndarray, "N 4"]) -> None:
+    """Decode rotations of versions 1 and 2 to w, x, y, z: x, y, z in a byte each, w the rest of the unit length."""
+    for part in steps(len(codes)):
+        small = codes[part] / 127.5 - 1
+        out[part] = insert_largest(small, np.zeros(len(small), np.int64))
+
+
+def decode_smallest_three(codes: UInt8[np.ndarray, "N 4"], out: Float32[np.ndarray, "N 4"]) -> None:
+    """Decode rotations of versions 3 and later to w, x, y, z.
+
+    Of a word's 32 bits the highest two name the largest of x, y, z, w; the others follow, the last in the lowest ten
+    bits: nine of magnitude, one of sign.
+    """
+    words = codes.view("<u4")[:, 0]
+    for part in steps(len(codes)):
+        word = words[part]
+        fields = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], axis=1)
+        magnitude = (fields & 511) / 511 * np.sqrt(0.5)
+        xyzw = insert_largest(np.where(fields & 512, -magnitude, magnitude), (word >> 30).astype(np.int64))
+        out[part] = np.roll(xyzw, 1, axis=1)
+
+
+def fractional_bits_for(reach: float) -> int:
+    """Return the bits after the binary point of positions up to ``reach`` from the origin along an axis.
+
+    They are 12, as the format's own library writes; fewer where a scene reaches beyond ±2048, and more where it is
+    smaller than ±4, so that it has at least 2^14 steps; 23 are the most.
+    """
+    exponent = int(np.frexp(reach)[1])
+    return max(0, min(23 - exponent, max(12, 15 - exponent), 23))
+
+
+def encode_positions(means: Float[np.ndarray, "B 3"], fractional_bits: int) -> UInt8[np.ndarray, "B 9"]:
+    """Encode positions as the nearest steps, clamped to 24 bits."""
+    steps_of = np.floor(np.ldexp(means.astype(np.float64), fractional_bits) + 0.5)
+    codes = np.clip(steps_of, -(1 << 23), (1 << 23) - 1).astype("<i4")
+    return codes.view(np.uint8).reshape(len(means), 3, 4)[:, :, :3].reshape(len(means), 9)
+
+
+def encode_scales(scales: Float32[np.ndarray, "B 3"]) -> UInt8[np.ndarray, "B 3"]:
+    """Encode logarithms of standard deviations, clamped to -10 to 5.9375."""
+    return to_bytes((scales.astype(np.float64) + 10) * 16)
+
+
+def encode_colors(sh0: Float32[np.ndarray, "B 3"]) -> UInt8[np.ndarray, "B 3"]:
+    """Encode constant SH coefficients, clamped to ±3.3333."""
+    return to_bytes(255 * (0.15 * sh0.astype(np.float64) + 0.5))
+
+
+def encode_sh(shN: Float[np.ndarray, "B K 3"]) -> UInt8[np.ndarray, "B bytes"]:
+    """Encode other SH coefficients, each band in its own steps."""
+    step = np.where(np.arange(shN.shape[1]) < 3, *SH_STEPS)[:, None]
+    codes = np.floor(np.clip(shN.astype(np.float64), -2, 2) * 128 + 128.5).astype(np.int64)
+    return np.clip((codes + step // 2) // step * step, 0, 255).astype(np.uint8).reshape(len(shN), 3 * shN.shape[1])
+
+
+def encode_smallest_three(quats: Float32[np.ndarray, "B 4"]) -> UInt8[np.ndarray, "B 4"]:
+    """Encode rotations w, x, y, z in the 32 bits of :func:`decode_smallest_three`."""
+    index, small = split_largest(np.roll(quats, -1, axis=1))
+    fields = to_codes(511 * np.sqrt(2) * np.abs(small), 511) | (small < 0).astype(np.int64) << 9
+    words = index << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
+    return words.astype("<u4").view(np.uint8).reshape(len(quats), 4)
+
+
+# The ``.spz`` format, versions 1 to 4: quantised attributes, one stream each, compressed with gzip or (4) zstd.
+#
+# Axes are x right, y up, z back, unless a file's extension names others. Some tools store those of a ``.ply`` without
+# saying so; ``raw_axes`` reads their files.
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -233,19 +430,19 @@ def _decode(streams: dict[str, UInt8[np.ndarray, "N width"]], info: SpzInfo) -> 
     splats = empty_splats(info.count, coefficients)
     positions, rotations = streams.pop("positions"), streams.pop("rotations")
     if info.version == 1:
-        spz_values.decode_half_positions(positions, splats.means)
+        decode_half_positions(positions, splats.means)
     else:
-        spz_values.decode_positions(positions, info.fractional_bits, splats.means)
+        decode_positions(positions, info.fractional_bits, splats.means)
     if info.version < 3:
-        spz_values.decode_three_bytes(rotations, splats.quats)
+        decode_three_bytes(rotations, splats.quats)
     else:
-        spz_values.decode_smallest_three(rotations, splats.quats)
+        decode_smallest_three(rotations, splats.quats)
     del positions, rotations
     look_up(OPACITY_OF_BYTE, streams.pop("alphas")[:, 0], splats.opacities)
-    look_up(spz_values.COLOR_OF_BYTE, streams.pop("colors"), splats.sh0)
-    look_up(spz_values.SCALE_OF_BYTE, streams.pop("scales"), splats.scales)
+    look_up(COLOR_OF_BYTE, streams.pop("colors"), splats.sh0)
+    look_up(SCALE_OF_BYTE, streams.pop("scales"), splats.scales)
     rest = streams.pop("sh").reshape(info.count, _COEFFICIENTS[info.stored_degree], 3)
-    look_up(spz_values.SH_OF_BYTE, rest[:, :coefficients], splats.shN)
+    look_up(SH_OF_BYTE, rest[:, :coefficients], splats.shN)
     return splats
 
 
@@ -268,3 +465,69 @@ def _read_extensions(extensions: bytes, name: str) -> tuple[str, list[str]]:
             unread[_EXTENSION_NAMES.get(kind, f"the extension record 0x{kind:08X}")] = None
         start += _EXTENSION.size + length
     return frame, list(unread)
+
+
+# Writing of ``.spz``: version 3, one gzip member without extension records, which the most readers take.
+
+_Encode = Callable[[slice], UInt8[np.ndarray, "B width"]]
+
+
+def write_spz(
+    file: BinaryWriter, splats: Splats, *, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a clean scene; return what the format cannot hold, one phrase each.
+
+    Args:
+        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
+        splats: The scene, cleaned.
+        raw_axes: Store the axes of a ``.ply`` instead of the format's own (x right, y up, z back).
+        progress: Receives events of stage ``write``.
+
+    Raises:
+        UnsupportedError: the scene has no Gaussians, which readers of the format refuse.
+    """
+    count = len(splats)
+    if not count:
+        raise UnsupportedError("a scene without Gaussians cannot be written as .spz; write it as .ply")
+    reach = float(np.abs(splats.means).max())
+    bits = fractional_bits_for(reach)
+    encoders = _encoders(splats, bits, axis_signs(PLY_FRAME if raw_axes else DEFAULT_FRAME))
+    packer = zlib.compressobj(wbits=_GZIP)  # writes no time into the file
+    file.write(packer.compress(header_bytes(count, splats.sh_degree, bits, antialiased=splats.antialiased)))
+    for done, encode in enumerate(encoders, 1):
+        for part in steps(count):
+            file.write(packer.compress(encode(part).tobytes()))
+        progress("write", done / len(encoders))
+    file.write(packer.flush())
+    return _notes(splats, reach, bits)
+
+
+def _encoders(splats: Splats, bits: int, signs: Signs) -> list[_Encode]:
+    """Return the encoder of each stream, in the order of the file."""
+    of_axes = np.array(signs, np.float32)
+    of_quats = np.array(quat_signs(signs), np.float32)
+    of_sh = sh_signs(signs, splats.shN.shape[1])[:, None]
+    encoders: list[_Encode] = [
+        lambda part: encode_positions(splats.means[part] * of_axes, bits),
+        lambda part: to_bytes(255 * opacities_of(splats.opacities[part]))[:, None],
+        lambda part: encode_colors(splats.sh0[part]),
+        lambda part: encode_scales(splats.scales[part]),
+        lambda part: encode_smallest_three(splats.quats[part] * of_quats),
+    ]
+    if splats.sh_degree:
+        encoders.append(lambda part: encode_sh(splats.shN[part] * of_sh))
+    return encoders
+
+
+def _notes(splats: Splats, reach: float, bits: int) -> tuple[str, ...]:
+    """Return what is lost beyond the steps that the format always has."""
+    notes: list[str] = []
+    if bits < 12:
+        notes.append(f"positions have steps of {2.0**-bits:g}, because the scene reaches {reach:,.0f} from the origin")
+    limit = (1 << 23) - 1
+    note_clamped(notes, "positions", splats.means, -limit - 1, limit + 0.5, f"±{limit:,}")
+    note_clamped(notes, "scales", splats.scales, -10 - 1 / 32, 5.9375 + 1 / 32, "e^-10 to e^5.94")
+    edge = (0.5 + 0.5 / 255) / 0.15
+    note_clamped(notes, "colours", splats.sh0, -edge, edge, "coefficients of ±3.33")
+    note_clamped(notes, "view-dependent colours", splats.shN, -1 - 1 / 32, 1 + 1 / 32, "coefficients of ±1")
+    return tuple(notes)

@@ -16,14 +16,12 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.origin import Origin, read_origin
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
-from kissgs.core.threads import Workers
-from kissgs.io.json_files import parse_json
-from kissgs.io.packed_files import Source, is_file_name, open_source
-from kissgs.io.scene_file import marked, refuse_more_than
+from kissgs.core.resources import Workers
+from kissgs.core.splats import ATTRIBUTES, MAX_GAUSSIANS, SH_REST_COUNTS, Splats, empty_splats
+from kissgs.io.containers import Source, is_file_name, open_source
+from kissgs.io.files import marked, parse_json, refuse_more_than
 
 MAX_TREE_BYTES = 1 << 25
 """Largest size of a manifest, bytes; one of a thousand leaves and five levels takes 330 kB."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from kissgs.core.errors import InvalidContainerError
-from kissgs.io.packed_files import Source
+from kissgs.io.containers import Source
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned
-from kissgs.io.container_names import ContainerName
+from kissgs.io.containers import ContainerName
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
-from kissgs.planning.encoded import Encoded
-from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.settings import EncodeSettings
 from kissgs.sog import encode as sog
-from kissgs.sog.container_model import SOG
 from kissgs.sog.decode import decode as decode_sog
+from kissgs.sog.encode import SOG
 from kissgs.sogxt import encode as sogxt
 from kissgs.sogxt import names
 from kissgs.sogxt.decode import decode as decode_sogxt

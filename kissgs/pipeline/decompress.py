@@ -9,9 +9,15 @@ from pathlib import Path
 from kissgs.core.origin import in_world
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
-from kissgs.pipeline.read_options import ReadOptions
-from kissgs.pipeline.scene_files import AnyPath, check_ply, read_scene, save_ply
-from kissgs.pipeline.scene_formats import CONTAINER_FORMATS, recognise
+from kissgs.pipeline.scene_files import (
+    CONTAINER_FORMATS,
+    AnyPath,
+    ReadOptions,
+    check_ply,
+    read_scene,
+    recognise,
+    save_ply,
+)
 
 
 def decompress(

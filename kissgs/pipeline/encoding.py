@@ -15,20 +15,17 @@ import numpy as np
 from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
-from kissgs.core.deadline import Deadline
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.free_memory import return_free_memory
-from kissgs.core.progress import Progress, SearchNote, as_stage
+from kissgs.core.progress import Deadline, Progress, SearchNote, as_stage
+from kissgs.core.resources import blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, empty_splats
-from kissgs.core.threads import blas_workers
-from kissgs.io.container_names import ContainerName
+from kissgs.io.containers import ContainerName
 from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
 from kissgs.pipeline.containers import DECODERS, MODELS, write_files
+from kissgs.pipeline.goal import Trial
 from kissgs.pipeline.rate_control import Container, Encoder, RateControl
-from kissgs.pipeline.trial import Trial
-from kissgs.planning.encoded import Encoded
-from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.order_refinement import refine_order
 from kissgs.planning.planner import load_kernels as load_encoder
 from kissgs.planning.planner import plan_encoding
@@ -38,11 +35,10 @@ from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
 
 if TYPE_CHECKING:
-    from kissgs.compaction.search_evaluation import SearchEvaluation
+    from kissgs.compaction.budget import SearchEvaluation
     from kissgs.finetuning.tune import Tuner
     from kissgs.rendering.sensitivity import WeightedCameras
-    from kissgs.training.supervision import SupervisionViews
-    from kissgs.training.targets import TrainingTargets
+    from kissgs.training.supervision import SupervisionViews, TrainingTargets
 
 VIEW_UNCERTAINTY = {True: 0.1, False: 0.55}
 """Default of the setting ``view_uncertainty``: True with the cameras of a capture, False with virtual cameras only."""
@@ -194,7 +190,7 @@ class Encoding:
             byte_limit: see :class:`RateControl`.
             trained: likewise.
         """
-        from kissgs.compaction.search_evaluation import SearchEvaluation
+        from kissgs.compaction.budget import SearchEvaluation
 
         settings = self.settings.encode
         return RateControl(
@@ -302,7 +298,7 @@ class Encoding:
 
     def _rd_planner(self) -> Planner:
         """Measure the sensitivity once; return a planner that uses it for every plan."""
-        from kissgs.cameras.virtual.sensitivity_cameras import default_view_count, sensitivity_cameras
+        from kissgs.cameras.virtual.regions import default_view_count, sensitivity_cameras
         from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
 
         splats, views, settings = self.splats, self.views, self.settings.encode
@@ -413,7 +409,7 @@ def _recolor(
     splats: Splats, cameras: WeightedCameras, sensitivity: Sensitivity, steps: int, threads: int, progress: Progress
 ) -> ColorRefit:
     """Return a function that refits base colours to renderings of the scene from the capture's cameras."""
-    from kissgs.rendering.color_refit import refit_colors
+    from kissgs.rendering.sensitivity import refit_colors
 
     cameras = _refit_cameras(cameras)
 

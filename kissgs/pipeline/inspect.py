@@ -9,10 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kissgs.core.splats import ATTRIBUTES, clean
-from kissgs.io.scene_file import refuse_more_than
-from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.scene_files import read_scene, reading_notes, stored_bytes
-from kissgs.pipeline.scene_formats import CONTAINER_FORMATS, STREAMED_FORMATS, SceneFormat, recognise, scene_root
+from kissgs.io.files import refuse_more_than
+from kissgs.pipeline.scene_files import (
+    CONTAINER_FORMATS,
+    DEFAULT_READ_OPTIONS,
+    STREAMED_FORMATS,
+    ReadOptions,
+    SceneFormat,
+    read_scene,
+    reading_notes,
+    recognise,
+    scene_root,
+    stored_bytes,
+)
 
 if TYPE_CHECKING:
     from kissgs.io.gltf import GltfInfo

@@ -9,10 +9,9 @@ import numpy as np
 
 from kissgs.core.origin import recorded
 from kissgs.core.signed_log import signed_exp
-from kissgs.io.packed_files import open_source
+from kissgs.io.containers import open_source
 from kissgs.pipeline.container_facts import Facts, stored_size
-from kissgs.sog.metadata import SogLayout, read_layout
-from kissgs.sog.names import META_NAME
+from kissgs.sog.metadata import META_NAME, SogLayout, read_layout
 
 
 def sog_facts(path: Path) -> Facts:

@@ -10,7 +10,7 @@ import numpy as np
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.origin import recorded
 from kissgs.core.signed_log import signed_exp
-from kissgs.io.packed_files import Source, open_source
+from kissgs.io.containers import Source, open_source
 from kissgs.pipeline.container_facts import Facts
 from kissgs.sogxt.metadata import CHANNELS, Layout
 from kissgs.sogxt.metadata_reader import read_layout, read_provenance

@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from kissgs.core.origin import recorded
-from kissgs.io.packed_files import Source
+from kissgs.io.containers import Source
 from kissgs.io.streamed import C, Part, StreamedFormat
 from kissgs.pipeline.container_facts import Facts, stored_size
 from kissgs.pipeline.inspect_sog import sog_images, sog_ranges
 from kissgs.pipeline.inspect_sogxt import sogxt_ranges
-from kissgs.sog.names import META_NAME
+from kissgs.sog.metadata import META_NAME
 from kissgs.sog.streamed import STREAMED as SOG
 from kissgs.sog.streamed import SogContainer
 from kissgs.sogxt.streamed import STREAMED as SOGXT

@@ -1,34 +1,181 @@
-"""``PathContainers``: makes containers of the points of a training path, and keeps the best."""
+"""``PathContainers``: makes containers of the points of a training path, pruned or trained, and keeps the best."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from kissgs.compaction.result import CountTrial
 from kissgs.core.errors import StopSearch
-from kissgs.pipeline.candidates import Candidates
-from kissgs.pipeline.goal import Goal
-from kissgs.pipeline.path_points import POINTS_PER_HALVING, count_at, last_number, number_for_size
-from kissgs.pipeline.pruning import Pruning
+from kissgs.core.splats import Splats
+from kissgs.evaluation.results import drop_of
+from kissgs.pipeline.goal import Goal, Trial
 from kissgs.pipeline.rate_control import Container, RateControl
 from kissgs.pipeline.search_time import SearchPlan, SearchTime
-from kissgs.pipeline.trained_scenes import TrainedScene, TrainedScenes
 from kissgs.pipeline.trained_search import (
     NEAR_HALVINGS,
     NEAR_IN_TIME,
+    POINTS_PER_HALVING,
     Position,
+    TrainedScene,
+    TrainedScenes,
+    count_at,
     first_position,
+    last_number,
+    number_for_size,
     search_positions,
 )
 from kissgs.pipeline.training_choice import has_photographs
-from kissgs.pipeline.trial import Trial
 from kissgs.settings import EncodeSettings
+from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
     from kissgs.compaction.budget import Compactor
     from kissgs.compaction.result import Compacted
-    from kissgs.compaction.training_path import TrainingPath
+    from kissgs.compaction.training_path import PathPoint, TrainingPath
     from kissgs.pipeline.encoding import Encoding
+
+
+# ``Candidates``: the best container of searches at several numbers of Gaussians.
+
+UNKNOWN_DROP = 1e6
+"""Larger than any finite drop of PSNR, decibels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A number of Gaussians with containers that meet the goal.
+
+    Attributes:
+        cost: of the best container, to be minimised: its loss where the goal is a size, else bytes.
+        search: the search that made the containers.
+        compacted: the scene that they hold.
+    """
+
+    cost: float
+    search: RateControl
+    compacted: Compacted
+
+
+@dataclass(slots=True, eq=False)
+class Candidates:
+    """Keeps the best container of several searches.
+
+    Attributes:
+        goal: the goal of all searches.
+        packed: whether the files become a zip, whose size then counts; False for a folder.
+        best: the best so far; None if no container meets the goal.
+    """
+
+    goal: Goal
+    packed: bool
+    best: Candidate | None = None
+    _missed: list[tuple[RateControl, Compacted]] = field(init=False, default_factory=list)
+
+    @property
+    def best_bytes(self) -> float:
+        """Bytes of the best container so far; infinite where bytes are not the cost."""
+        return math.inf if self.best is None or self.goal.by_size else self.best.cost
+
+    @property
+    def any_missed(self) -> bool:
+        """Whether there is a container that misses the goal."""
+        return any(search.closest is not None for search, _ in self._missed)
+
+    def keep(self, search: RateControl, compacted: Compacted) -> None:
+        """Keep the best container of a search if it is better than that of all others."""
+        if search.best is None:
+            self._missed.append((search, compacted))
+            return
+        cost = float(stored_sizes(search.best.encoded.files, packed=self.packed)[0])
+        if self.goal.by_size:
+            cost = self._loss(search, search.best)
+        if self.best is None or cost < self.best.cost:
+            self.best = Candidate(cost, search, compacted)
+
+    def keep_closest(self) -> None:
+        """Keep the container that misses the goal least."""
+        made = [(search, compacted) for search, compacted in self._missed if search.closest is not None]
+        if made:
+            search, compacted = max(made, key=lambda each: max(map(self.goal.margin, each[0].trials)))
+            search.best, search.stopped = search.closest, True  # a fine-tuned one would not replace it
+            self.keep(search, compacted)
+
+    def _loss(self, search: RateControl, container: Container) -> float:
+        """Return the drop of PSNR of a container, decibels; infinite if a rendering failed.
+
+        If the photographs equal the scene's renderings, every drop is infinite. It is then a large number minus PSNR.
+        """
+        try:
+            evaluation = search.evaluate(container.encoded)
+        except StopSearch:  # the container exists, so it is evaluated before the search ends
+            search.stopped = True
+            evaluation = search.evaluate(container.encoded)
+        drop, psnr = drop_of(evaluation), evaluation.mean.candidate.psnr
+        if math.isnan(drop) or math.isnan(psnr):
+            return math.inf
+        return drop if math.isfinite(drop) else UNKNOWN_DROP - min(psnr, 1e3)
+
+
+# ``Pruning``: points of a training path that are pruned without training, and what each of them loses.
+
+PRUNABLE_DROP = 1.0
+"""Drop of PSNR, decibels, up to which pruning goes on without training."""
+
+
+def is_prunable(trial: Trial) -> bool:
+    """Whether a point may be pruned further without training."""
+    return (trial.drop or 0.0) <= PRUNABLE_DROP  # false where a rendering failed
+
+
+@dataclass(slots=True, eq=False)
+class Pruning:
+    """Prunes a scene along its path without training, and measures what that loses.
+
+    Attributes:
+        goal: what the losses are measured for.
+        compactor: compactor of the scene.
+        path: its path.
+        losses: figures of the points 1, 2 and so on that were measured, without an encoding.
+        tried: the same for the report, and of any other scene that was measured.
+    """
+
+    goal: Goal
+    compactor: Compactor
+    path: TrainingPath
+    losses: list[Trial] = field(default_factory=list)
+    tried: list[CountTrial] = field(default_factory=list)
+
+    def prune_to(self, number: int) -> PathPoint:
+        """Prune up to a point of the path, and return the last one."""
+        while len(self.path.points) <= number:
+            self.path.prune(count_at(len(self.path.points), len(self.compactor.splats)))
+        return self.path.points[-1]
+
+    def prune_while(self, useful: Callable[[Trial], bool], most: int) -> None:
+        """Prune and measure point after point up to number ``most``, or to the first that is not ``useful``."""
+        while len(self.path.points) <= most and len(self.path.points[-1]) > 1:
+            trial = self.measure(self.prune_to(len(self.path.points)).splats)
+            self.losses.append(trial)
+            if not useful(trial):
+                break
+
+    def last(self, serves: Callable[[Trial], bool]) -> int:
+        """Return the number of the last measured point that ``serves``; 0 for none."""
+        return max((number for number, trial in enumerate(self.losses, 1) if serves(trial)), default=0)
+
+    def measure(self, splats: Splats) -> Trial:
+        """Return the figures of a scene that is not encoded, and record them for the report."""
+        evaluation = self.compactor.evaluate(splats)
+        trial = self.goal.measured(Trial(len(splats), None, 0), evaluation)
+        ssim_decides = self.goal.decisive(trial).setting == "max_ssim_drop"
+        self.tried.append(CountTrial(len(splats), drop_of(evaluation), trial.ssim_drop, ssim_decides))
+        return trial
+
+
+# ``PathContainers``: makes containers of the points of a training path, and keeps the best.
 
 ENCODES = 6
 """Largest number of containers of the encoder alone where others are trained."""

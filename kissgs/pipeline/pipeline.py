@@ -11,18 +11,24 @@ import numpy as np
 
 from kissgs.compaction.result import Compacted
 from kissgs.core.array_types import Int
-from kissgs.core.deadline import Deadline
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.limits import MAX_GAUSSIANS
-from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_search, silent
+from kissgs.core.progress import Deadline, Progress, SearchNote, as_stage, ignore_stop_search, silent
+from kissgs.core.resources import StageTimer, peak_memory
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import Splats
-from kissgs.core.timing import StageTimer, peak_memory
-from kissgs.io.container_names import ContainerName, named_container
+from kissgs.core.splats import MAX_GAUSSIANS, Splats
+from kissgs.io.containers import ContainerName, named_container
 from kissgs.pipeline.containers import FILES
-from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.report import Report
-from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
+from kissgs.pipeline.scene_files import (
+    DEFAULT_READ_OPTIONS,
+    AnyPath,
+    ReadOptions,
+    check_ply,
+    open_scene,
+    read_scene,
+    reading_notes,
+    save_ply,
+)
 from kissgs.pipeline.training_choice import decided, work_plan
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
@@ -34,9 +40,9 @@ if TYPE_CHECKING:
     from kissgs.cameras.views import Views
     from kissgs.evaluation.results import Evaluation
     from kissgs.pipeline.encoding import Encoding
+    from kissgs.pipeline.goal import Trial
     from kissgs.pipeline.rate_control import RateControl
     from kissgs.pipeline.search_time import SearchTime
-    from kissgs.pipeline.trial import Trial
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,26 +8,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from kissgs.core.deadline import Deadline
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.limits import MAX_GAUSSIANS
-from kissgs.core.progress import SearchNote
+from kissgs.core.progress import Deadline, SearchNote
 from kissgs.core.root_finding import StopRule, find_root
-from kissgs.core.splats import Splats
-from kissgs.evaluation.psnr_loss import ESTIMATED_DROP
+from kissgs.core.splats import MAX_GAUSSIANS, Splats
+from kissgs.evaluation.results import ESTIMATED_DROP
 from kissgs.finetuning.result import FinetuneReport
-from kissgs.pipeline.goal import Goal, Limit
-from kissgs.pipeline.read_options import ReadOptions
-from kissgs.pipeline.scene_files import read_scene
-from kissgs.pipeline.trial import Trial
-from kissgs.planning.encoded import Encoded
+from kissgs.pipeline.goal import Goal, Limit, Trial
+from kissgs.pipeline.scene_files import ReadOptions, read_scene
+from kissgs.planning.encoding_plan import Encoded
 from kissgs.planning.sh_codebook import COEFFICIENTS, codebook_side
 from kissgs.settings import EncodeSettings
 from kissgs.settings.encode import GOALS
 from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
-    from kissgs.compaction.search_evaluation import SearchEvaluation
+    from kissgs.compaction.budget import SearchEvaluation
     from kissgs.evaluation.results import Evaluation
 
 LOG2_LAMBDA_RANGE = (-70.0, -6.0)

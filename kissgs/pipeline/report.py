@@ -9,7 +9,7 @@ from kissgs.compaction.result import CompactionReport
 from kissgs.core.splats import Cleaned
 from kissgs.evaluation.results import Evaluation
 from kissgs.finetuning.result import FinetuneReport
-from kissgs.pipeline.trial import Trial
+from kissgs.pipeline.goal import Trial
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

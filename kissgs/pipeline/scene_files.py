@@ -1,24 +1,325 @@
-"""Scenes in files: read every format, write those that are no containers.
-
-The module of a format is loaded when a file of that format is read.
-"""
+"""Scenes in files: recognise and read every format, write those that are no containers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+import io
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
 
 from kissgs.core.errors import InvalidContainerError, OutputError
-from kissgs.core.origin import WORLD, centred, in_world, relative_to
+from kissgs.core.origin import WORLD, centred, in_world, origin_for, relative_to, world_positions
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import Cleaned, Splats, clean
-from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
-from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.scene_formats import SceneFormat, recognise, scene_root
-from kissgs.pipeline.scene_output import output_format, write_scene
+from kissgs.core.splats import MAX_GAUSSIANS, Cleaned, Splats, clean
+from kissgs.io.containers import (
+    ENDINGS,
+    LEVELS_NAME,
+    LOD_NAME,
+    SCENE_ENDINGS,
+    ZIP_MAGICS,
+    MemorySource,
+    Source,
+    open_source,
+    sniff_format,
+    zip_names,
+)
+from kissgs.io.files import BinaryWriter, atomic_file, listed, parse_json, reason_of, refuse_existing
+from kissgs.sog.metadata import MAX_METADATA_BYTES, META_NAME
+from kissgs.sogxt.container import is_packed
+from kissgs.sogxt.names import YAML_NAME
+
+# Options for reading a scene from a file.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadOptions:
+    """Options for reading a scene, of which each format heeds those that concern it.
+
+    Attributes:
+        max_gaussians: largest number of Gaussians; more are refused before memory is allocated. By default 20 million
+            for formats whose scene can take far more memory than the file; no limit for ``.ply``, ``.splat`` and
+            ``.ksplat``, whose scene takes at most four times the bytes of the file.
+        level: level of detail of a streamed scene; 0 is the finest.
+        raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so, as some tools write it.
+        origin: "auto" makes positions relative to the whole numbers nearest to the middle of the scene
+            (:attr:`kissgs.Splats.origin`), where containers have the finest steps. By default the origin is that of the
+            file, or the middle of the scene where float32 cannot hold its positions.
+        antialiased: whether the scene was trained with antialiasing (:class:`kissgs.Splats`); None: as the file says.
+    """
+
+    max_gaussians: int | None = None
+    level: int = 0
+    raw_axes: bool = False
+    origin: Literal["auto"] | None = None
+    antialiased: bool | None = None
+
+    @property
+    def max_compressed(self) -> int:
+        """Largest number of Gaussians of formats whose scene can take far more memory than the file."""
+        return MAX_GAUSSIANS if self.max_gaussians is None else self.max_gaussians
+
+    def marked(self, splats: Splats) -> Splats:
+        """Return a scene that was read, antialiased or not as these options say."""
+        return splats if self.antialiased is None else replace(splats, antialiased=self.antialiased)
+
+
+DEFAULT_READ_OPTIONS = ReadOptions()
+
+
+# Recognition of scene formats: by content where a format has a mark, else by the ending of the name.
+
+SceneFormat = Literal["ply", "sogxt", "sog", "streamed-sog", "streamed-sogxt", "spz", "splat", "ksplat", "gltf"]
+"""All formats that are read. "ply" stands for unknown content too, about which its reader has the best messages."""
+
+STREAMED_FORMATS: frozenset[SceneFormat] = frozenset({"streamed-sog", "streamed-sogxt"})
+"""Formats with levels of detail."""
+
+CONTAINER_FORMATS: frozenset[SceneFormat] = STREAMED_FORMATS | {"sogxt", "sog"}
+"""Formats whose metadata describes them without decoding an image."""
+
+HEAD_BYTES = 512
+"""Bytes at the beginning of a file that recognition needs."""
+
+_STREAMED: dict[str, SceneFormat] = {LOD_NAME: "streamed-sog", LEVELS_NAME: "streamed-sogxt"}
+"""Format of streamed scenes by the name of their manifest, the first of which decides."""
+
+_WITHOUT_MARK: dict[str, SceneFormat] = {".splat": "splat", ".ksplat": "ksplat"}
+
+_ENDINGS: dict[str, SceneFormat] = {".spz": "spz", ".glb": "gltf", ".gltf": "gltf", ".sog": "sog"}
+"""Format of files whose content is not recognised: damaged ones, about which the reader says more."""
+
+
+def recognise(
+    source: Path | bytes | Mapping[str, bytes], *, name: str | None = None, size: int | None = None
+) -> SceneFormat:
+    """Return the format of a scene: a file, a folder, the bytes of a file, or a container's files in memory.
+
+    The metadata file of a container and the manifest of a streamed scene stand for their folder. ``.splat`` is
+    recognised by its name only.
+
+    Args:
+        source: the scene, or the first 512 bytes of a file, of which every zip then counts as "sogxt".
+        name: name of the file, if ``source`` has none or another one.
+        size: bytes of the whole file, if ``source`` is only its beginning.
+
+    Raises:
+        InvalidContainerError: a folder holds no container and no streamed scene.
+    """
+    if isinstance(source, Mapping):
+        return _container_format(MemorySource(source))
+    name = ("" if isinstance(source, bytes) else source.name) if name is None else name
+    name = name.lower()
+    ending = Path(name).suffix
+    if isinstance(source, Path) and (_is_folder(source) or scene_root(source) != source):
+        _check_folder(scene_root(source))
+        return _STREAMED.get(name) or _packed_format(scene_root(source), "sogxt")
+    head, found_size = _beginning(source)
+    if marked := _by_mark(head):
+        return marked
+    if ending in _WITHOUT_MARK and head[:4] not in ZIP_MAGICS:
+        return _WITHOUT_MARK[ending]
+    if is_container(source):
+        return _packed_format(source, "sog" if ending == ".sog" else "sogxt")
+    from kissgs.io.ksplat import is_ksplat
+
+    if is_ksplat(head, found_size if size is None else size):
+        return "ksplat"
+    if ending not in _ENDINGS and _is_json(head):
+        return "gltf"
+    return _ENDINGS.get(ending, "ply")
+
+
+def scene_root(path: Path) -> Path:
+    """Return the folder of a container or streamed scene if ``path`` is its metadata or manifest, else ``path``."""
+    return path.parent if path.name in (META_NAME, *_STREAMED) and path.is_file() else path
+
+
+def is_container(source: Path | bytes) -> bool:
+    """Whether a source is a folder or a zip, rather than another file.
+
+    A zip may have any name, and a prefix such as a self-extractor. If the file cannot be opened, the ending ``.zip``
+    decides.
+    """
+    if isinstance(source, bytes):
+        return sniff_format(io.BytesIO(source)) == "zip"
+    try:
+        if source.is_dir():
+            return True
+        if source.is_file():  # opening a named pipe would block
+            with source.open("rb") as file:
+                return sniff_format(file) == "zip"
+    except (OSError, ValueError):
+        pass
+    return is_packed(source)
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a folder that is no container, and name the scenes in it, or below it where INRIA's trainer puts them."""
+    try:
+        if any((folder / name).is_file() for name in (YAML_NAME, META_NAME, *_STREAMED)):
+            return
+        found = [path for pattern in ("*", "point_cloud/iteration_*/*") for path in sorted(folder.glob(pattern))]
+        scenes = [path for path in found if path.suffix.lower() in (*ENDINGS, *SCENE_ENDINGS) and path.is_file()]
+    except (OSError, ValueError):
+        return  # the reader says why
+    if scenes:
+        names = listed([str(path.relative_to(folder)) for path in scenes])
+        raise InvalidContainerError(f"{folder!s:.200} is a folder, not a scene; name a file in it: {names}")
+    raise InvalidContainerError(
+        f"{folder!s:.200} is a folder without a scene: it has neither {YAML_NAME} nor {META_NAME}, {LOD_NAME} or "
+        f"{LEVELS_NAME}; name the file of a scene, or the folder of a container"
+    )
+
+
+def _beginning(source: Path | bytes) -> tuple[bytes, int]:
+    """Return the first bytes and the size of a file; nothing of what cannot be read."""
+    if isinstance(source, bytes):
+        return source[:HEAD_BYTES], len(source)
+    try:
+        if source.is_file():  # opening a named pipe would block
+            with source.open("rb") as file:
+                return file.read(HEAD_BYTES), source.stat().st_size
+    except (OSError, ValueError):
+        pass
+    return b"", 0
+
+
+def _by_mark(head: bytes) -> SceneFormat | None:
+    if head[:3] == b"ply" and head[3:4].isspace():
+        return "ply"
+    if head[:4] in ZIP_MAGICS:  # the modules of other formats need not be loaded
+        return None
+    from kissgs.io.gltf_document import GLB_MAGIC
+    from kissgs.io.spz import is_spz
+
+    if head.startswith(GLB_MAGIC):
+        return "gltf"
+    return "spz" if is_spz(head) else None
+
+
+def _is_json(head: bytes) -> bool:
+    start = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    return start.startswith(b"{") and not any(byte < 32 and byte not in b"\t\r\n" for byte in start)
+
+
+def _packed_format(source: Path | bytes, damaged: SceneFormat) -> SceneFormat:
+    """Return the format of a folder or a zip; ``damaged`` if it cannot be read, whose reader then says why."""
+    try:
+        if isinstance(source, bytes) or not _is_folder(source):
+            with _opened(source) as file:
+                names = {name.replace("\\", "/").rsplit("/", 1)[-1] for name in zip_names(file)}
+            if found := _streamed_format(names):
+                return found
+        with open_source(source) as files:
+            return _container_format(files, damaged)
+    except (InvalidContainerError, OSError, ValueError):
+        return damaged
+
+
+def _opened(source: Path | bytes) -> io.BufferedIOBase:
+    return io.BytesIO(source) if isinstance(source, bytes) else source.open("rb")
+
+
+def _streamed_format(names: Collection[str]) -> SceneFormat | None:
+    return next((kind for manifest, kind in _STREAMED.items() if manifest in names), None)
+
+
+def _container_format(files: Source, unknown: SceneFormat = "sogxt") -> SceneFormat:
+    """Tell the containers apart: only SOG-XT has a YAML file, and a mask in ``meta.json``."""
+    names = files.names()
+    if found := _streamed_format(names):
+        return found
+    if YAML_NAME in names or META_NAME not in names:
+        return "sogxt" if YAML_NAME in names else unknown
+    try:
+        document = parse_json(files.read(META_NAME, MAX_METADATA_BYTES), META_NAME)
+    except InvalidContainerError:
+        return unknown
+    plain = isinstance(document, dict) and "means" in document and document.keys().isdisjoint({"mask", "gridSide"})
+    return "sog" if plain else unknown
+
+
+# Formats in which a scene is written, by the ending of a name. Containers are written by ``compress``.
+
+OutputFormat = Literal["ply", "compressed.ply", "spz", "splat", "glb", "spz.glb"]
+OUTPUT_FORMATS: tuple[OutputFormat, ...] = ("ply", "compressed.ply", "spz", "splat", "glb", "spz.glb")
+"""Formats that are written; each is the ending of its files without the first dot."""
+
+
+def output_format(path: Path) -> OutputFormat:
+    """Return the format that the ending of a name stands for.
+
+    Raises:
+        OutputError: no format that is written has this ending.
+    """
+    name = path.name.lower()
+    found = [kind for kind in OUTPUT_FORMATS if name.endswith(f".{kind}")]
+    if found:
+        return max(found, key=len)
+    if path.suffix.lower() in ENDINGS:
+        raise OutputError(f"{path!s:.100} is the name of a container; kissgs compress writes those")
+    raise OutputError(
+        f"{path!s:.100} has no ending of a format that is written: .{', .'.join(OUTPUT_FORMATS)}; choose one of them"
+    )
+
+
+def write_scene(
+    file: BinaryWriter, splats: Splats, kind: OutputFormat, *, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a scene in a format, which all but ``ply`` need cleaned; return what the format cannot hold.
+
+    Each loss beyond the steps that the format always has is one phrase. ``raw_axes`` is for ``spz``.
+
+    Raises:
+        UnsupportedError: the format cannot hold the scene.
+    """
+    if kind == "ply":
+        from kissgs.io.ply import write_ply
+
+        write_ply(file, splats, progress=progress)
+        return ()
+    splats = clean(splats)[0]
+    notes = _write_cleaned(file, splats, kind, raw_axes, progress)
+    if splats.origin != WORLD:
+        kept = "records it as a translation" if kind.endswith("glb") else "does not record it"
+        rounded = origin_for(world_positions(splats), splats.scales) != WORLD
+        reason = ", because float32 would round those of the world" if rounded else ""
+        notes = (*notes, f"{relative_to(splats.origin)}{reason}; .{kind} {kept}")
+    return notes
+
+
+def _write_cleaned(
+    file: BinaryWriter, splats: Splats, kind: OutputFormat, raw_axes: bool, progress: Progress
+) -> tuple[str, ...]:
+    if kind == "spz":
+        from kissgs.io.spz import write_spz
+
+        return write_spz(file, splats, raw_axes=raw_axes, progress=progress)
+    if kind == "compressed.ply":
+        from kissgs.io.compressed_ply import write_compressed
+
+        return write_compressed(file, splats, progress=progress)
+    if kind == "splat":
+        from kissgs.io.splat import write_splat
+
+        return write_splat(file, splats, progress=progress)
+    from kissgs.io.gltf_writer import write_glb, write_spz_glb
+
+    return (write_glb if kind == "glb" else write_spz_glb)(file, splats, progress=progress)
+
+
+# Scenes in files: read every format, write those that are no containers.
+#
+# The module of a format is loaded when a file of that format is read.
 
 AnyPath = str | PathLike[str]
 

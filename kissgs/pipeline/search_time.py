@@ -1,11 +1,87 @@
-"""``SearchTime``: how a search that trains divides its time among training and containers."""
+"""Time of a search: expected on this machine, divided among training and containers, and what a limit allows."""
 
 from __future__ import annotations
 
+import json
 import math
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
-from kissgs.core.deadline import Deadline
+from kissgs.core.errors import OutputError
+from kissgs.core.progress import Deadline
+from kissgs.core.resources import processors
+from kissgs.io.files import atomic_file, reason_of
+from kissgs.settings import Preset, Settings
+
+# Expected time of an encoding on this machine, from its speed as ``kissgs warmup`` has measured it.
+
+ENCODE_SECONDS = {
+    Preset.FAST: (0.5, 0.0, 6e-6),
+    Preset.BALANCED: (1.5, 5.0, 40e-6),
+    Preset.SMALL: (1.5, 5.0, 80e-6),
+    Preset.PAPER: (1.0, 0.0, 140e-6),
+}
+"""Seconds of an encoding by preset, measured on two processors: a fixed part; one that all scenes of more than
+:data:`FULL_RENDERINGS` Gaussians have, for renderings; one per Gaussian."""
+
+FULL_RENDERINGS = 20_000
+"""Number of Gaussians from which renderings take about the same time; with fewer, they take in proportion less."""
+
+SPEEDS = (1e-3, 1e3)
+"""Slowest and fastest speed of a processor that is believed, in units of :func:`save_speed`."""
+
+REFERENCE_PROCESSORS, MOST_PROCESSORS = 2, 8
+"""Processors of that machine, and the number beyond which an encoding is taken to become no faster."""
+
+
+def encode_seconds(preset: Preset, count: int, threads: int = 0) -> float:
+    """Return the expected wall time of an encoding of ``count`` Gaussians without training, seconds.
+
+    ``threads`` is the number of threads; 0 means one per processor.
+    """
+    used = min(threads or processors(), processors(), MOST_PROCESSORS)
+    return _reference_seconds(preset, count) / (_speed_per_processor() * used)
+
+
+def _reference_seconds(preset: Preset, count: int) -> float:
+    fixed, renderings, each = ENCODE_SECONDS[preset]
+    return fixed + renderings * min(count / FULL_RENDERINGS, 1.0) + each * count
+
+
+def save_speed(seconds: float, preset: Preset, count: int) -> None:
+    """Save the speed of this machine, which encoded ``count`` Gaussians in ``seconds`` with all its processors.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    speed = _reference_seconds(preset, count) / seconds
+    try:
+        path = _speed_file()
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
+    except RuntimeError as error:  # this user has no home
+        raise OutputError("there is no folder for caches; name one by XDG_CACHE_HOME") from error
+    with atomic_file(path, overwrite=True) as file:
+        file.write(json.dumps({"speed_per_processor": speed / min(processors(), MOST_PROCESSORS)}).encode())
+
+
+def _speed_per_processor() -> float:
+    """Return the speed that was saved, of the reference machine if none was or the file is damaged."""
+    try:
+        speed = float(json.loads(_speed_file().read_bytes())["speed_per_processor"])
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError, OverflowError):
+        return 1 / REFERENCE_PROCESSORS
+    return speed if SPEEDS[0] <= speed <= SPEEDS[1] else 1 / REFERENCE_PROCESSORS
+
+
+def _speed_file() -> Path:
+    """Return the file of the speed, in the user's folder for caches."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "kissgs" / "speed.json"
+
+
+# ``SearchTime``: how a search that trains divides its time among training and containers.
 
 CONTAINER_SHARE, LAST_CONTAINER_SHARE = 2.0, 4.0
 """Time to fine-tune a container, in units of that to train one point of the path; the second for the last container,
@@ -135,3 +211,77 @@ class SearchTime:
     def for_container(self, containers: int) -> Deadline:
         """Return the deadline of the next of so many containers."""
         return Deadline.after(max(self.deadline.seconds, 0.0) / containers)
+
+
+# Choice of what a limited time is used for: training, the preset, or the fastest preset.
+
+TRAINING_TIME = 3.5
+"""Time from which training on photographs pays, in units of an encoding without training."""
+
+TUNING_TIME = 5.0
+"""Time from which fine-tuning on renderings of the scene pays, in the same unit."""
+
+TOO_LITTLE_TIME = "there was too little time for training"
+"""Note where training is left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimePlan:
+    """How a limited time is used.
+
+    Attributes:
+        settings: settings that fit into the time.
+        time: the time, for a search that trains; None for no limit.
+        note: what the user may not expect; empty if there is nothing to say.
+    """
+
+    settings: Settings
+    time: SearchTime | None = None
+    note: str = ""
+
+
+def time_plan(
+    requested: Settings,
+    settings: Settings,
+    count: int,
+    deadline: Deadline | None,
+    *,
+    captured: bool,
+    torch: bool,
+    threads: int,
+) -> TimePlan:
+    """Choose what to do in the time that is left for a scene.
+
+    Training that was not requested is left out where there is too little time for it, and the preset where even a
+    plain encoding takes too long, unless a goal or a setting of the encoder is given. Without a goal and a capture,
+    time that is left goes to fine-tuning on renderings of the scene.
+
+    Args:
+        requested: settings as requested.
+        settings: the same with what they leave open decided, as if there were time for everything.
+        count: number of Gaussians.
+        deadline: time until which the container shall be ready; None for no limit.
+        captured: whether there is a capture.
+        torch: whether torch is installed, which training needs.
+        threads: number of threads; 0 means one per processor.
+    """
+    if deadline is None:
+        return TimePlan(settings)
+    plain, left = encode_seconds(settings.preset, count, threads), deadline.seconds
+    time = SearchTime(deadline, plain)
+    if left >= TRAINING_TIME * plain and count > 1:
+        tunes = requested.aims and not captured and settings.finetune.enabled is None
+        if tunes and torch and left >= TUNING_TIME * plain:
+            settings = settings.model_copy(update={"finetune": settings.finetune.model_copy(update={"enabled": True})})
+        return TimePlan(settings, time)
+    trained = settings.compact.auto_count and not requested.compact.auto_count
+    settings = requested.decided(photographs=False, torch=False)
+    note = TOO_LITTLE_TIME if trained and count > 1 else ""
+    if note and not settings.encode.has_goal:
+        note += ", so nothing limits the loss but the preset"
+    usual = Settings.from_preset(settings.preset, seed=settings.encode.seed).encode
+    takes = plain * (CAPTURE_TIME if captured and settings.encode.rate_distortion else 1.0)
+    if left >= takes or settings.preset == Preset.FAST or settings.encode != usual or settings.finetune.enabled:
+        return TimePlan(settings, time, note)
+    fast = Settings.from_preset(Preset.FAST, time_limit=settings.time_limit, seed=settings.encode.seed)
+    return TimePlan(fast, time, f"encoded with the preset fast: {settings.preset} would take about {takes:.0f} s")

@@ -6,8 +6,8 @@ from dataclasses import replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from kissgs.core.deadline import Deadline
-from kissgs.pipeline.time_plan import TimePlan, time_plan
+from kissgs.core.progress import Deadline
+from kissgs.pipeline.search_time import TimePlan, time_plan
 from kissgs.settings import Settings
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""``EncodingPlan``: the encoder's decisions for a scene, independent of the container format."""
+"""``EncodingPlan``: the result of planning, independent of the container format; ``Encoded``: the files of it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import UInt8
+from kissgs.core.array_types import Int, UInt8
 from kissgs.core.origin import Origin
-from kissgs.planning.gaussian_costs import Costs
 from kissgs.planning.layout import Grid
 from kissgs.planning.quantize import Quantized
+from kissgs.planning.rd_criterion import Costs
 from kissgs.planning.sh_codebook import Codebook
+
+# ``EncodingPlan``: the encoder's decisions for a scene, independent of the container format.
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,3 +68,55 @@ class EncodingPlan:
     rd_lambda: float | None = None
     note: str = ""
     coarse: str = ""
+
+
+# ``Encoded``: the files of a container in memory, and figures of its encoding.
+
+
+@dataclass(frozen=True, slots=True)
+class Encoded:
+    """A container in memory, and figures of its encoding.
+
+    Attributes:
+        files: name -> bytes, in the order in which they are best stored.
+        order: ``(M,)`` index in the encoded scene of every Gaussian of the container, in the container's order.
+        form_error: largest relative change of a covariance by the plan of its equivalent form.
+        invisible: number of Gaussians pruned because no renderer draws them.
+        pruned_by_rd: number of Gaussians pruned because removing them costs less than their bits.
+        clipped_colors: number of Gaussians with a clipped base colour (:func:`kissgs.planning.quantize.clip_outliers`).
+        errors: largest quantisation error by field and channel (:class:`kissgs.planning.encoding_plan.EncodingPlan`).
+        rd_lambda: squared error per bit; None for uniform planning.
+        codebook_side: S; the codebook has up to S × S entries.
+        note: a sentence for the user if many Gaussians were pruned; else empty.
+        coarse: a sentence for the user if the positions are too coarse for the Gaussians; else empty.
+    """
+
+    files: dict[str, bytes]
+    order: Int[np.ndarray, " M"]
+    form_error: float
+    invisible: int
+    pruned_by_rd: int
+    clipped_colors: int
+    errors: dict[str, list[float]]
+    rd_lambda: float | None
+    codebook_side: int
+    note: str = ""
+    coarse: str = ""
+
+    @classmethod
+    def of(cls, plan: EncodingPlan, files: dict[str, bytes]) -> Encoded:
+        """Return the files of a plan with the plan's figures."""
+        scene = plan.scene
+        return cls(
+            files=files,
+            order=plan.grid.cells[plan.grid.mask],
+            form_error=plan.form_error,
+            invisible=scene.count - scene.visible,
+            pruned_by_rd=scene.visible - int(plan.grid.mask.sum()),
+            clipped_colors=plan.clipped_colors,
+            errors=plan.errors,
+            rd_lambda=plan.rd_lambda,
+            codebook_side=plan.codebook.side,
+            note=plan.note,
+            coarse=plan.coarse,
+        )

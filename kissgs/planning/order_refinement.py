@@ -17,7 +17,7 @@ import numpy as np
 
 from kissgs.core.array_types import Int, Int32, UInt8, UInt16
 from kissgs.core.progress import Progress
-from kissgs.core.threads import Workers
+from kissgs.core.resources import Workers
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import hilbert_order
 from kissgs.planning.rows import sorted_order

@@ -13,9 +13,9 @@ from math import ceil
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, Integer, UInt8, UInt16
+from kissgs.core.resources import Workers
 from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import Splats
-from kissgs.core.threads import Workers
 from kissgs.planning.rows import Rows, for_each_block, row_range, selected
 
 MEANS_TOP = 65_535

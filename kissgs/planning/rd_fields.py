@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.core.resources import Workers
 from kissgs.core.signed_log import signed_exp, signed_log
 from kissgs.core.splats import Splats
-from kissgs.core.threads import Workers
 from kissgs.planning import table_fields
 from kissgs.planning.container_model import ContainerModel
 from kissgs.planning.quantize import MEANS_TOP, Quantized, clip_outliers, log_extent, means_bits, quantize_means

@@ -14,7 +14,7 @@ from math import ceil
 import numpy as np
 
 from kissgs.core.array_types import Float, Float32, Float64, Int, Integer, UInt8
-from kissgs.core.threads import Workers
+from kissgs.core.resources import Workers
 from kissgs.planning.quantize import Quantized
 from kissgs.planning.rd_criterion import RdCriterion
 from kissgs.planning.rotation_forms import PERMUTATIONS

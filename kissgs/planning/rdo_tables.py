@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, UInt8
-from kissgs.core.threads import Workers
+from kissgs.core.resources import Workers
 from kissgs.planning.rd_criterion import RdCriterion
 from kissgs.planning.rdo_quantize import CHUNK, ROUNDS, level_bits
 from kissgs.planning.rotation_forms import PERMUTATIONS

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Float64, Int, UInt8
+from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.core.threads import Workers
 from kissgs.planning.container_model import ContainerModel
-from kissgs.planning.plas import box_blur
+from kissgs.planning.layout import box_blur
 from kissgs.planning.rows import Computed, for_each_block, selected
 from kissgs.settings import EncodeSettings
 

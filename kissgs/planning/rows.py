@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 
 from kissgs.core.array_types import Int, Int32, Shaped, UInt64
-from kissgs.core.threads import Workers
+from kissgs.core.resources import Workers
 
 R = TypeVar("R")
 

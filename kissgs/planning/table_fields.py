@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from kissgs.core.array_types import Float, Float32, Float64, UInt8
+from kissgs.core.resources import Workers
 from kissgs.core.signed_log import signed_log
-from kissgs.core.threads import Workers
 from kissgs.planning import smallest_three
 from kissgs.planning.container_model import ByteTables
 from kissgs.planning.quantize import MEANS_TOP, Quantized

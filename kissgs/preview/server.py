@@ -11,10 +11,8 @@ from urllib.parse import quote, unquote, urlsplit
 
 from kissgs._version import __version__
 from kissgs.core.errors import UnsupportedError
-from kissgs.io.atomic import reason_of
-from kissgs.preview.page_files import PAGE, hash_source, import_map, page_files, read_page
-from kissgs.preview.page_scene import PageScene
-from kissgs.preview.streamed_folder import StreamedFolder
+from kissgs.io.files import reason_of
+from kissgs.preview.page_scene import PAGE, PageScene, StreamedFolder, hash_source, import_map, page_files, read_page
 
 HOST = "127.0.0.1"
 SLOWEST_SECONDS = 60

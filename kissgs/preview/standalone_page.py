@@ -14,8 +14,7 @@ import posixpath
 import re
 from pathlib import Path
 
-from kissgs.preview.page_files import hash_source, import_map, page_files, read_page
-from kissgs.preview.page_scene import PageScene
+from kissgs.preview.page_scene import PageScene, hash_source, import_map, page_files, read_page
 
 _START, _PROGRAM, _STYLE = "standalone.js", "preview.js", "preview.css"
 

@@ -1,19 +1,23 @@
-"""Image metrics as in the 3DGS literature: PSNR, SSIM and MS-SSIM.
-
-Images are ``(H, W, 3)``, floats in [0, 1] or uint8. Values outside [0, 1] are not clamped here; clamp renderings first.
-A NaN in either image makes the result NaN, so that no average hides a failed rendering.
-"""
+"""Image metrics as in the 3DGS literature: PSNR, SSIM, MS-SSIM; LPIPS and FLIP by their packages."""
 
 from __future__ import annotations
 
+import http.client
+import importlib
 import itertools
 import math
+import warnings
 
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Shaped
-from kissgs.core.errors import InvalidViewsError
-from kissgs.core.threads import Workers
+from kissgs.core.errors import InvalidViewsError, UnsupportedError
+from kissgs.core.resources import Workers
+
+# Image metrics as in the 3DGS literature: PSNR, SSIM and MS-SSIM.
+#
+# Images are ``(H, W, 3)``, floats in [0, 1] or uint8. Values outside [0, 1] are not clamped here; clamp renderings
+# first. A NaN in either image makes the result NaN, so that no average hides a failed rendering.
 
 WINDOW = 11
 """Side of the Gaussian window of SSIM and MS-SSIM, pixels."""
@@ -178,3 +182,101 @@ def _tiles(height: int, width: int) -> list[np.ndarray]:
         for top, bottom in itertools.pairwise(row_edges)
         for left, right in itertools.pairwise(column_edges)
     ]
+
+
+# LDR-FLIP, a perceptual difference of images, by the package ``flip-evaluator`` (extra ``kissgs[flip]``).
+
+
+class Flip:
+    """FLIP: from 0 for equal images to 1. Construct it once and call it often.
+
+    It estimates the difference that an observer sees who flips between two images on a display with 67 pixels per
+    degree of visual angle: a monitor of 3840 pixels and 0.7 m width, 0.7 m away.
+
+    Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", Proceedings of the ACM on Computer Graphics
+    and Interactive Techniques 3 (2020).
+    """
+
+    def __init__(self) -> None:
+        """Load the package.
+
+        Raises:
+            UnsupportedError: the package is not installed.
+        """
+        try:
+            self._package = importlib.import_module("flip_evaluator")
+        except ModuleNotFoundError as error:
+            raise UnsupportedError(
+                f"FLIP needs a package that is not installed ({error}): pip install 'kissgs[flip]'"
+            ) from error
+
+    def __call__(self, image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
+        """Return the mean over all pixels of two sRGB images ``(H, W, 3)``, floats or uint8; NaN if either has a NaN.
+
+        Values are clamped to [0, 1].
+
+        Raises:
+            InvalidViewsError: the arrays are not two images of the same size.
+        """
+        first, second = (np.clip(pixels, 0, 1) for pixels in image_pair(image, reference))
+        if np.isnan(first).any() or np.isnan(second).any():  # the package takes NaN for a value
+            return float("nan")
+        errors, *_ = self._package.evaluate(second, first, "LDR", applyMagma=False, computeMeanError=False)
+        return float(errors.mean(dtype=np.float64))  # the package adds them up in float32
+
+
+# LPIPS, a perceptual distance of images, by the package ``lpips`` (extra ``kissgs[lpips]``).
+
+MIN_SIDE = 16
+"""Smallest side of an image, pixels: the network halves its input four times."""
+
+
+class Lpips:
+    """LPIPS with VGG-16: from 0 for equal images up to about 1. Construct it once and call it often.
+
+    This is the LPIPS of papers on Gaussian splatting: like the evaluation script of 3DGS, it passes images in [0, 1] to
+    the network, which was calibrated on [-1, 1].
+
+    Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018.
+    """
+
+    def __init__(self, device: str = "cpu") -> None:
+        """Load the network, whose weights (528 MB) torchvision downloads on first use.
+
+        Raises:
+            UnsupportedError: the packages are not installed, or the weights cannot be loaded.
+        """
+        try:
+            package = importlib.import_module("lpips")
+        except ModuleNotFoundError as error:
+            raise UnsupportedError(
+                f"LPIPS needs packages that are not installed ({error}): pip install 'kissgs[lpips]'"
+            ) from error
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # lpips loads weights by a deprecated function of torchvision
+                self._network = package.LPIPS(net="vgg", verbose=False).to(device)
+        except (OSError, RuntimeError, http.client.HTTPException) as error:
+            raise UnsupportedError(
+                f"LPIPS could not load the weights of its network, vgg16, which torchvision downloads on first use "
+                f"({error}): construct kissgs.rendering.metrics.Lpips once while online, or copy the file into the "
+                f"folder checkpoints of torch.hub.get_dir()"
+            ) from error
+        self._device = device
+
+    def __call__(self, image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
+        """Return the distance of two images ``(H, W, 3)``, floats in [0, 1] or uint8; NaN if either has a NaN.
+
+        Raises:
+            InvalidViewsError: the arrays are not two images of the same size.
+            UnsupportedError: a side is below :data:`MIN_SIDE`.
+        """
+        import torch
+
+        pair = image_pair(image, reference)
+        height, width, _ = pair[0].shape
+        if min(height, width) < MIN_SIDE:
+            raise UnsupportedError(f"LPIPS needs images of at least {MIN_SIDE}x{MIN_SIDE} pixels, not {width}x{height}")
+        first, second = (torch.from_numpy(array).to(self._device).permute(2, 0, 1)[None] for array in pair)
+        with torch.no_grad():
+            return float(self._network(first, second).item())

@@ -13,8 +13,8 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.progress import Progress, silent
+from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 
 Device = Literal["cpu", "cuda"]
@@ -97,7 +97,7 @@ def load_kernels(progress: Progress = silent) -> None:
     """Compile the rasteriser's kernels, or load them from numba's cache; ``progress`` receives the stage "kernels"."""
     progress("kernels", 0.0)
     from kissgs.rendering import ssim_kernels
-    from kissgs.rendering.cpu import gradients  # noqa: F401
+    from kissgs.rendering.cpu import backward as gradients  # noqa: F401
 
     del ssim_kernels
     progress("kernels", 1.0)

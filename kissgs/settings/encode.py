@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, BeforeValidator, ByteSize, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from kissgs.core.limits import MAX_GRID_SIDE
+from kissgs.core.splats import MAX_GRID_SIDE
 
 Step = Annotated[float, Field(ge=1e-4, le=10)]
 

@@ -12,16 +12,33 @@ from kissgs.core.array_types import UInt8
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.origin import recorded
 from kissgs.core.progress import Progress, silent
+from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.core.threads import blas_workers
+from kissgs.io.conventions import OPACITY_OF_BYTE
 from kissgs.io.planes import compress_images
-from kissgs.planning.encoded import Encoded
-from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.container_model import ByteTables, ContainerModel
+from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.quantize import Quantized
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.settings import EncodeSettings
-from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG
-from kissgs.sog.names import META_NAME
+from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, META_NAME
+
+# Description of SOG 2 for the planner: its tables, and no mask for padding.
+
+FIRST_DRAWN = 2
+"""Smallest level of opacity that viewers draw: they leave out opacities of 1/255 and less."""
+
+LAST_DRAWN = 254
+"""Largest level to use: 255 is an opacity of 1, whose logit no decoder can give back."""
+
+SOG = ContainerModel(
+    tables=ByteTables(
+        opacity_logits=OPACITY_OF_BYTE.astype(np.float64), first_drawn=FIRST_DRAWN, last_drawn=LAST_DRAWN
+    ),
+    padding_last=True,
+    entry_bits=130,
+)
+
 
 MEANS, QUATS, SCALES, SH0 = ("means_l.webp", "means_u.webp"), "quats.webp", "scales.webp", "sh0.webp"
 SHN = ("shN_centroids.webp", "shN_labels.webp")
@@ -40,7 +57,7 @@ def write_files(
     """Make the files of a plan.
 
     Args:
-        plan: plan of :func:`~kissgs.planning.planner.plan_encoding` for :data:`kissgs.sog.container_model.SOG`.
+        plan: plan of :func:`~kissgs.planning.planner.plan_encoding` for :data:`kissgs.sog.encode.SOG`.
         settings: settings of the plan.
         threads: number of threads; 0 means one per processor. The bytes do not depend on it.
         progress: receives "images".

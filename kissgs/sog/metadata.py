@@ -12,11 +12,14 @@ from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.origin import WORLD, Origin, read_origin
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.io.activations import OPACITY_OF_BYTE
-from kissgs.io.json_files import parse_json
-from kissgs.io.packed_files import Source, is_file_name
-from kissgs.io.scene_file import listed
-from kissgs.sog.names import MAX_METADATA_BYTES, META_NAME
+from kissgs.io.containers import Source, is_file_name
+from kissgs.io.conventions import OPACITY_OF_BYTE
+from kissgs.io.files import listed, parse_json
+
+META_NAME = "meta.json"
+
+MAX_METADATA_BYTES = 1 << 20
+"""Largest size of ``meta.json``, bytes; four codebooks in full digits take 15 kB."""
 
 ENTRIES_PER_ROW = 64
 """Entries of the SH codebook in a row of its image."""

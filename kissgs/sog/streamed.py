@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.core.threads import Workers
-from kissgs.io.container_names import LOD_NAME
-from kissgs.io.packed_files import Source
+from kissgs.io.containers import LOD_NAME, Source
 from kissgs.io.streamed import StreamedFormat
 from kissgs.sog.decode import decode_files
 from kissgs.sog.metadata import SogLayout, read_layout

@@ -11,8 +11,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from kissgs.core.errors import OutputError
-from kissgs.io.atomic import atomic_file, check_writable, move_into_place, path_state, reason_of, refuse_existing, umask
-from kissgs.io.packed_files import open_source
+from kissgs.io.containers import open_source
+from kissgs.io.files import atomic_file, check_writable, move_into_place, path_state, reason_of, refuse_existing, umask
 from kissgs.sogxt.names import FILES
 
 

@@ -9,15 +9,13 @@ import numpy as np
 
 from kissgs._version import __version__
 from kissgs.core.array_types import Float32, UInt8
-from kissgs.core.limits import MAX_CODEBOOK_SIDE
 from kissgs.core.progress import Progress, silent
+from kissgs.core.resources import blas_workers
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
-from kissgs.core.threads import blas_workers
+from kissgs.core.splats import MAX_CODEBOOK_SIDE, NOTHING_CLEANED, Cleaned, Splats
 from kissgs.io.planes import compress_images
 from kissgs.io.webp import pixels_crc32
-from kissgs.planning.encoded import Encoded
-from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.planner import plan_encoding
 from kissgs.planning.quantize import Quantized, observed_range
 from kissgs.planning.rate_distortion import ColorRefit

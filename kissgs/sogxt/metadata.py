@@ -15,9 +15,8 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 from pydantic_core import PydanticCustomError
 
-from kissgs.core.limits import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE
 from kissgs.core.origin import WORLD, Origin, recorded
-from kissgs.core.splats import SH_REST_COUNTS
+from kissgs.core.splats import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE, SH_REST_COUNTS
 from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME
 
 TILE_ROWS, TILE_COLUMNS = 3, 5

@@ -13,9 +13,8 @@ from pydantic import ValidationError
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.origin import WORLD, read_origin
-from kissgs.io.container_names import LEVELS_NAME, LOD_NAME
-from kissgs.io.json_files import parse_json
-from kissgs.io.packed_files import Source
+from kissgs.io.containers import LEVELS_NAME, LOD_NAME, Source
+from kissgs.io.files import parse_json
 from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout, Provenance
 from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME, YAML_NAME
 

@@ -6,10 +6,9 @@ import io
 from dataclasses import dataclass
 
 from kissgs.core.errors import InvalidContainerError
+from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.core.threads import Workers
-from kissgs.io.container_names import LEVELS_NAME
-from kissgs.io.packed_files import Source, ZipSource
+from kissgs.io.containers import LEVELS_NAME, Source, ZipSource
 from kissgs.io.streamed import StreamedFormat
 from kissgs.sogxt.decode import decode_files
 from kissgs.sogxt.metadata import Layout

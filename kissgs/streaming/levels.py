@@ -1,19 +1,75 @@
-"""Levels of detail of one chunk: each leaf merged to half its Gaussians, again and again."""
+"""Levels of detail of one chunk, how much they differ from its finest, and the far surroundings of the scene."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from kissgs.compaction.covariance_kernels import covariances_of
 from kissgs.compaction.merging import merged_levels
-from kissgs.core.array_types import Float64
+from kissgs.core.array_types import Bool, Float32, Float64
 from kissgs.core.progress import Progress, silent
+from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats, concatenate
-from kissgs.core.threads import Workers
-from kissgs.streaming.level_errors import level_errors
+from kissgs.rendering.camera import Camera, look_at
+from kissgs.rendering.rasterizer import render
 from kissgs.streaming.partition import leaf_groups
+
+# ``level_errors``: how much the coarser levels of a leaf differ from its finest, measured in rendered images.
+#
+# The leaf is drawn alone. Other Gaussians in front of it could only hide differences.
+
+SIZE = 128
+"""Width and height of the images, pixels; the leaf fills them."""
+
+DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
+"""Directions from which a leaf is seen."""
+
+DISTANCE = 4.0
+"""Distance of the cameras, in radii of the leaf."""
+
+INSIDE = 0.9
+"""Share of a leaf's Gaussians within its radius: a few may be far away."""
+
+BACKGROUND = (0.5, 0.5, 0.5)
+
+
+def level_errors(levels: Sequence[Splats]) -> list[float]:
+    """Return the root mean square error of each level, in units of the range of colours; that of the finest is 0.
+
+    No level has a smaller error than a finer one, so that a smaller error never asks for a coarser level.
+
+    Args:
+        levels: the leaf's Gaussians in each level, the finest first, clean.
+    """
+    squared = np.zeros(len(levels))
+    for camera in _cameras(levels[0]):
+        images = [np.clip(render(level, camera, background=BACKGROUND, threads=1)[0], 0, 1) for level in levels]
+        squared += [float(np.mean((image - images[0]) ** 2)) for image in images]
+    errors = np.sqrt(squared / len(DIRECTIONS))
+    return [round(float(error), 5) for error in np.maximum.accumulate(np.nan_to_num(errors, nan=1.0))]
+
+
+def _cameras(leaf: Splats) -> list[Camera]:
+    means = leaf.means.astype(np.float64)
+    centre = np.median(means, axis=0)
+    radius = _radius(means - centre, leaf)
+    fov, up = 2 * np.arctan(1 / DISTANCE), np.array([0.1, 1.0, 0.2])
+    return [
+        look_at(centre + DISTANCE * radius * direction, centre, up, fov=fov, width=SIZE, height=SIZE)
+        for direction in DIRECTIONS
+    ]
+
+
+def _radius(offsets: Float64[np.ndarray, "N 3"], leaf: Splats) -> float:
+    """Return the radius of the ball around the centre that holds most of the leaf, or its median Gaussian."""
+    size = float(np.exp(np.median(leaf.scales.max(axis=1).astype(np.float64))))
+    return max(float(np.quantile(np.linalg.norm(offsets, axis=1), INSIDE)), 2 * size)
+
+
+# Levels of detail of one chunk: each leaf merged to half its Gaussians, again and again.
 
 MERGING = 0.7
 """Share of merging in the time for the levels of a chunk; the rest measures their errors."""
@@ -28,7 +84,7 @@ class ChunkLevels:
         counts: number of Gaussians of each leaf, per level.
         bounds: ``(leaves, 2, 3)`` lowest and highest corner of each leaf: the boxes of one standard deviation around
             the Gaussians of all its levels.
-        errors: for each leaf, the error of each level (:func:`kissgs.streaming.level_errors.level_errors`).
+        errors: for each leaf, the error of each level (:func:`kissgs.streaming.levels.level_errors`).
     """
 
     levels: list[Splats]
@@ -80,3 +136,55 @@ def bounds(splats: Splats) -> Float64[np.ndarray, "2 3"]:
     reach = np.sqrt(covariances[:, [0, 3, 5]])
     means = splats.means.astype(np.float64)
     return np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
+
+
+# ``Environment``: the far surroundings of a scene, such as its sky, which are apart from the levels of detail.
+#
+# They look alike from everywhere in the scene, so no distance says which of their levels to draw; and they would widen
+# the boxes of the leaves that they are in.
+
+FAR = 8.0
+"""Distance from which Gaussians belong to the environment, in units of their median distance from the centre."""
+
+FEWEST, MOST = 1_000, 65_536
+"""Least and largest number of Gaussians in an environment. Viewers draw it always and whole, so it must be small."""
+
+LARGEST_SHARE = 0.3
+"""Largest share of a scene in its environment."""
+
+ONE_SIDED = 0.7
+"""Length of the mean direction of Gaussians from which they do not surround the scene. Half a sphere has 0.5."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Environment:
+    """Space beyond a ball.
+
+    Attributes:
+        center: ``(3,)`` centre of the scene, world units.
+        radius: of the ball; infinite if the scene has no environment.
+    """
+
+    center: Float64[np.ndarray, "3"]
+    radius: float
+
+    @classmethod
+    def of(cls, positions: Float32[np.ndarray, "S 3"], count: int) -> Environment:
+        """Return the environment of a scene of ``count`` Gaussians, by evenly sampled positions."""
+        none = cls(np.zeros(3), np.inf)
+        if not len(positions):
+            return none
+        points = positions.astype(np.float64)
+        found = cls(
+            center := np.median(points, axis=0), FAR * float(np.median(np.linalg.norm(points - center, axis=1)))
+        )
+        far = points[found.contains(positions)] - center
+        estimate = len(far) / len(points) * count
+        if found.radius <= 0 or not FEWEST <= estimate <= min(MOST, LARGEST_SHARE * count):
+            return none
+        directions = far / np.linalg.norm(far, axis=1, keepdims=True)
+        return found if np.linalg.norm(directions.mean(axis=0)) < ONE_SIDED else none
+
+    def contains(self, means: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Return whether each position belongs to the environment."""
+        return np.linalg.norm(means.astype(np.float64) - self.center, axis=1) > self.radius

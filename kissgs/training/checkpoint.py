@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from kissgs.core.errors import OutputError
-from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
+from kissgs.io.files import atomic_file, reason_of, refuse_existing
 
 SAVE_INTERVAL = 30.0
 """Shortest time between two saves, seconds."""

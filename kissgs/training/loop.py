@@ -11,15 +11,13 @@ from typing import Protocol
 
 import numpy as np
 
-from kissgs.core.deadline import Pace
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.free_memory import keep_free_memory
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import Pace, Progress, silent
+from kissgs.core.resources import keep_free_memory
 from kissgs.rendering import tensors
-from kissgs.rendering.cpu.gradients import Gradients
-from kissgs.rendering.differentiable import rasterize
-from kissgs.rendering.losses import photometric_loss
-from kissgs.training.targets import TrainingTargets
+from kissgs.rendering.cpu.backward import Gradients
+from kissgs.rendering.differentiable import photometric_loss, rasterize
+from kissgs.training.supervision import TrainingTargets
 
 try:
     import torch
@@ -105,7 +103,7 @@ def train(
 ) -> None:
     """Fit a scene to target images, from step ``first`` on.
 
-    The loss is :func:`kissgs.rendering.losses.photometric_loss` plus the plan's regularizers. On the CPU, the result
+    The loss is :func:`kissgs.rendering.differentiable.photometric_loss` plus the plan's regularizers. On the CPU, it
     depends on the seed but not on the number of threads; on a GPU it is not reproducible.
 
     Args:

@@ -20,7 +20,7 @@ from kissgs.core.splats import (
     Splats,
     clean,
 )
-from kissgs.rendering.cpu.gradients import Gradients
+from kissgs.rendering.cpu.backward import Gradients
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.tensors import tensors_of
 from kissgs.training.optimizer import PrunableAdam

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from kissgs.cameras.pixels import PhotoHeader, read_photo, read_photo_header
+from kissgs.cameras.photographs import PhotoHeader, read_photo, read_photo_header
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 
 BLACK, WHITE = np.zeros(3, dtype=np.float32), np.ones(3, dtype=np.float32)
@@ -145,7 +145,7 @@ def test_a_large_jpeg_is_decoded_smaller_at_the_same_place(tmp_path, monkeypatch
     waves = np.stack([np.sin(20 * x), np.cos(14 * y), np.sin(9 * x + 11 * y)], axis=-1)
     image = Image.fromarray(np.uint8(127.5 + 120 * waves))
     path = saved(tmp_path, image, "a.jpg", quality=98, subsampling=0)
-    monkeypatch.setattr("kissgs.cameras.pixels.DRAFT_PIXELS", 1203 * 811 - 1)
+    monkeypatch.setattr("kissgs.cameras.photographs.DRAFT_PIXELS", 1203 * 811 - 1)
     found = read_photo(path, 120, 81, BLACK)
     expected = np.asarray(image.resize((120, 81), Image.Resampling.BOX))
     assert np.abs(found.astype(int) - expected).mean() < 1
@@ -157,7 +157,7 @@ def test_bands_make_no_difference(tmp_path, monkeypatch, background):
     transparent = saved(tmp_path, Image.fromarray(np.uint8(np.concatenate([COLOUR, alpha], axis=2))))
     grey = saved(tmp_path, Image.fromarray(GREY.astype(np.uint16) * 257), "b.png")
     whole = [read_photo(path, 6, 4, background) for path in (transparent, grey)]
-    monkeypatch.setattr("kissgs.cameras.pixels.BAND_PIXELS", 18)
+    monkeypatch.setattr("kissgs.cameras.photographs.BAND_PIXELS", 18)
     for path, expected in zip((transparent, grey), whole, strict=True):
         np.testing.assert_array_equal(read_photo(path, 6, 4, background), expected)
 

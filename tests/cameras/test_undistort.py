@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import fsolve
 
-from kissgs.cameras.undistort import MIN_AREA, Distortion, Lens, Window, full_window, undistort
+from kissgs.cameras.photographs import MIN_AREA, Distortion, Lens, Window, full_window, undistort
 from kissgs.core.errors import InvalidViewsError
 
 BARREL = Distortion(k1=-0.15, k2=0.02)

@@ -12,8 +12,7 @@ from kissgs import CompactSettings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.budget import compact_scene
 from kissgs.evaluation.evaluate import compare_images, evaluate
-from kissgs.evaluation.psnr_loss import ASSUMED_PSNR, drop_of
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
+from kissgs.evaluation.results import ASSUMED_PSNR, Comparison, Evaluation, ImageMetrics, ViewComparison, drop_of
 from kissgs.rendering.rasterizer import render
 
 ONLY_PRUNE = {"sparsify_steps": 0, "refine_steps": 0, "min_keep_per_scoring": 0.6}

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 import kissgs
 from kissgs import CompactSettings
-from kissgs.compaction import covariance_kernels, merge_kernels, nearest_kernels
+from kissgs.compaction import covariance_kernels, nearest_kernels
+from kissgs.compaction import merging as merge_kernels
 from kissgs.compaction.budget import Compactor, compact_scene
 from kissgs.compaction.merging import BLUR, CONTRAST, LEAF, NEIGHBOURS, SPACING_RANK, merge_gaussians
 from kissgs.compaction.scoring import highest_indices

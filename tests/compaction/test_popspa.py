@@ -12,7 +12,7 @@ from PIL import Image
 import kissgs
 from kissgs import CompactSettings, OutputError, UnsupportedError
 from kissgs.cameras.views import View, Views, black
-from kissgs.cameras.virtual.scene_views import scene_views
+from kissgs.cameras.virtual.regions import scene_views
 from kissgs.compaction.budget import compact_scene
 from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.scoring import highest_indices, prune_by_score
@@ -21,8 +21,7 @@ from kissgs.rendering.camera import look_at
 from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.rasterizer import render
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.supervision import SupervisionViews, supervision_views
-from kissgs.training.targets import training_targets
+from kissgs.training.supervision import SupervisionViews, supervision_views, training_targets
 
 SHORT = {"sparsify_steps": 8, "refine_steps": 6, "prune_rounds": 2, "min_keep_per_scoring": 0.6, "admm_interval": 3}
 NO_TRAINING = {"sparsify_steps": 0, "refine_steps": 0}

@@ -7,11 +7,11 @@ from helpers.training_scenes import around, cloud
 
 import kissgs
 from kissgs.cameras.views import Views, black
-from kissgs.cameras.virtual.random_poses import random_poses
-from kissgs.compaction.search_evaluation import COUNT, SearchEvaluation
+from kissgs.cameras.virtual.samples import random_poses
+from kissgs.compaction.budget import COUNT, SearchEvaluation
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images, render_clamped
-from kissgs.evaluation.psnr_loss import SEARCH_SEED
+from kissgs.evaluation.results import SEARCH_SEED
 
 SCENE = kissgs.sample_scene(400, sh_degree=1, seed=3)
 WORSE = replace(SCENE, opacities=SCENE.opacities - 0.5)
@@ -43,8 +43,8 @@ def test_the_views_and_their_renderings_are_made_once(monkeypatch):
         "kissgs.evaluation.evaluate.render_clamped",
         lambda *given, **named: rendered.append(1) or render_clamped(*given, **named),
     )
-    monkeypatch.setattr("kissgs.compaction.search_evaluation.random_poses", None)
-    monkeypatch.setattr("kissgs.compaction.search_evaluation.evaluation_views", None)
+    monkeypatch.setattr("kissgs.compaction.budget.random_poses", None)
+    monkeypatch.setattr("kissgs.compaction.budget.evaluation_views", None)
     assert compare(WORSE).as_dict() == first.as_dict()
     assert len(rendered) == len(first.views) + len(first.surroundings.views)  # the candidate alone
 

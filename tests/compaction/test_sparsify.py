@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.compaction.sparsify import AdmmSparsifier, keep_largest
+from kissgs.compaction.regularizers import AdmmSparsifier, keep_largest
 
 
 @given(st.lists(st.sampled_from([-1.0, 0.0, 0.25, 0.5, 2.0]), min_size=1, max_size=12), st.integers(1, 12))

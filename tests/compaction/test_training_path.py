@@ -14,8 +14,7 @@ from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.scene_training import MOST_STEP_PER_SIZE
 from kissgs.compaction.scoring import prune_by_score
 from kissgs.compaction.training_path import TrainingPath
-from kissgs.core.deadline import Deadline
-from kissgs.core.progress import silent
+from kissgs.core.progress import Deadline, silent
 from kissgs.training.supervision import SupervisionViews
 
 SCENE = cloud(60)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from kissgs.core import deadline
-from kissgs.core.deadline import Deadline, Pace
+from kissgs.core import progress as deadline
+from kissgs.core.progress import Deadline, Pace
 
 
 @pytest.fixture

@@ -5,13 +5,13 @@ import sys
 
 import pytest
 
-from kissgs.core import free_memory
-from kissgs.core.free_memory import keep_free_memory, return_free_memory
+from kissgs.core import resources as free_memory
+from kissgs.core.resources import keep_free_memory, return_free_memory
 
 LARGE_ARRAYS = """
 import resource
 import numpy as np
-from kissgs.core.free_memory import keep_free_memory
+from kissgs.core.resources import keep_free_memory
 
 def page_faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

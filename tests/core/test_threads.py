@@ -6,7 +6,7 @@ import threading
 import pytest
 from threadpoolctl import threadpool_info
 
-from kissgs.core.threads import Workers, blas_workers
+from kissgs.core.resources import Workers, blas_workers
 
 
 def blas_threads():

@@ -21,7 +21,7 @@ from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images, evaluate
 from kissgs.evaluation.metric_text import format_metric
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
-from kissgs.evaluation.visibility import share_shown
+from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.metrics import ms_ssim, ssim
 from kissgs.rendering.rasterizer import render

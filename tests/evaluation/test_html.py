@@ -16,9 +16,21 @@ from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.views import View, Views
 from kissgs.core.errors import Cancelled
 from kissgs.core.splats import ATTRIBUTES, Splats
-from kissgs.evaluation.error_maps import FULL_SCALES, INFERNO, WINDOW, full_scale, heat_map, rms_difference, worst_crop
 from kissgs.evaluation.evaluate import compare_images, evaluate
-from kissgs.evaluation.html import MAX_SURROUNDINGS, MAX_VIEWS, ReportScene, html_report, select_views
+from kissgs.evaluation.html import (
+    FULL_SCALES,
+    INFERNO,
+    MAX_SURROUNDINGS,
+    MAX_VIEWS,
+    WINDOW,
+    ReportScene,
+    full_scale,
+    heat_map,
+    html_report,
+    rms_difference,
+    select_views,
+    worst_crop,
+)
 
 WORSE = damaged()
 VOID = {"meta", "link", "img", "input", "br"}

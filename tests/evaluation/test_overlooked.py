@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 
 import kissgs
+from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, Splats
-from kissgs.core.threads import Workers
-from kissgs.evaluation.cameras import COUNT, evaluation_views
+from kissgs.evaluation.cameras import COUNT, MAX_ADDED, VISIBLE_PSNR, Parts, evaluation_views
 from kissgs.evaluation.evaluate import compare_images
-from kissgs.evaluation.overlooked import MAX_ADDED, VISIBLE_PSNR, Parts
-from kissgs.evaluation.parts import find_parts
-from kissgs.evaluation.prominence import prominence
+from kissgs.evaluation.scene_parts import find_parts, prominence
 
 
 def objects(count, gaussians=100, apart=200.0, seed=0):

@@ -9,8 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.cameras.views import View
-from kissgs.evaluation.psnr_loss import ASSUMED_PSNR, MAX_ERROR_RATIO, MAX_SSIM_RATIO, drop_of, psnr_of, ssim_drop_of
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
+from kissgs.evaluation.results import (
+    ASSUMED_PSNR,
+    MAX_ERROR_RATIO,
+    MAX_SSIM_RATIO,
+    Comparison,
+    Evaluation,
+    ImageMetrics,
+    ViewComparison,
+    drop_of,
+    psnr_of,
+    ssim_drop_of,
+)
 from kissgs.rendering.camera import look_at
 
 VIEW = View(

@@ -5,16 +5,20 @@ import pytest
 from helpers import reference_rasterizer
 
 import kissgs
+from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, Splats
-from kissgs.core.threads import Workers
-from kissgs.evaluation.prominence import (
+from kissgs.evaluation.scene_parts import (
+    MAX_SIDE,
     NEIGHBOURS,
+    SHOWN_SHARE,
     GaussianSampler,
+    base_colors_only,
+    blending_weights,
     drawn_opacities,
     mahalanobis_distances,
     prominence,
+    share_shown,
 )
-from kissgs.evaluation.visibility import MAX_SIDE, SHOWN_SHARE, base_colors_only, blending_weights, share_shown
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.cpu.frame import draw
 

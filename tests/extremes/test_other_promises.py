@@ -11,9 +11,9 @@ from helpers.training_scenes import cloud
 import kissgs
 from kissgs import Settings
 from kissgs.cameras.views import black
+from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.core.threads import Workers
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.cpu.frame import draw
 from kissgs.rendering.sensitivity import WeightedCameras, _bound, measure_sensitivity

@@ -11,11 +11,10 @@ from helpers.training_scenes import cloud
 from helpers.tuning_scenes import chosen, shuffled
 from PIL import Image
 
-from kissgs.core.deadline import Pace
-from kissgs.finetuning.codebook_rate import CodebookRate
-from kissgs.finetuning.losses import ENTROPY_FIELDS, PAPER_TV_WEIGHTS, RateLoss, TotalVariationLoss
+from kissgs.core.progress import Pace
+from kissgs.finetuning.losses import ENTROPY_FIELDS, PAPER_TV_WEIGHTS, CodebookRate, RateLoss, TotalVariationLoss
 from kissgs.finetuning.quantized_scene import QuantizedScene
-from kissgs.sog.container_model import SOG
+from kissgs.sog.encode import SOG
 
 
 def quantized(count=400, degree=1, preset="balanced"):

@@ -10,8 +10,8 @@ from helpers.tuning_scenes import FIELDS, choices, chosen, shuffled
 from kissgs import Settings, Splats, decompress
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.finetuning.quantized_scene import QuantizedScene
-from kissgs.planning.gaussian_costs import Costs
 from kissgs.planning.quantize import _levels
+from kissgs.planning.rd_criterion import Costs
 from kissgs.sogxt.encode import write_files
 
 IMAGES = {"opacities": 3, "scales": 3, "quaternions": 4, "f_dc": 3}

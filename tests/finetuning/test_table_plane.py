@@ -11,10 +11,9 @@ from helpers.tuning_scenes import FIELDS, choices, chosen, shuffled
 from kissgs import Settings, Splats, decompress
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.finetuning.quantized_scene import QuantizedScene, table_name
-from kissgs.io.activations import OPACITY_OF_BYTE
-from kissgs.planning.gaussian_costs import Costs
-from kissgs.sog.container_model import SOG
-from kissgs.sog.encode import write_files
+from kissgs.io.conventions import OPACITY_OF_BYTE
+from kissgs.planning.rd_criterion import Costs
+from kissgs.sog.encode import SOG, write_files
 
 TABLES = ("scales", "f_dc", "f_rest_centroids")
 

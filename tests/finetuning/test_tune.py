@@ -12,8 +12,7 @@ from helpers.tuning_scenes import Interrupted, chosen, stopping_after
 import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
 from kissgs.cameras.views import Views, black
-from kissgs.compaction.scene_training import SceneTraining
-from kissgs.compaction.schedule import Phase
+from kissgs.compaction.scene_training import Phase, SceneTraining
 from kissgs.core.progress import silent
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.tune import Tuner, _Result

@@ -16,9 +16,8 @@ from kissgs.core.progress import silent
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.evaluation.evaluate import evaluate
 from kissgs.finetuning.tune import Tuner
-from kissgs.sog.container_model import SOG
 from kissgs.sog.decode import decode
-from kissgs.sog.encode import write_files
+from kissgs.sog.encode import SOG, write_files
 from kissgs.sogxt.container import zip_bytes
 from kissgs.training.checkpoint import Checkpoint
 

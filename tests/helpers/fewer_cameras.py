@@ -1,6 +1,7 @@
 """Fewer camera candidates, for faster tests."""
 
-from kissgs.cameras.virtual import candidates, scored_candidates
+from kissgs.cameras.virtual import candidates
+from kissgs.cameras.virtual import select as scored_candidates
 
 
 def try_fewer(patch, azimuths=8, radii=(1.1, 2.6)):

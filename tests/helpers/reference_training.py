@@ -8,12 +8,12 @@ import numpy as np
 import torch
 
 from helpers import reference_float64
-from kissgs.core.deadline import Pace
+from kissgs.core.progress import Pace
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.rendering.losses import plain_photometric_loss
+from kissgs.rendering.differentiable import plain_photometric_loss
 from kissgs.training.loop import TrainingPlan, train
 from kissgs.training.model import BOUNDS, GaussianModel
-from kissgs.training.targets import TrainingTargets
+from kissgs.training.supervision import TrainingTargets
 
 STEPS = 3
 RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 0.05, "sh0": 2.5e-3, "shN": 1.25e-4}

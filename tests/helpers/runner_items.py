@@ -59,7 +59,7 @@ def allocate(arguments, progress):
 
 def write_slowly(arguments, progress):
     """Add a line to the file ``starts``, then wait, in the first start for long, and write ``output`` atomically."""
-    from kissgs.io.atomic import atomic_file
+    from kissgs.io.files import atomic_file
 
     with Path(arguments["starts"]).open("a") as file:
         file.write(f"{os.getpid()}\n")

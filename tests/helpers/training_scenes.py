@@ -5,8 +5,7 @@ import numpy as np
 import kissgs
 from kissgs.cameras.views import View, black
 from kissgs.rendering.camera import look_at
-from kissgs.training.supervision import SupervisionViews
-from kissgs.training.targets import training_targets
+from kissgs.training.supervision import SupervisionViews, training_targets
 
 
 def cloud(count=60, degree=1, seed=0):

@@ -10,7 +10,7 @@ from helpers.reference_compressed_ply import SH_C0, compressed_bytes, header_byt
 from helpers.reference_ply import assert_identical
 
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.io import ply_body
+from kissgs.io import ply_rows as ply_body
 from kissgs.io.ply import PlyInfo, read_ply, read_ply_info
 
 

@@ -10,7 +10,7 @@ from helpers.splat_transform import convert, needs_splat_transform
 
 from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.io.compressed_ply import write_compressed
-from kissgs.io.morton import morton_order
+from kissgs.io.conventions import morton_order
 from kissgs.io.ply import PlyInfo, read_ply, read_ply_info
 
 

@@ -31,8 +31,7 @@ from kissgs.io.gltf_writer import write_glb, write_spz_glb
 from kissgs.io.ksplat import read_ksplat
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.io.splat import read_splat, write_splat
-from kissgs.io.spz import read_spz
-from kissgs.io.spz_writer import write_spz
+from kissgs.io.spz import read_spz, write_spz
 from kissgs.sog.decode import decode
 
 COUNTS = [1, 65]

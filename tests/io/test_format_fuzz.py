@@ -18,8 +18,7 @@ from kissgs.io.ksplat import read_ksplat
 from kissgs.io.ply import read_ply
 from kissgs.io.splat import read_splat
 from kissgs.io.spz import read_spz
-from kissgs.pipeline.read_options import ReadOptions
-from kissgs.pipeline.scene_files import read_scene
+from kissgs.pipeline.scene_files import ReadOptions, read_scene
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.names import SCENE_NAME, YAML_NAME
 

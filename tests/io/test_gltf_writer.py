@@ -16,7 +16,7 @@ from kissgs.io import gltf_writer
 from kissgs.io.gltf import GltfInfo, read_gltf, read_gltf_info
 from kissgs.io.gltf_writer import write_glb, write_spz_glb
 from kissgs.io.ply import write_ply
-from kissgs.io.spz_writer import write_spz
+from kissgs.io.spz import write_spz
 
 
 def written(splats):

@@ -6,8 +6,8 @@ import zipfile
 import pytest
 
 from kissgs.core.errors import InvalidContainerError
-from kissgs.io import packed_files
-from kissgs.io.packed_files import DirectorySource, is_below, open_source, zip_names
+from kissgs.io import containers as packed_files
+from kissgs.io.containers import DirectorySource, is_below, open_source, zip_names
 
 
 @pytest.mark.parametrize("name", ["a", "a/b.webp", "a b/c", "..a/b", "a/..b", "a\\b"])

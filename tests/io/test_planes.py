@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from kissgs.core.errors import InvalidContainerError
-from kissgs.core.threads import blas_workers
+from kissgs.core.resources import blas_workers
 from kissgs.io.planes import compress_images, effort_of
 from kissgs.io.webp import decode_plane, encode_plane, probe_webp
 from kissgs.settings import EncodeSettings

@@ -27,7 +27,7 @@ from helpers.reference_ply import (
 
 from kissgs.core.errors import Cancelled, InvalidSceneError
 from kissgs.core.splats import Splats
-from kissgs.io import ply_body
+from kissgs.io import ply_rows as ply_body
 from kissgs.io.ply import PlyInfo, read_ply, read_ply_blocks, read_ply_info, write_ply
 
 

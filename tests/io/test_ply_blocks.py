@@ -8,7 +8,7 @@ from kissgs.core.errors import InvalidSceneError
 from kissgs.core.splats import concatenate
 from kissgs.io import ply
 from kissgs.io.ply import read_ply, read_ply_blocks
-from kissgs.pipeline.scene_output import write_scene
+from kissgs.pipeline.scene_files import write_scene
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
@@ -17,7 +17,7 @@ from kissgs.pipeline.scene_output import write_scene
 @pytest.mark.quick(8)
 def test_blocks_are_the_scene(encoding, count, degree, tmp_path, monkeypatch):
     monkeypatch.setattr(ply, "BLOCK", 100)
-    monkeypatch.setattr("kissgs.io.ply_body.BLOCK_BYTES", 100 * 4 * (14 + 45))
+    monkeypatch.setattr("kissgs.io.ply_rows.BLOCK_BYTES", 100 * 4 * (14 + 45))
     path = tmp_path / "scene.ply"
     path.write_bytes(ply_bytes(random_columns(count, degree), encoding))
     blocks = list(read_ply_blocks(path))

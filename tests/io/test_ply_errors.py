@@ -8,7 +8,7 @@ from helpers.memory import takes_less_than
 from helpers.reference_ply import declaration, header_bytes, names, ply_bytes, random_columns
 
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.io import ply_body
+from kissgs.io import ply_rows as ply_body
 from kissgs.io.ply import read_ply, read_ply_info
 
 VERTEX = ["element vertex 1", *(f"property float {name}" for name in names(0))]

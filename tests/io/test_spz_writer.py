@@ -13,9 +13,17 @@ from helpers.splat_transform import convert, needs_splat_transform
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.io.ply import read_ply
-from kissgs.io.spz import SpzInfo, read_spz, read_spz_info
-from kissgs.io.spz_values import encode_colors, encode_scales, encode_sh, encode_smallest_three, fractional_bits_for
-from kissgs.io.spz_writer import write_spz
+from kissgs.io.spz import (
+    SpzInfo,
+    encode_colors,
+    encode_scales,
+    encode_sh,
+    encode_smallest_three,
+    fractional_bits_for,
+    read_spz,
+    read_spz_info,
+    write_spz,
+)
 
 
 def written(splats, **options):

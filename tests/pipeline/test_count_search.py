@@ -16,7 +16,7 @@ from kissgs import Settings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.result import CountTrial
 from kissgs.core.progress import SearchNote
-from kissgs.evaluation.psnr_loss import drop_of
+from kissgs.evaluation.results import drop_of
 from kissgs.rendering.rasterizer import render
 
 SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)

@@ -7,9 +7,8 @@ import pytest
 
 from kissgs import Settings
 from kissgs.core.root_finding import find_root
-from kissgs.pipeline.goal import Goal
+from kissgs.pipeline.goal import Goal, Trial
 from kissgs.pipeline.rate_control import LOG2_LAMBDA_RANGE
-from kissgs.pipeline.trial import Trial
 
 
 def goal_of(**limits):

@@ -18,7 +18,7 @@ import kissgs
 from kissgs import Cancelled, InvalidContainerError, InvalidSceneError, KissgsError, OutputError, Settings
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.io.ply import write_ply
-from kissgs.pipeline.scene_formats import is_container
+from kissgs.pipeline.scene_files import is_container
 
 FAST = Settings.from_preset("fast")
 SCENE = kissgs.sample_scene(120, sh_degree=1, seed=3)

@@ -8,8 +8,8 @@ import pytest
 
 import kissgs
 from kissgs import FinetuneReport, OutputError, Settings, Splats, StopSearch, UnsupportedError
-from kissgs.cameras.virtual.random_poses import random_poses
-from kissgs.compaction.search_evaluation import SearchEvaluation
+from kissgs.cameras.virtual.samples import random_poses
+from kissgs.compaction.budget import SearchEvaluation
 from kissgs.core.progress import SearchNote, silent
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.pipeline.rate_control import Container, RateControl

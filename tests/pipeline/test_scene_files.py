@@ -13,9 +13,7 @@ from helpers.command_line import run
 import kissgs
 from kissgs import InvalidContainerError, KissgsError, Settings, decompress, sample_scene
 from kissgs.pipeline.inspect import describe
-from kissgs.pipeline.read_options import ReadOptions
-from kissgs.pipeline.scene_files import open_scene
-from kissgs.pipeline.scene_formats import is_container
+from kissgs.pipeline.scene_files import ReadOptions, is_container, open_scene
 
 
 def zips() -> dict[str, bytes]:

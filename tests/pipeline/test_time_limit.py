@@ -11,13 +11,11 @@ from helpers.training_scenes import cloud
 
 import kissgs
 from kissgs import Settings, UnsupportedError
-from kissgs.compaction.search_evaluation import SearchEvaluation
-from kissgs.core.deadline import Deadline
-from kissgs.pipeline import machine_speed
-from kissgs.pipeline.machine_speed import encode_seconds, save_speed
-from kissgs.pipeline.search_time import MEETING, SearchTime
-from kissgs.pipeline.time_plan import time_plan
-from kissgs.pipeline.trained_scenes import TrainedScenes
+from kissgs.compaction.budget import SearchEvaluation
+from kissgs.core.progress import Deadline
+from kissgs.pipeline import search_time as machine_speed
+from kissgs.pipeline.search_time import MEETING, SearchTime, encode_seconds, save_speed, time_plan
+from kissgs.pipeline.trained_search import TrainedScenes
 from kissgs.settings import Preset
 from kissgs.training.supervision import SupervisionViews
 
@@ -198,7 +196,7 @@ def test_a_scene_that_training_does_not_recover_is_encoded_whole(tmp_path, monke
     """Photographs that are the scene's own renderings lose without limit; with much time, fewer Gaussians follow."""
     scene = cloud(200)
     views = photographs(scene, tmp_path, brightness=1.0)
-    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: LONG / units)
+    monkeypatch.setattr("kissgs.pipeline.search_time.encode_seconds", lambda *found: LONG / units)
     requested = with_photographs().model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     counts = [trial.count for trial in found.report.trials]
@@ -240,7 +238,7 @@ def test_ctrl_c_while_all_gaussians_are_encoded_keeps_them(tmp_path, monkeypatch
 def test_an_aim_is_sought_only_while_there_is_time(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path, brightness=1.0)
-    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: LONG / 12.0)
+    monkeypatch.setattr("kissgs.pipeline.search_time.encode_seconds", lambda *found: LONG / 12.0)
     monkeypatch.setattr(SearchTime, "over_for_encoding", True)
     requested = with_photographs().model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
@@ -252,7 +250,7 @@ def test_a_goal_that_training_does_not_recover_is_met_by_the_encoder(tmp_path, m
     scene = cloud(200)
     views = photographs(scene, tmp_path)
     monkeypatch.setattr("kissgs.pipeline.count_search.RECOVERABLE_DB", -math.inf)
-    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: LONG / 12.0)
+    monkeypatch.setattr("kissgs.pipeline.search_time.encode_seconds", lambda *found: LONG / 12.0)
     requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     assert found.report.trials[0].count == 200
@@ -274,7 +272,7 @@ def test_much_time_makes_twice_the_usual_steps_on_renderings():
 def test_little_time_makes_one_container_with_few_steps(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
-    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1.5)
+    monkeypatch.setattr("kissgs.pipeline.search_time.encode_seconds", lambda *found: 1.5)
     settings = with_photographs({"steps": 10_000}).model_copy(update={"time_limit": 9.0})
     found = kissgs.compress(scene, settings=settings, views=views)
     assert len(found.report.trials) == 1
@@ -320,7 +318,7 @@ def test_the_reported_settings_are_valid(tmp_path):
 def test_a_short_search_prunes_no_further_than_it_trains(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
-    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1e-3)
+    monkeypatch.setattr("kissgs.pipeline.search_time.encode_seconds", lambda *found: 1e-3)
     monkeypatch.setattr(SearchTime, "plan", lambda self, photographs, aims: MEETING[0][1])
     requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)

@@ -7,10 +7,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from kissgs.pipeline.goal import Goal
+from kissgs.pipeline.goal import Goal, Trial
 from kissgs.pipeline.search_time import AIMING, MEETING, SearchPlan
 from kissgs.pipeline.trained_search import first_position, search_positions
-from kissgs.pipeline.trial import Trial
 from kissgs.settings import EncodeSettings
 
 PER_HALVING = 3.0

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from kissgs.planning.axes_order import axes_order, principal_axes
+from kissgs.planning.layout import axes_order, principal_axes
 
 
 def test_bands_blocks_rows_and_columns_follow_the_axes():

@@ -6,7 +6,7 @@ import numpy as np
 from helpers.codec_scenes import random_scene
 from helpers.random_sensitivity import encode_rd, random_sensitivity
 
-from kissgs.planning.gaussian_costs import Costs
+from kissgs.planning.rd_criterion import Costs
 
 
 def costs_of(removal, coverage):

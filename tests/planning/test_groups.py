@@ -10,8 +10,7 @@ from kissgs import Settings
 from kissgs.core.errors import UnsupportedError
 from kissgs.planning import planner
 from kissgs.planning.planner import plan_encoding
-from kissgs.sog.container_model import SOG
-from kissgs.sog.encode import write_files
+from kissgs.sog.encode import SOG, write_files
 from kissgs.sogxt.container import zip_bytes
 
 SCENE = kissgs.clean(random_scene(600, 1))[0]

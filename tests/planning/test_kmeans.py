@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs import sample_scene
-from kissgs.core.threads import Workers, blas_workers
-from kissgs.planning.kmeans import KMeansOptions, fit
-from kissgs.planning.kmeans_start import allocate, assign, near_centroids
+from kissgs.core.resources import Workers, blas_workers
+from kissgs.planning.kmeans import KMeansOptions, allocate, assign, fit, near_centroids
 from kissgs.planning.sh_codebook import codebook_side, nearest_square
 
 

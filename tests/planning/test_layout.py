@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.limits import MAX_GRID_SIDE
-from kissgs.core.threads import blas_workers
+from kissgs.core.resources import blas_workers
+from kissgs.core.splats import MAX_GRID_SIDE
 from kissgs.planning.layout import grid_side, hilbert_order, layout_grid
 from kissgs.settings import EncodeSettings, Settings
 

@@ -7,7 +7,7 @@ from helpers.random_sensitivity import random_sensitivity
 
 import kissgs
 from kissgs import Settings
-from kissgs.core.threads import Workers
+from kissgs.core.resources import Workers
 from kissgs.planning import order_refinement, tour_kernels
 from kissgs.planning.layout import hilbert_order
 from kissgs.planning.order_refinement import refined_order

@@ -8,9 +8,9 @@ from helpers.examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.core.threads import blas_workers
+from kissgs.core.resources import blas_workers
 from kissgs.planning import kernels
-from kissgs.planning.plas import box_blur, plas
+from kissgs.planning.layout import box_blur, plas
 
 
 def sort(items, threads=1, **options):

@@ -7,9 +7,9 @@ import pytest
 from helpers.codec_scenes import random_scene
 from helpers.random_sensitivity import random_sensitivity
 
-from kissgs.planning.codebook_error import CodebookErrorModel
-from kissgs.planning.gaussian_costs import Costs
-from kissgs.planning.quality_estimate import MIN_ERROR_RATIO, default_error, error_at, lambda_for
+from kissgs.planning.rate_distortion import MIN_ERROR_RATIO, default_error, error_at, lambda_for
+from kissgs.planning.rd_criterion import Costs
+from kissgs.planning.sh_codebook import CodebookErrorModel
 
 
 def test_lambda_for_gives_the_requested_error():

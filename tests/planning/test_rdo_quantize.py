@@ -7,10 +7,9 @@ from helpers.codec_scenes import random_scene
 from helpers.random_sensitivity import encode_rd, packed_hessian, random_sensitivity
 
 import kissgs
-from kissgs.core.threads import Workers
-from kissgs.planning.gaussian_costs import Costs
+from kissgs.core.resources import Workers
 from kissgs.planning.quantize import quantize
-from kissgs.planning.rd_criterion import RdCriterion, step
+from kissgs.planning.rd_criterion import Costs, RdCriterion, step
 from kissgs.planning.rdo_quantize import (
     CAPTURED,
     UNSEEN,

@@ -3,7 +3,7 @@
 import numpy as np
 from helpers.clusters import clustered, means_of
 
-from kissgs.planning import relocation_kernels as kernels
+from kissgs.planning import kmeans_kernels as kernels
 
 
 def error_of(vectors, weights):

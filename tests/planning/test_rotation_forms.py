@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from kissgs.core.threads import blas_workers
+from kissgs.core.resources import blas_workers
 from kissgs.planning import kernels
-from kissgs.planning.plas import box_blur
+from kissgs.planning.layout import box_blur
 from kissgs.planning.rotation_forms import (
     PERMUTATIONS,
     ROTATIONS,

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from helpers.codec_scenes import random_scene
 
-from kissgs.core.threads import Workers
+from kissgs.core.resources import Workers
 from kissgs.planning.container_model import EVEN_LEVELS
-from kissgs.planning.gaussian_costs import Costs
 from kissgs.planning.quantize import means_bits, quantize, quantize_means
+from kissgs.planning.rd_criterion import Costs
 from kissgs.planning.rdo_quantize import level_bits
 from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS, StoredShapes, choose_forms
 from kissgs.planning.rows import BLOCK, for_each_block, row_range, selected, sorted_order
 from kissgs.settings import Settings
-from kissgs.sog.container_model import SOG
+from kissgs.sog.encode import SOG
 
 BORDERS = (1, 7, 8, 9, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK)
 

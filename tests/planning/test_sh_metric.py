@@ -9,13 +9,12 @@ from helpers.memory import takes_less_than
 from helpers.reference_harmonics import real_harmonics
 
 import kissgs
+from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.core.threads import Workers
 from kissgs.planning import kmeans
-from kissgs.planning.clustering import Clustering, Vectors, sorted_by_label
-from kissgs.planning.codebook_error import codebook_error_model
-from kissgs.planning.sh_metric import UNIFORM_WEIGHT, ShMetric
+from kissgs.planning.clustering import UNIFORM_WEIGHT, Clustering, ShMetric, Vectors, sorted_by_label
+from kissgs.planning.sh_codebook import codebook_error_model
 
 OPTIONS = kmeans.KMeansOptions(seed=0, iterations=3, neighbors=32, tolerance=0.0, lattice=0.0)
 

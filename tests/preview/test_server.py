@@ -11,8 +11,7 @@ from helpers.small_page import FILES, UNSERVED
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.preview import server as server_module
-from kissgs.preview.page_files import hash_source
-from kissgs.preview.page_scene import PageScene
+from kissgs.preview.page_scene import PageScene, hash_source
 from kissgs.preview.server import PageServer
 
 NAME = "two words % & ü?.zip"

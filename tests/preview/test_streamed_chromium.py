@@ -16,9 +16,9 @@ from helpers.viewers import scattered
 import kissgs
 from kissgs.core.splats import concatenate
 from kissgs.preview import server as server_module
+from kissgs.preview.page_scene import streamed_folder
 from kissgs.preview.server import PageServer
-from kissgs.preview.streamed_folder import streamed_folder
-from kissgs.streaming import environment
+from kissgs.streaming import levels as environment
 
 NAME = "city 100%41 \N{SNOWMAN}"
 

@@ -8,18 +8,22 @@ from PIL import Image, ImageSequence
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.rendering.camera import Camera, look_at
-from kissgs.rendering.contact_sheet import (
+from kissgs.rendering.images import (
     GAP,
     MARKED_COLOUR,
     PAGE_COLOUR,
     TEXT_COLOUR,
     Label,
+    animated_webp,
     balanced_columns,
     contact_sheet,
+    png,
+    reframed,
+    render_all,
+    to_bytes,
 )
-from kissgs.rendering.images import animated_webp, png, reframed, render_all, to_bytes
 from kissgs.rendering.rasterizer import render
-from kissgs.synthetic.scene import sample_scene
+from kissgs.synthetic import sample_scene
 
 
 def noise(height, width, seed=0):

@@ -9,11 +9,10 @@ import pytest
 from helpers.whole_scenes import joined, moved
 
 from kissgs import Splats, sample_scene
+from kissgs.core.resources import Workers
 from kissgs.core.splats import concatenate
-from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera, look_at
-from kissgs.rendering.coverage import Coverage
-from kissgs.rendering.local_scale import local_scale
+from kissgs.rendering.coverage import Coverage, local_scale
 
 UP = np.array([0.0, -1.0, 0.0])
 

@@ -10,8 +10,8 @@ from scipy.ndimage import correlate
 
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.evaluation.evaluate import evaluate
-from kissgs.rendering.flip import Flip
-from kissgs.synthetic.scene import sample_scene
+from kissgs.rendering.metrics import Flip
+from kissgs.synthetic import sample_scene
 
 needs_package = pytest.mark.skipif(
     importlib.util.find_spec("flip_evaluator") is None, reason="flip-evaluator is not installed: pip install '.[flip]'"

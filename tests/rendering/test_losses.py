@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import correlate1d
 
 from kissgs.core.errors import InvalidViewsError
-from kissgs.rendering.losses import photometric_loss, plain_photometric_loss
+from kissgs.rendering.differentiable import photometric_loss, plain_photometric_loss
 from kissgs.rendering.metrics import ssim
 
 

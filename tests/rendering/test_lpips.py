@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
-from kissgs.rendering.lpips import Lpips
+from kissgs.rendering.metrics import Lpips
 
 
 class FakeNetwork(torch.nn.Module):

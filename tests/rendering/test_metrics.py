@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.signal import convolve2d
 
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.threads import Workers
+from kissgs.core.resources import Workers
 from kissgs.rendering.metrics import differences_and_ssim, ms_ssim, psnr, ssim
 
 C1, C2 = 0.01**2, 0.03**2

@@ -316,7 +316,7 @@ def test_read_only_scenes_are_rendered():
 
 
 def test_too_many_gaussians_in_one_tile_are_refused(monkeypatch):
-    from kissgs.rendering.cpu import lists
+    from kissgs.rendering.cpu import tiles as lists
 
     monkeypatch.setattr(lists, "MAX_MEMBERS", 10)
     with pytest.raises(UnsupportedError, match="touch the same 16x16 pixels"):
@@ -335,7 +335,7 @@ def test_an_image_that_does_not_fit_into_memory_is_refused(monkeypatch):
 
 
 def test_too_many_pairs_of_gaussians_and_tiles_are_refused(monkeypatch):
-    from kissgs.rendering.cpu import lists
+    from kissgs.rendering.cpu import tiles as lists
 
     monkeypatch.setattr(lists, "MAX_PAIRS", 10)
     with pytest.raises(KissgsError, match="render a smaller image"):

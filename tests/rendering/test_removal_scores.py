@@ -10,9 +10,9 @@ from scipy.stats import spearmanr
 
 import kissgs
 from kissgs.core.errors import Cancelled
-from kissgs.core.threads import Workers
+from kissgs.core.resources import Workers
+from kissgs.rendering.cpu.backward import differentiate
 from kissgs.rendering.cpu.frame import draw
-from kissgs.rendering.cpu.gradients import differentiate
 from kissgs.rendering.rasterizer import removal_scores, render
 
 

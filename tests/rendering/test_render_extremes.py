@@ -78,7 +78,7 @@ import numpy as np, torch
 from helpers.render_scenes import blobs, camera, one, together
 from helpers.rasterized import all_is_finite
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.losses import photometric_loss
+from kissgs.rendering.differentiable import photometric_loss
 for degree, size in enumerate(((1, 1), (33, 50), (1, 4096), (300, 7))):
     all_is_finite(blobs(0, degree), camera(*size))
     all_is_finite(blobs(400, degree, spread=2.0), camera(*size))

@@ -10,16 +10,15 @@ from helpers.reference_harmonics import real_harmonics
 from helpers.render_scenes import blobs, camera, in_float64, one, together
 
 import kissgs
-from kissgs.cameras.virtual.sensitivity_cameras import sensitivity_cameras
+from kissgs.cameras.virtual.regions import sensitivity_cameras
+from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.spherical_harmonics import sh_basis
 from kissgs.core.splats import SH_C0, clean
-from kissgs.core.threads import Workers
-from kissgs.rendering.color_refit import refit_colors
 from kissgs.rendering.constants import TRANSMITTANCE_MIN
 from kissgs.rendering.cpu import frame
 from kissgs.rendering.rasterizer import removal_scores, render
-from kissgs.rendering.sensitivity import HIDDEN, WeightedCameras, measure_sensitivity
+from kissgs.rendering.sensitivity import HIDDEN, WeightedCameras, measure_sensitivity, refit_colors
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 
@@ -374,7 +373,7 @@ def test_the_colour_refit_without_cached_images_is_the_same(monkeypatch):
     colors = measure_sensitivity(splats, views).color_weight
     decoded = replace(splats, shN=splats.shN * 0)
     cached = refit_colors(decoded, splats, views, colors, colors * 0, steps=2)
-    monkeypatch.setattr(kissgs.rendering.color_refit, "MAX_CACHED_PIXELS", 10)
+    monkeypatch.setattr(kissgs.rendering.sensitivity, "MAX_CACHED_PIXELS", 10)
     np.testing.assert_array_equal(refit_colors(decoded, splats, views, colors, colors * 0, steps=2), cached)
 
 

@@ -15,8 +15,8 @@ from helpers.ray_cluster import kill_tree, tree
 from helpers.running import is_alive, wait_until
 
 import kissgs
+from kissgs.cli.compress_cluster import compress_scene
 from kissgs.cli.options import with_default_values
-from kissgs.cli.scene_item import compress_scene
 from kissgs.io.ply import write_ply
 
 TIMES = {"seconds", "cpu_seconds", "peak_memory", "output"}

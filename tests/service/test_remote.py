@@ -96,7 +96,7 @@ def test_local_errors(service, scene, tmp_path):
 
 @pytest.mark.quick(0)
 def test_an_unreachable_service(scene, tmp_path, monkeypatch):
-    from kissgs.client import remote
+    from kissgs import client as remote
 
     monkeypatch.setattr(remote, "RETRY_SECONDS", 1.0)
     with socket.socket() as unused:

@@ -14,7 +14,7 @@ from helpers.memory import takes_less_than
 
 from kissgs import compress, decompress
 from kissgs.core.errors import InvalidContainerError, OutputError
-from kissgs.io.packed_files import MAX_ZIP_ENTRIES, open_source
+from kissgs.io.containers import MAX_ZIP_ENTRIES, open_source
 from kissgs.sogxt.container import check_destination, write_container, zip_bytes
 
 FILES = {"container_meta.yaml": b"meta", "meta.json": b"{}", "a.webp": bytes(range(256)) * 4, "empty.webp": b""}

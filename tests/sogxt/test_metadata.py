@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs import Settings, compress, decompress
-from kissgs.io.packed_files import MemorySource
+from kissgs.io.containers import MemorySource
 from kissgs.sogxt.metadata import CHANNELS, ContainerMeta, Layout
 from kissgs.sogxt.metadata_reader import read_layout
 

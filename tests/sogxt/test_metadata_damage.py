@@ -11,7 +11,7 @@ from helpers.codec_scenes import random_scene, replaced
 from helpers.metadata_files import FILES, assert_same, document
 
 from kissgs import InvalidContainerError, KissgsError, Settings, UnsupportedError, compress, decompress
-from kissgs.io.packed_files import MemorySource
+from kissgs.io.containers import MemorySource
 from kissgs.sogxt.metadata import CHANNELS
 from kissgs.sogxt.metadata_reader import read_layout
 from kissgs.sogxt.names import CHECKSUM, JSON_NAME, YAML_NAME

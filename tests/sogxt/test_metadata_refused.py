@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import kissgs
 from kissgs import KissgsError, UnsupportedError, decompress
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.io.packed_files import MemorySource
+from kissgs.io.containers import MemorySource
 from kissgs.sogxt.metadata import CHANNELS
 from kissgs.sogxt.metadata_reader import MAX_METADATA_BYTES, read_layout
 

@@ -12,9 +12,10 @@ from helpers.streamed_scenes import FAST, TARGETS, files_of, small_sizes
 
 import kissgs
 from kissgs import Settings
-from kissgs.streaming import environment, time_left
+from kissgs.streaming import compress as time_left
+from kissgs.streaming import levels as environment
 from kissgs.streaming.compress import compress_streamed
-from kissgs.streaming.environment import FEWEST, MOST, Environment
+from kissgs.streaming.levels import FEWEST, MOST, Environment
 
 
 @pytest.fixture(autouse=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.render_scenes import blobs, one
 
-from kissgs.streaming.level_errors import SIZE, level_errors
+from kissgs.streaming.levels import SIZE, level_errors
 
 
 def test_equal_levels_have_no_error():

@@ -14,9 +14,8 @@ from kissgs.rendering.camera import look_at
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import EncodeSettings
 from kissgs.streaming import layout
-from kissgs.streaming.compress import compress_streamed
-from kissgs.streaming.sensitivities import cameras_json, cameras_of, measure_file
-from kissgs.streaming.time_left import duration, with_time_left
+from kissgs.streaming.build import cameras_json, cameras_of, measure_file
+from kissgs.streaming.compress import compress_streamed, duration, with_time_left
 
 BALANCED = Settings()
 PLAIN = EncodeSettings(view_uncertainty=0.0, sensitivity_view_size=96)

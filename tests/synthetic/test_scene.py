@@ -11,8 +11,7 @@ from scipy.special import sph_harm_y
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, clean
-from kissgs.synthetic.scene import SUN, sample_scene
-from kissgs.synthetic.surfaces import BALL_CENTRE, BALL_RADIUS, SURFACES
+from kissgs.synthetic import BALL_CENTRE, BALL_RADIUS, SUN, SURFACES, sample_scene
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,8 @@ import torch
 from helpers.training_scenes import around, cloud, same, targets_of
 
 import kissgs
-from kissgs.core.deadline import Pace
-from kissgs.rendering.differentiable import rasterize
-from kissgs.rendering.losses import plain_photometric_loss
+from kissgs.core.progress import Pace
+from kissgs.rendering.differentiable import plain_photometric_loss, rasterize
 from kissgs.rendering.rasterizer import render
 from kissgs.rendering.tensors import tensors_of
 from kissgs.training.loop import TrainingPlan, exponential_lr, image_loss, train

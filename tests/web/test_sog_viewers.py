@@ -13,7 +13,7 @@ from helpers.viewers import chromium, opened, scattered, seen_from
 
 import kissgs
 from kissgs.io.ply import write_ply
-from kissgs.pipeline.scene_output import write_scene
+from kissgs.pipeline.scene_files import write_scene
 from kissgs.rendering.camera import Camera
 
 # To kissgs.render, dB. Spark rounds colours and sizes, and reaches 46. PlayCanvas draws exp(-x) less a constant, so

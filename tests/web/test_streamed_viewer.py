@@ -10,7 +10,7 @@ from helpers.viewers import chromium, opened, scattered, seen_from
 import kissgs
 from kissgs import Settings
 from kissgs.core.splats import concatenate
-from kissgs.streaming import environment
+from kissgs.streaming import levels as environment
 from kissgs.streaming.compress import compress_streamed
 
 FIRST_IMAGE_BYTES = 1_000_000

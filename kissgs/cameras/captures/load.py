@@ -12,8 +12,7 @@ from kissgs.cameras.captures.colmap import MODEL_FOLDERS, find_colmap, missing_p
 from kissgs.cameras.captures.photos import FoundPhoto, find_photos, searched_folders
 from kissgs.cameras.captures.posed_image import Capture, PosedImage
 from kissgs.cameras.captures.transforms_json import read_split_transforms, read_transforms, similarities
-from kissgs.cameras.pixels import QUARTER_TURNS, PhotoHeader, orientation, read_photo_header
-from kissgs.cameras.undistort import full_window
+from kissgs.cameras.photographs import QUARTER_TURNS, PhotoHeader, full_window, orientation, read_photo_header
 from kissgs.cameras.views import UndistortionSpec, View, Views
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import InvalidViewsError

@@ -13,8 +13,8 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from kissgs.cameras.captures.files import composed, quoted
-from kissgs.cameras.pixels import EXTENSIONS
+from kissgs.cameras.captures.posed_image import composed, quoted
+from kissgs.cameras.photographs import EXTENSIONS
 from kissgs.core.errors import InvalidViewsError
 
 MAX_FACTOR = 64

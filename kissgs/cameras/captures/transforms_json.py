@@ -19,9 +19,8 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
-from kissgs.cameras.captures.files import composed, open_file, quoted
-from kissgs.cameras.captures.posed_image import MAX_SIDE, Capture, Intrinsics, PosedImage
-from kissgs.cameras.undistort import Distortion
+from kissgs.cameras.captures.posed_image import MAX_SIDE, Capture, Intrinsics, PosedImage, composed, open_file, quoted
+from kissgs.cameras.photographs import Distortion
 from kissgs.cameras.views import Similarity
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError

@@ -1,16 +1,312 @@
-"""Candidate cameras: on orbits around a scene, inside it, or framing an object that stands alone."""
+"""Candidate cameras on orbits, inside or framing an object; the scene's bounds; and how useful a camera is."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kissgs.cameras.virtual.scene_bounds import SceneBounds, Vec3, opacity, weighted_quantiles
-from kissgs.core.array_types import Float64
-from kissgs.core.splats import Splats
+from kissgs.cameras.views import black
+from kissgs.core.array_types import Float64, Int
+from kissgs.core.progress import Progress
+from kissgs.core.resources import Workers
+from kissgs.core.splats import SH_C0, Splats
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.constants import NEAR
+from kissgs.rendering.cpu.frame import draw
+
+# ``scene_bounds``: centre, radius and up direction of a scene, estimated from its Gaussians alone.
+
+Vec3 = Float64[np.ndarray, "3"]
+"""``(3,)`` float64, a point or a direction in world space."""
+
+UP_AXES = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+"""Up directions of scene files: COLMAP's y points roughly down, nerfstudio's z up. The first is the default."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneBounds:
+    """Position, size and orientation of a scene's densest part.
+
+    Attributes:
+        centre: ``(3,)`` float64, centre of the densest part, world units.
+        radius: distance from the centre within which half of the opacity of that part lies, world units.
+        up: ``(3,)`` float64 unit vector.
+    """
+
+    centre: Vec3
+    radius: float
+    up: Vec3
+
+
+def scene_bounds(splats: Splats, start: tuple[Vec3, float] | None = None) -> SceneBounds:
+    """Estimate centre, radius and up direction of a scene.
+
+    Gaussians count by their opacity, so that floaters and sky have little influence. A capture has most Gaussians where
+    its photographs point. The centre is a mode of that density, found by mean shift from the weighted median of the
+    positions; the bandwidth is the current radius.
+
+    Args:
+        splats: the scene, finite. Without any opacity, the result is the unit sphere around the origin.
+        start: centre, ``(3,)``, and radius from which mean shift starts instead, world units.
+    """
+    means = splats.means.astype(np.float64)
+    weights = opacity(splats)
+    if not weights.sum() > 0:
+        return SceneBounds(np.zeros(3), 1.0, UP_AXES[0])
+    centre = np.array([weighted_quantile(axis, weights) for axis in means.T]) if start is None else start[0]
+    distance = np.linalg.norm(means - centre, axis=1)
+    gaussian_size = float(np.exp(np.median(splats.scales.max(axis=1)).astype(np.float64)))
+    min_radius = max(2 * gaussian_size, 1e-5 * float(np.abs(centre).max()), 1e-9)  # float32 positions are no finer
+    radius = max(weighted_quantile(distance, weights) if start is None else start[1], min_radius)
+    for _ in range(30):
+        kernel = weights * np.exp(-0.5 * (distance / radius) ** 2)
+        new_centre = kernel @ means / kernel.sum()
+        distance = np.linalg.norm(means - new_centre, axis=1)
+        near = distance < 2.5 * radius
+        new_radius = max(weighted_quantile(distance[near], weights[near]), min_radius) if near.any() else radius
+        moved = np.linalg.norm(new_centre - centre)
+        converged = moved < 0.01 * radius and abs(new_radius - radius) < 0.01 * radius
+        centre, radius = new_centre, new_radius
+        if converged:
+            break
+    return SceneBounds(centre, radius, _up(splats, weights * (distance < 3 * radius), means - centre))
+
+
+def opacity(splats: Splats) -> Float64[np.ndarray, " N"]:
+    """Return opacities after the sigmoid, ``(N,)`` float64, 0 to 1."""
+    return 1 / (1 + np.exp(-splats.opacities.astype(np.float64)))
+
+
+def weighted_quantile(
+    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantile: float = 0.5
+) -> float:
+    """Return the value at which the fraction ``quantile`` of the weight is reached; by default, the weighted median.
+
+    Args:
+        values: ``(n,)`` float64. Without any, the result is 0.
+        weights: ``(n,)`` float64, 0 or more.
+        quantile: 0 to 1.
+    """
+    return weighted_quantiles(values, weights, (quantile,))[0]
+
+
+def weighted_quantiles(
+    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantiles: Sequence[float]
+) -> list[float]:
+    """Return the values at which several fractions of the weight are reached, see :func:`weighted_quantile`."""
+    if not len(values):
+        return [0.0] * len(quantiles)
+    order = np.argsort(values, kind="stable")
+    cumulative = np.cumsum(weights[order])
+    places = np.searchsorted(cumulative, np.asarray(quantiles) * cumulative[-1])
+    return [float(value) for value in values[order[np.minimum(places, len(values) - 1)]]]
+
+
+def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.ndarray, "N 3"]) -> Vec3:
+    """Return the up direction: the normal of the ground, or the axis that files use if there is no ground.
+
+    The short axes of flat Gaussians are surface normals; most of them near one file axis select that axis. The sign
+    follows from the skew of heights: objects stand on the ground, so that density falls off upwards.
+
+    Args:
+        splats: the scene.
+        weights: ``(N,)`` float64, 0 or more; 0 for Gaussians that do not count.
+        offsets: ``(N, 3)`` float64, positions relative to the centre.
+    """
+    axis = UP_AXES[0]
+    if not weights.any():
+        return axis
+    log_scales = np.sort(splats.scales.astype(np.float64), axis=1)
+    area = np.exp(log_scales[:, 1] + log_scales[:, 2])
+    flatness = np.clip(log_scales[:, 1] - log_scales[:, 0], 0, 1)
+    flat_weights = flatness * np.minimum(area, np.quantile(area, 0.95)) * weights
+    normals = _short_axes(splats)
+    level = [float(flat_weights @ (np.abs(normals @ each) > np.cos(np.radians(15)))) for each in UP_AXES]
+    if level[1] > 2 * level[0] + 0.1 * flat_weights.sum():
+        axis = UP_AXES[1]
+    axis = _ground_normal(axis, normals, flat_weights)
+    heights = offsets @ axis
+    mean = weights @ heights / weights.sum()
+    deviation = np.sqrt(weights @ (heights - mean) ** 2 / weights.sum())
+    skew = weights @ ((heights - mean) / max(deviation, 1e-30)) ** 3 / weights.sum()
+    return -axis if skew < -0.3 else axis
+
+
+def _ground_normal(axis: Vec3, normals: Float64[np.ndarray, "N 3"], weights: Float64[np.ndarray, " N"]) -> Vec3:
+    """Return the mean normal near ``axis``, or ``axis`` if less than 35 % of the weight has a normal within 30° of it.
+
+    The cone narrows in three steps, so that walls and slopes do not tilt the result.
+    """
+    for degrees, min_share in ((30, 0.35), (15, 0.0), (8, 0.0)):
+        cosines = normals @ axis
+        near = (np.abs(cosines) > np.cos(np.radians(degrees))) * weights
+        if near.sum() <= min_share * weights.sum() or not near.any():
+            return axis
+        mean = (near * np.sign(cosines)) @ normals
+        axis = mean / np.linalg.norm(mean)
+    return axis
+
+
+def _short_axes(splats: Splats) -> Float64[np.ndarray, "N 3"]:
+    """Return the direction of each Gaussian's smallest scale, ``(N, 3)`` float64 unit vectors."""
+    w, x, y, z = splats.quats.astype(np.float64).T
+    columns = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    shortest = splats.scales.argmin(axis=1)
+    return np.asarray(columns[shortest, :, np.arange(len(splats))])
+
+
+# View scores: how useful a camera is, from a thumbnail of what it sees.
+
+PROXY_GAUSSIANS = 30_000
+"""Largest number of Gaussians in the proxy scene that thumbnails show."""
+
+OPAQUE = 0.01
+"""Transmittance at which the list of a thumbnail's pixel ends: what is behind does not change its statistics."""
+
+TOO_NEAR = 0.35
+"""Depth in radii of the scene; anything nearer to the camera counts as an obstruction."""
+
+CENTRE_SCALE = 30.0
+"""Factor by which the mark of central Gaussians is scaled, so that it uses half the range of a colour channel."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewStats:
+    """Statistics of a thumbnail.
+
+    Attributes:
+        alpha: mean alpha, 0 to 1.
+        log_size: median logarithm of the largest scale of the Gaussians, world units. Parts that no photograph shows
+            have large Gaussians.
+        log_angle: median logarithm of the angle that these scales subtend, radians.
+        near: mean alpha of what is nearer than :data:`TOO_NEAR`, 0 to 1.
+        centre: mean alpha of the central Gaussians, those within two radii of the centre, 0 to 1.
+    """
+
+    alpha: float
+    log_size: float
+    log_angle: float
+    near: float
+    centre: float
+
+
+class ViewScorer:
+    """Renders thumbnails of a proxy scene and measures their statistics.
+
+    Attributes:
+        bounds: bounds of the part of the scene that views should show.
+    """
+
+    def __init__(self, proxy: Splats, bounds: SceneBounds, pool: Workers, progress: Progress) -> None:
+        """Store the arguments; nothing is rendered.
+
+        Args:
+            proxy: scene to render, from :func:`proxy_scene`.
+            bounds: bounds of the part of the scene that views should show.
+            pool: threads to render with.
+            progress: receives the stage ``"cameras"``.
+        """
+        self.bounds = bounds
+        self._proxy, self._pool, self._progress = proxy, pool, progress
+        self._log_sizes = proxy.scales.max(axis=1)
+        self._central = np.linalg.norm(proxy.means - bounds.centre, axis=1) < 2 * bounds.radius
+        self._measured = 0
+
+    def measure(self, cameras: list[Camera]) -> list[ViewStats]:
+        """Render a thumbnail from each camera, at the camera's size, and return its statistics."""
+
+        def report(fraction: float) -> None:
+            measured = self._measured + fraction * len(cameras)
+            self._progress("cameras", measured / (measured + 300))  # the number of further cameras is unknown
+
+        stats = self._pool.map(self._stats, cameras, report)
+        self._measured += len(cameras)
+        return stats
+
+    def _stats(self, camera: Camera) -> ViewStats:
+        """Render log size, log depth and centrality as the three colours, so that blending averages what is visible."""
+        proxy = self._proxy
+        log_depth = np.log(np.maximum(proxy.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3], 1e-12))
+        values = self._log_sizes, log_depth, CENTRE_SCALE * self._central
+        colours = np.stack([_to_sh0(value) for value in values], axis=1)
+        coloured = replace(proxy, sh0=colours.astype(np.float32), shN=np.empty((len(proxy), 0, 3), np.float32))
+        with Workers(1) as single:  # cameras are already rendered in parallel
+            frame = draw(coloured, camera, black(), single, OPAQUE)
+        alpha = 1 - frame.transmittance.astype(np.float64)
+        size, depth, centre = (_from_colour(frame.image[:, :, c] / np.maximum(alpha, 1e-6)) for c in range(3))
+        near = (np.exp(depth) < TOO_NEAR * self.bounds.radius) * alpha
+        return ViewStats(
+            alpha=float(alpha.mean()),
+            log_size=weighted_quantile(size.ravel(), alpha.ravel()),
+            log_angle=weighted_quantile((size - depth).ravel(), alpha.ravel()),
+            near=float(near.mean()),
+            centre=float((centre / CENTRE_SCALE * alpha).mean()),
+        )
+
+
+def _to_sh0(logarithm: np.ndarray) -> np.ndarray:
+    """Return the SH coefficient of a colour from 0 to 1 that stands for logarithms from -30 to 30."""
+    return (np.clip(logarithm / 60 + 0.5, 0, 1) - 0.5) / SH_C0
+
+
+def _from_colour(colour: np.ndarray) -> np.ndarray:
+    """Return the logarithm that a colour from 0 to 1 stands for."""
+    return (colour - 0.5) * 60
+
+
+def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.ndarray, " m"] | None = None) -> Splats:
+    """Return at most ``max_count`` evenly selected Gaussians, without SH rest, enlarged to cover the same area.
+
+    Args:
+        splats: the scene.
+        max_count: largest number of Gaussians.
+        among: indices of the Gaussians to select from; by default, all.
+    """
+    count = len(splats) if among is None else len(among)
+    step = max(1, -(-count // max_count))
+    chosen = slice(None, None, step) if among is None else among[::step]
+    return replace(
+        splats,
+        means=np.ascontiguousarray(splats.means[chosen]),
+        quats=np.ascontiguousarray(splats.quats[chosen]),
+        scales=splats.scales[chosen] + np.float32(np.log(step) / 2),
+        opacities=np.ascontiguousarray(splats.opacities[chosen]),
+        sh0=np.ascontiguousarray(splats.sh0[chosen]),
+        shN=np.empty((-(-count // step), 0, 3), np.float32),
+    )
+
+
+def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[np.ndarray, " n"]:
+    """Return the view score of each camera, ``(n,)`` float64, at most 1.
+
+    1 is a sharp image of the scene's centre, without holes and with nothing right in front of the camera. Size and
+    angle of Gaussians are compared with the best tenth of the views that show enough.
+
+    Args:
+        stats: statistics of all cameras to compare, at least one.
+        fills_image: whether the scene should fill the image; if not, an object stands alone, and only an image that is
+            much emptier than the others is a fault.
+    """
+    names = ("alpha", "log_size", "log_angle", "near", "centre")
+    alpha, log_size, log_angle, near, centre = (np.array([getattr(view, name) for view in stats]) for name in names)
+    enough = alpha >= 0.5 * alpha.max()
+    excess_size, excess_angle = (
+        np.maximum(value - np.quantile(value[enough], 0.1), 0) for value in (log_size, log_angle)
+    )
+    holes = 2 * (1 - alpha) if fills_image else np.maximum(0.5 - alpha / max(alpha.max(), 1e-9), 0)
+    off_centre = np.maximum(1 - centre / 0.25, 0) if fills_image else np.zeros(len(stats))
+    return np.asarray(1 - holes - 0.4 * excess_size - 0.35 * excess_angle - near - 0.5 * off_centre)
+
+
+# Candidate cameras: on orbits around a scene, inside it, or framing an object that stands alone.
 
 FIELD_OF_VIEW = np.radians(60)
 """Angle of view along the longer side, radians; roughly that of a phone."""

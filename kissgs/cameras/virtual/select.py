@@ -1,28 +1,224 @@
-"""``virtual_views``: virtual cameras that show a scene well, for people to look at.
-
-Candidates are scored by thumbnails. A trained scene is sharp from where it was photographed and dissolves elsewhere, so
-the good ones lie on the side that was captured. Among these, cameras far from each other are chosen.
-"""
+"""``virtual_views``: virtual cameras that show a scene well, for people to look at."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from kissgs.cameras.views import View, Views, black
-from kissgs.cameras.virtual.candidates import FIELD_OF_VIEW, horizontal_axes
-from kissgs.cameras.virtual.scored_candidates import (
-    ScoredCandidates,
-    normalized_poses,
-    pose_distances,
-    score_candidates,
+from kissgs.cameras.virtual.candidates import (
+    FIELD_OF_VIEW,
+    INSIDE_DIRECTIONS,
+    ORBIT_RADII,
+    SceneBounds,
+    ViewScorer,
+    ViewStats,
+    horizontal_axes,
+    inside_cameras,
+    object_cameras,
+    orbit_cameras,
+    proxy_scene,
+    reversed_camera,
+    scene_bounds,
+    view_scores,
 )
+from kissgs.core.array_types import Float64, Int
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.progress import Progress, silent
+from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.core.threads import Workers
-from kissgs.rendering.camera import Camera, pinhole
+from kissgs.rendering.camera import Camera, look_at, pinhole
+
+# ``score_candidates``: candidate cameras for a scene, with their view scores, for a first choice.
+#
+# Which candidates suit depends on the kind of scene. Inside a room or under a sky, cameras must stay within what
+# encloses them; before a background, the image should be full; an object that stands alone is framed from all sides.
+
+THUMBNAIL_SIZE = 64
+"""Longer side of a thumbnail, pixels."""
+
+FULL_ALPHA = 0.85
+"""An image is full if its mean alpha is above this."""
+
+SCORE_MARGIN = 0.3
+"""How much lower than the best a camera may score to be chosen."""
+
+MAX_REFINEMENTS = 3
+"""Largest number of times that cameras between good ones are added where good ones are few."""
+
+NEIGHBOURS = 4
+"""Number of the nearest good cameras towards each of which a camera is added."""
+
+SceneKind = Literal["enclosed", "background", "object"]
+"""A room or a scene under a sky, seen from inside; a scene before a background; an object that stands alone."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredCandidates:
+    """Candidate cameras with what is needed to compare their views.
+
+    Attributes:
+        scorer: measures further views on the same scale; its ``bounds`` are those of the scene.
+        kind: kind of scene; whether images should be full follows from it.
+        cameras: one or more, with the size of thumbnails.
+        stats: statistics of their thumbnails.
+        outside_penalty: ``(n,)`` float64, 1 for cameras outside of what encloses the scene, else 0.
+    """
+
+    scorer: ViewScorer
+    kind: SceneKind
+    cameras: list[Camera]
+    stats: list[ViewStats]
+    outside_penalty: Float64[np.ndarray, " n"]
+
+    @property
+    def bounds(self) -> SceneBounds:
+        """Bounds of the scene, or of the region."""
+        return self.scorer.bounds
+
+    @property
+    def fills_image(self) -> bool:
+        """Whether the scene should fill the image."""
+        return self.kind != "object"
+
+    @property
+    def scores(self) -> Float64[np.ndarray, " n"]:
+        """View scores, ``(n,)`` float64, at most 1."""
+        return view_scores(self.stats, fills_image=self.fills_image) - self.outside_penalty
+
+    def good(self) -> Int[np.ndarray, " good"]:
+        """Return the indices of the cameras that score at most :data:`SCORE_MARGIN` less than the best."""
+        scores = self.scores
+        return np.flatnonzero(scores >= scores.max() - SCORE_MARGIN)
+
+    def scores_of(self, cameras: list[Camera]) -> Float64[np.ndarray, " more"]:
+        """Return the view scores of other cameras, ``(more,)`` float64, on the same scale."""
+        penalty = _outside_penalty(cameras, self.scorer) if self.kind == "enclosed" else np.zeros(len(cameras))
+        stats = [*self.stats, *self.scorer.measure(cameras)]
+        return view_scores(stats, fills_image=self.fills_image)[len(self.stats) :] - penalty
+
+    def refined(self, count: int) -> ScoredCandidates:
+        """Return the candidates with cameras between good ones added, until twice ``count`` are good, if possible."""
+        candidates = self
+        for _ in range(MAX_REFINEMENTS):
+            if len(candidates.good()) >= 2 * count:
+                break
+            candidates = candidates._with_midpoints()
+        return candidates
+
+    def _with_midpoints(self) -> ScoredCandidates:
+        """Return the candidates with one more half-way between each good camera and its nearest good neighbours."""
+        good = self.good()
+        positions, forward = normalized_poses([self.cameras[n] for n in good], self.bounds)
+        pairs = set()
+        for n in range(len(good)):
+            nearest = np.argsort(pose_distances(positions, forward, n), kind="stable")[1 : NEIGHBOURS + 1]
+            pairs |= {(min(n, int(other)), max(n, int(other))) for other in nearest}
+        width, height = self.cameras[0].width, self.cameras[0].height
+        added = []
+        for one, other in sorted(pairs):
+            position = 0.5 * (positions[one] + positions[other]) * self.bounds.radius
+            target = position + forward[one] + forward[other]
+            added.append(look_at(position, target, self.bounds.up, fov=FIELD_OF_VIEW, width=width, height=height))
+        return ScoredCandidates(
+            self.scorer,
+            self.kind,
+            [*self.cameras, *added],
+            [*self.stats, *self.scorer.measure(added)],
+            np.concatenate([self.outside_penalty, np.zeros(len(added))]),
+        )
+
+
+def score_candidates(splats: Splats, size: tuple[int, int], pool: Workers, progress: Progress) -> ScoredCandidates:
+    """Return some hundred candidate cameras of a scene, with their view scores.
+
+    Args:
+        splats: the scene, finite.
+        size: (width, height) of the images for which cameras are wanted, pixels; only the aspect ratio matters.
+        pool: threads to render with.
+        progress: receives the stage ``"cameras"``.
+
+    Raises:
+        InvalidViewsError: a side of the image is less than 1.
+    """
+    if min(size) < 1:
+        raise InvalidViewsError(f"an image must have at least 1x1 pixels, not {size[0]}x{size[1]}")
+    proxy = proxy_scene(splats)
+    bounds = scene_bounds(proxy)
+    scale = THUMBNAIL_SIZE / max(size)
+    thumbnail_size = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+    scorer = ViewScorer(proxy, bounds, pool, progress)
+    inside, orbits = list(inside_cameras(bounds, thumbnail_size)), list(orbit_cameras(bounds, thumbnail_size))
+    cameras = [*inside, *orbits]
+    stats = scorer.measure(cameras)
+    if _is_enclosed(stats[: len(inside)]):
+        return ScoredCandidates(scorer, "enclosed", cameras, stats, _outside_penalty(cameras, scorer))
+    if _has_background(stats[len(inside) :], thumbnail_size, scorer):
+        return ScoredCandidates(scorer, "background", cameras, stats, np.zeros(len(cameras)))
+    cameras = list(object_cameras(proxy, bounds, thumbnail_size))
+    return ScoredCandidates(scorer, "object", cameras, scorer.measure(cameras), np.zeros(len(cameras)))
+
+
+def _is_enclosed(inside: list[ViewStats]) -> bool:
+    """Whether images are full in all directions from three or more positions inside the scene."""
+    unobstructed = np.reshape([view.alpha - view.near for view in inside], (-1, INSIDE_DIRECTIONS)).mean(axis=1)
+    return bool((unobstructed > FULL_ALPHA).sum() >= 3)
+
+
+def _has_background(orbits: list[ViewStats], size: tuple[int, int], scorer: ViewScorer) -> bool:
+    """Whether images from the largest orbit are full, at least the fullest tenth of them.
+
+    An object may fill a portrait image, so that landscape images are tried too where ``size``, (width, height), is
+    portrait.
+    """
+    outermost = len(orbits) // len(ORBIT_RADII)
+    if not _fullest_tenth(orbits[-outermost:]):
+        return False
+    if size[0] >= size[1]:
+        return True
+    landscape = list(orbit_cameras(scorer.bounds, (size[1], size[0])))
+    return _fullest_tenth(scorer.measure(landscape[-outermost:]))
+
+
+def _fullest_tenth(stats: list[ViewStats]) -> bool:
+    """Whether at least a tenth of the images are full."""
+    return bool(np.quantile([view.alpha for view in stats], 0.9) > FULL_ALPHA)
+
+
+def _outside_penalty(cameras: list[Camera], scorer: ViewScorer) -> Float64[np.ndarray, " n"]:
+    """Return 1 for each camera that sees a gap when it is turned around: it is outside the enclosing scene; else 0."""
+    behind = scorer.measure([reversed_camera(camera) for camera in cameras])
+    return np.array([float(view.alpha < FULL_ALPHA) for view in behind])
+
+
+def normalized_poses(
+    cameras: list[Camera], bounds: SceneBounds
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Return positions in radii of the scene and unit viewing directions of cameras, ``(n, 3)`` float64 each."""
+    positions = np.array([camera.position for camera in cameras]) / bounds.radius
+    return positions, np.array([camera.viewmat[2, :3] for camera in cameras])
+
+
+def pose_distances(
+    positions: Float64[np.ndarray, "n 3"], forward: Float64[np.ndarray, "n 3"], index: int
+) -> Float64[np.ndarray, " n"]:
+    """Return how far each pose is from pose ``index``, ``(n,)`` float64: radii of the scene plus change of direction.
+
+    Args:
+        positions: ``(n, 3)``, from :func:`normalized_poses`.
+        forward: ``(n, 3)`` unit viewing directions.
+        index: 0 to n - 1.
+    """
+    to_position = np.linalg.norm(positions - positions[index], axis=1)
+    return np.asarray(to_position + np.linalg.norm(forward - forward[index], axis=1))
+
+
+# ``virtual_views``: virtual cameras that show a scene well, for people to look at.
+#
+# Candidates are scored by thumbnails. A trained scene is sharp from where it was photographed and dissolves elsewhere,
+# so the good ones lie on the side that was captured. Among these, cameras far from each other are chosen.
 
 HOLD_OUT = 8
 """One in this many virtual views is held out, starting with the first."""

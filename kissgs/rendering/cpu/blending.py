@@ -180,7 +180,7 @@ def removal_errors(
 ) -> None:
     """Compute the squared change of tiles ``first`` to ``last`` (exclusive) by the removal of each member.
 
-    The arguments are those of :func:`kissgs.rendering.cpu.blending_backward.blend_backward`. ``errors``: out,
+    The arguments are those of :func:`kissgs.rendering.cpu.backward.blend_backward`. ``errors``: out,
     ``(slots,)``, sums over the tile's pixels and RGB.
     """
     alpha_min, alpha_max = limits[0], limits[1]

@@ -30,7 +30,7 @@ def raise_coverage(
 
     Args:
         means, scales, opacities: stored parameters, see :class:`kissgs.Splats`.
-        local_scale: ``(N,)`` see :func:`kissgs.rendering.local_scale.local_scale`.
+        local_scale: ``(N,)`` see :func:`kissgs.rendering.coverage.local_scale`.
         visible: the Gaussian of each footprint.
         first: first footprint.
         last: end of the footprints, exclusive.

@@ -13,13 +13,13 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int32, Int64, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
+from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Splats
-from kissgs.core.threads import Workers
 from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending, sensitivity
-from kissgs.rendering.cpu.lists import (
+from kissgs.rendering.cpu.tiles import (
     Footprints,
     Slots,
     TileLists,

@@ -203,7 +203,7 @@ def add_to_parameters(
 
     Args:
         means, quats, scales, visible, rows, slots_from, first, last, viewmat, K, width, height, constants: as for
-            :func:`kissgs.rendering.cpu.projection_backward.project_backward`.
+            :func:`kissgs.rendering.cpu.backward.project_backward`.
         slots: output of :func:`moments`.
         eye: ``(3,)`` position of the camera, world units.
         weight: weight of the image.

@@ -122,7 +122,7 @@ def shade_backward(
 
     Args:
         means, shN, eye: as for :func:`shade`.
-        gaussians, first, last, v_colors: as for :func:`kissgs.rendering.cpu.projection_backward.project_backward`.
+        gaussians, first, last, v_colors: as for :func:`kissgs.rendering.cpu.backward.project_backward`.
         v_means: ``(R, 3)``; gradients are added.
         v_sh0: out, ``(R, 3)``.
         v_shN: out, ``(R, K, 3)``.

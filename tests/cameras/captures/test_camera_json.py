@@ -5,8 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from kissgs.cameras.captures.camera_json import camera_as_dict, read_cameras, write_camera
-from kissgs.cameras.captures.select_view import is_camera_file, pick_view, view_of_file
+from kissgs.cameras.captures.camera_json import (
+    camera_as_dict,
+    is_camera_file,
+    pick_view,
+    read_cameras,
+    view_of_file,
+    write_camera,
+)
 from kissgs.cameras.views import View, Views, black
 from kissgs.core.errors import InvalidViewsError, OutputError
 from kissgs.rendering.camera import Camera, look_at

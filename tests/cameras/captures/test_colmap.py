@@ -9,7 +9,7 @@ from helpers.reference_cameras import MODELS, PINHOLE, assert_camera, poses, wri
 
 from kissgs.cameras.captures.colmap import find_colmap, read_colmap
 from kissgs.cameras.captures.load import load_views
-from kissgs.cameras.undistort import Distortion
+from kissgs.cameras.photographs import Distortion
 
 NAMES = ["b.jpg", "with a space.jpg", "sub/folder/a.png"]
 K = np.array([[110, 0, 61], [0, 115, 39.5], [0, 0, 1.0]])

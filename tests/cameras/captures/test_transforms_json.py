@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from kissgs.cameras.captures import transforms_json
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.captures.transforms_json import read_transforms
-from kissgs.cameras.undistort import Distortion
+from kissgs.cameras.photographs import Distortion
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg"]

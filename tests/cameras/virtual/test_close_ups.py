@@ -8,9 +8,8 @@ from helpers.looked_at import looked_at
 from helpers.whole_scenes import moved, two
 
 from kissgs import render, sample_scene
-from kissgs.cameras.virtual.close_ups import close_ups
-from kissgs.cameras.virtual.scattered import scattered_cameras
-from kissgs.rendering.local_scale import local_scale
+from kissgs.cameras.virtual.samples import close_ups, scattered_cameras
+from kissgs.rendering.coverage import local_scale
 
 
 def test_objects_of_all_sizes_have_close_ups():

@@ -6,7 +6,7 @@ from helpers.hollow_scenes import box, surface
 from helpers.whole_scenes import five
 
 from kissgs.cameras.captures.load import load_views
-from kissgs.cameras.virtual.random_poses import FIELDS_OF_VIEW, random_poses
+from kissgs.cameras.virtual.samples import FIELDS_OF_VIEW, random_poses
 from kissgs.core.errors import Cancelled, InvalidViewsError
 from kissgs.core.splats import Splats, clean
 from kissgs.io.ply import read_ply

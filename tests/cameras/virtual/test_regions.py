@@ -7,8 +7,8 @@ import pytest
 from helpers.whole_scenes import SCENES, joined, moved, two
 
 from kissgs import Camera, Splats, clean, sample_scene
-from kissgs.cameras.virtual.random_poses import random_poses
-from kissgs.cameras.virtual.scene_views import scene_views
+from kissgs.cameras.virtual.regions import scene_views
+from kissgs.cameras.virtual.samples import random_poses
 
 
 def count_near(cameras: list[Camera], position: tuple[float, float, float], radius: float) -> int:

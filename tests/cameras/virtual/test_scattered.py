@@ -8,9 +8,9 @@ from helpers.looked_at import looked_at
 from helpers.whole_scenes import two
 
 from kissgs import sample_scene
-from kissgs.cameras.virtual.scattered import scattered_cameras
-from kissgs.cameras.virtual.scene_bounds import scene_bounds
-from kissgs.rendering.local_scale import local_scale
+from kissgs.cameras.virtual.candidates import scene_bounds
+from kissgs.cameras.virtual.samples import scattered_cameras
+from kissgs.rendering.coverage import local_scale
 
 
 def test_distances_directions_and_fields_of_view():

@@ -5,7 +5,7 @@ import pytest
 from helpers.hollow_scenes import box, surface
 
 from kissgs import sample_scene
-from kissgs.cameras.virtual.scene_bounds import scene_bounds, weighted_quantile
+from kissgs.cameras.virtual.candidates import scene_bounds, weighted_quantile
 from kissgs.core.splats import ATTRIBUTES, Splats
 
 

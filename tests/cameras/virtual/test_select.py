@@ -7,7 +7,7 @@ from helpers.hollow_scenes import box
 
 from kissgs import sample_scene
 from kissgs.cameras.captures.load import load_views
-from kissgs.cameras.virtual.scene_bounds import scene_bounds
+from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.cameras.virtual.select import best_view, virtual_views
 from kissgs.core.errors import Cancelled, InvalidViewsError
 from kissgs.core.splats import Splats, clean

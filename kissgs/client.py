@@ -1,0 +1,386 @@
+"""``Remote``: compression by a kissgs service over HTTP."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import hashlib
+import json
+import re
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
+from urllib.parse import urlsplit
+
+from kissgs.core.errors import Cancelled, InvalidSceneError, KissgsError, RemoteError, UnsupportedError
+from kissgs.core.progress import Progress, silent
+from kissgs.io.containers import ContainerName, named_container
+from kissgs.io.files import atomic_file, reason_of, refuse_existing
+from kissgs.settings import Settings
+
+if TYPE_CHECKING:
+    import httpx
+
+BLOCK_BYTES = 1 << 18
+"""Size of the blocks in which files are uploaded and downloaded."""
+
+RETRY_SECONDS = 300.0
+"""Time for which requests to an overloaded or restarting service are repeated."""
+
+FIRST_RETRY_SECONDS = 8.0
+"""Time for which requests to a service that has never answered are repeated: its address may be wrong."""
+
+WAIT = "wait for server"
+"""Stage in which a request is repeated after a while."""
+
+_ERRORS: dict[str, type[KissgsError]] = {kind.code: kind for kind in (InvalidSceneError, UnsupportedError)}
+"""Errors by problem type, for problems of the scene or the settings that the library itself would raise."""
+
+T = TypeVar("T")
+
+
+class Remote:
+    """Client of a kissgs service.
+
+    Args:
+        server: address of the service, such as ``http://localhost:8000``.
+        key: access key; None if the service needs none.
+
+    Raises:
+        UnsupportedError: httpx is not installed; the address or the key is malformed.
+    """
+
+    def __init__(self, server: str, *, key: str | None = None) -> None:
+        try:
+            import httpx
+        except ModuleNotFoundError as error:
+            raise UnsupportedError(
+                "a kissgs service needs httpx, which is not installed: pip install 'kissgs[remote]'"
+            ) from error
+        if not _is_address(server):
+            raise UnsupportedError(
+                f"{server!r} is not the address of a service; write it as http://localhost:8000, without a path"
+            )
+        if key and not re.fullmatch(r"[!-~]+", key):
+            raise UnsupportedError(
+                "the key is malformed: a key has only printable ASCII characters without spaces; check it"
+            )
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        timeout = httpx.Timeout(60.0, connect=10.0)
+        self._http = httpx.Client(base_url=server.rstrip("/"), headers=headers, timeout=timeout)
+        self._has_answered = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._http.close()
+
+    def compress(
+        self,
+        source: str | PathLike[str],
+        destination: str | PathLike[str],
+        *,
+        settings: Settings | None = None,
+        container: ContainerName | None = None,
+        evaluate: bool = False,
+        origin: Literal["auto"] | None = None,
+        overwrite: bool = False,
+        progress: Progress = silent,
+    ) -> dict[str, Any]:
+        """Compress a scene on the service, and write the container to a local file.
+
+        Args:
+            source: the scene: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.ksplat`` or ``.glb``.
+            destination: the ``.zip`` or ``.sog`` file to write, atomically.
+            settings: None for the preset ``balanced``.
+            container: ``"sogxt"`` or ``"sog"``; by default SOG if ``destination`` ends in ``.sog``, else SOG-XT.
+            evaluate: whether the service also compares rendered images.
+            origin: see :class:`kissgs.ReadOptions`.
+            overwrite: whether to replace ``destination`` if it exists.
+            progress: receives "upload", "queue", the stages of the service, "download", and "wait for server" with the
+                reason as a note. An exception that it raises cancels the job.
+
+        Returns:
+            The status of the job: sizes, times and so on, see the API of the service.
+
+        Raises:
+            InvalidSceneError: the file cannot be read, or is not a scene.
+            UnsupportedError: a limit is exceeded, a setting is invalid, or the ending is that of another container.
+            RemoteError: the service cannot be reached, refuses the job or fails.
+            OutputError: ``destination`` cannot be written.
+        """
+        target = Path(destination)
+        kind = named_container(container, destination)
+        refuse_existing(target, overwrite=overwrite)
+        status = self.submit(
+            source, settings=settings, container=kind, evaluate=evaluate, origin=origin, progress=progress
+        )
+        try:
+            status = self.follow(status["id"], progress)
+            self.download(status, target, overwrite=overwrite, progress=progress)
+        except KissgsError as error:
+            if isinstance(error, Cancelled):
+                self._cancel_quietly(status["id"])
+            raise _with_file_name(error, source) from error
+        except BaseException:
+            self._cancel_quietly(status["id"])
+            raise
+        return status
+
+    def _cancel_quietly(self, job: str) -> None:
+        with contextlib.suppress(KissgsError):  # the original error matters more
+            self.cancel(job)
+
+    def submit(
+        self,
+        source: str | PathLike[str],
+        *,
+        settings: Settings | None = None,
+        container: ContainerName = "sogxt",
+        evaluate: bool = False,
+        origin: Literal["auto"] | None = None,
+        progress: Progress = silent,
+    ) -> dict[str, Any]:
+        """Upload a scene; retry if the connection breaks or the service is overloaded, without a second job.
+
+        Args:
+            source: the scene: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.ksplat`` or ``.glb``.
+            settings: None for the preset ``balanced``.
+            container: ``"sogxt"`` or ``"sog"``.
+            evaluate: whether the service also compares rendered images.
+            origin: see :class:`kissgs.ReadOptions`.
+            progress: receives "upload" and "wait for server".
+
+        Returns:
+            The status of the job.
+
+        Raises:
+            KissgsError: see :meth:`compress`.
+        """
+        path = Path(source)
+        options = {
+            **(settings or Settings()).model_dump(mode="json", exclude_unset=True),
+            "format": container,
+            "evaluate": evaluate,
+            **({} if origin is None else {"origin": origin}),
+        }
+        size = _size(path)
+        headers = {
+            "Content-Type": "application/octet-stream",
+            "Content-Length": str(size),
+            "Idempotency-Key": uuid.uuid4().hex,
+        }
+
+        def send() -> dict[str, Any]:
+            body = _blocks(path, size, progress)
+            params = {"options": json.dumps(options), "name": path.name}
+            response = self._http.post("/v1/jobs", params=params, headers=headers, content=body)
+            return _checked(response).json()
+
+        try:
+            return self._with_retries(send, progress)
+        except KissgsError as error:
+            raise _with_file_name(error, path) from error
+
+    def follow(self, job: str, progress: Progress = silent) -> dict[str, Any]:
+        """Wait until a job has ended, and pass its progress on.
+
+        Returns:
+            The status of the job, which has succeeded.
+
+        Raises:
+            KissgsError: the job failed or was cancelled.
+        """
+        last = ""
+
+        def listen() -> None:
+            nonlocal last
+            headers = {"Last-Event-ID": last} if last else {}
+            with self._http.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as response:
+                if response.is_error:
+                    response.read()
+                for number, event, data in _events(_checked(response)):
+                    last = number
+                    if event == "progress":
+                        # Without a note, only two arguments: receivers need not accept notes.
+                        progress(data["stage"], data["fraction"], *([data["note"]] if "note" in data else []))
+                    elif data["state"] == "queued":
+                        progress("queue", 0.0)
+
+        while True:
+            self._with_retries(listen, progress)
+            status = self._with_retries(lambda: self.status(job), progress)
+            if status["state"] not in ("queued", "running"):
+                break
+            time.sleep(0.2)  # the stream ended early: the service is stopping
+        if status["state"] == "succeeded":
+            return status
+        problem = status.get("problem", {"code": "cancelled", "detail": f"the job was {status['state']} on the server"})
+        raise _error(problem)
+
+    def download(
+        self, status: dict[str, Any], destination: Path, *, overwrite: bool = False, progress: Progress = silent
+    ) -> None:
+        """Write the container of a job that has succeeded, and verify its checksum.
+
+        Raises:
+            KissgsError: see :meth:`compress`.
+        """
+
+        def fetch() -> None:
+            with self._http.stream("GET", status["links"]["result"]) as response:
+                if response.is_error:
+                    response.read()
+                _checked(response)
+                size, digest, done = int(response.headers["Content-Length"]), hashlib.sha256(), 0
+                with atomic_file(destination, overwrite=overwrite) as file:
+                    for block in response.iter_bytes(BLOCK_BYTES):
+                        file.write(block)
+                        digest.update(block)
+                        done += len(block)
+                        progress("download", done / size)
+                    expected = f"sha-256=:{base64.b64encode(digest.digest()).decode()}:"
+                    if response.headers.get("Repr-Digest") != expected:
+                        raise RemoteError("the container was damaged during the download; try again")
+
+        self._with_retries(fetch, progress)
+
+    def status(self, job: str, *, wait: float = 0.0) -> dict[str, Any]:
+        """Return the status of a job, after waiting up to ``wait`` seconds (at most 30) for its end.
+
+        Raises:
+            RemoteError: the service cannot be reached, or there is no such job.
+        """
+        return self._once(lambda: _checked(self._http.get(f"/v1/jobs/{job}", params={"wait": wait})).json())
+
+    def cancel(self, job: str) -> dict[str, Any]:
+        """Cancel a job, and return its status.
+
+        Raises:
+            RemoteError: the service cannot be reached, or there is no such job.
+        """
+        return self._once(lambda: _checked(self._http.post(f"/v1/jobs/{job}/cancel")).json())
+
+    def jobs(self, limit: int = 20) -> list[dict[str, Any]]:
+        """Return the status of the ``limit`` latest jobs, newest first.
+
+        Raises:
+            RemoteError: the service cannot be reached.
+        """
+        return self._once(lambda: _checked(self._http.get("/v1/jobs", params={"limit": limit})).json()["jobs"])
+
+    def _once(self, request: Callable[[], T]) -> T:
+        import httpx
+
+        try:
+            result = request()
+        except httpx.HTTPError as error:
+            reason = str(error).lower() or type(error).__name__
+            remote_error = RemoteError(f"cannot reach {self._http.base_url}: {reason}; is kissgs-serve running there?")
+            remote_error.unreachable = True
+            raise remote_error from error
+        self._has_answered = True
+        return result
+
+    def _with_retries(self, request: Callable[[], T], progress: Progress) -> T:
+        """Repeat a request while the service is overloaded or unreachable, for :data:`RETRY_SECONDS`."""
+        start, pause = time.monotonic(), 0.5
+        while True:
+            try:
+                return self._once(request)
+            except RemoteError as error:
+                pause = min(30.0, 2 * pause)
+                delay = pause if error.unreachable else error.retry_after
+                limit = RETRY_SECONDS if self._has_answered or not error.unreachable else FIRST_RETRY_SECONDS
+                if delay is None or time.monotonic() + delay > start + limit:
+                    raise
+                time_limit = f"{limit:.0f} seconds" if limit < 60 else f"{limit / 60:.0f} minutes"
+                reason = str(error).replace(str(self._http.base_url), "it")  # the command prints the address before it
+                _sleep(delay, progress, f"not ready ({reason}); trying again for {time_limit}")
+
+
+def _is_address(server: str) -> bool:
+    try:
+        parts = urlsplit(server)
+        return (
+            parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0 and parts.path in ("", "/")
+        )
+    except ValueError:
+        return False
+
+
+def _sleep(seconds: float, progress: Progress, why: str) -> None:
+    """Sleep in short steps that call ``progress``, which may raise."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        progress(WAIT, 0.0, why)
+        time.sleep(min(0.5, seconds))
+
+
+def _size(path: Path) -> int:
+    try:
+        if not path.is_file():
+            reason = "it is a folder or a device" if path.exists() else "there is no such file"
+            raise InvalidSceneError(f"cannot read {path}: {reason}; name a scene file")
+        return path.stat().st_size
+    except OSError as error:
+        raise InvalidSceneError(f"cannot read {path}: {reason_of(error)}") from error
+
+
+def _blocks(path: Path, size: int, progress: Progress) -> Iterator[bytes]:
+    done = 0
+    progress("upload", 0.0)
+    try:
+        with path.open("rb") as file:
+            while block := file.read(BLOCK_BYTES):
+                yield block
+                done += len(block)
+                progress("upload", min(1.0, done / max(size, 1)))
+    except OSError as error:
+        raise InvalidSceneError(f"cannot read {path}: {reason_of(error)}") from error
+
+
+def _events(response: httpx.Response) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield id, event and data of each server-sent event; each field is on one line."""
+    fields: dict[str, str] = {}
+    for line in response.iter_lines():
+        if line:
+            name, _, value = line.partition(": ")
+            fields[name] = value
+        else:
+            if "data" in fields:
+                yield fields.get("id", ""), fields.get("event", "message"), json.loads(fields["data"])
+            fields = {}
+
+
+def _with_file_name(error: KissgsError, source: str | PathLike[str]) -> KissgsError:
+    """Return the error with "the upload" replaced by the file name in its message."""
+    text = str(error)
+    renamed = type(error)(text.replace("the upload", str(source)))
+    return renamed if text != str(renamed) else error
+
+
+def _checked(response: httpx.Response) -> httpx.Response:
+    if not response.is_error:
+        return response
+    try:
+        problem = response.json()
+        hint = "; set KISSGS_KEY or give --key" if problem["code"] == "unauthorized" else ""
+        error = _error({"code": problem["code"], "detail": problem["detail"] + hint})
+    except (ValueError, KeyError, TypeError):
+        error = RemoteError(
+            f"{response.url.host} answered with status {response.status_code}; check that it is a kissgs service"
+        )
+    after = response.headers.get("Retry-After", "")
+    if isinstance(error, RemoteError) and response.status_code in (429, 503) and after.isdigit():
+        error.retry_after = float(after)
+    raise error
+
+
+def _error(problem: dict[str, str]) -> KissgsError:
+    kind = _ERRORS.get(problem["code"], RemoteError)
+    return kind(problem["detail"])

@@ -1,1 +1,0 @@
-"""Client of a kissgs service: uploads scenes, follows jobs, downloads containers."""

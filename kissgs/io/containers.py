@@ -1,0 +1,398 @@
+"""Files of a container, in a folder, a zip or memory; and the names of the containers that ``compress`` writes."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import struct
+import threading
+import zlib
+from collections.abc import Iterator, Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
+
+from kissgs.core.errors import InvalidContainerError, UnsupportedError
+from kissgs.io.files import reason_of
+
+# The files of a container: in a folder, a zip or memory. Names and sizes are checked before reading.
+
+MAX_ZIP_ENTRIES = 1000
+"""Largest number of entries: a container has 12 files, to which users may add notes and previews."""
+
+MAX_TREE_ENTRIES = 20_000
+"""Largest number of entries of a zip of many containers, each of which has up to eight files."""
+
+MAX_DIRECTORY_BYTES = 1 << 21
+"""Largest list of entries in a zip, which is read whole."""
+
+_END, _END64 = b"PK\x05\x06", b"PK\x06\x07"
+_END_SIZE, _MAX_COMMENT = 22, 0xFFFF
+_ENTRY = struct.Struct("<4s4xHH4xIIIHHH8xI")
+_LOCAL = struct.Struct("<4s22xHH")
+_STORED, _DEFLATED = 0, 8
+_BLOCK = 1 << 20
+
+ZIP_MAGICS = (b"PK\x03\x04", _END)
+"""First bytes of a zip file, and of an empty one."""
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Source that a container's files are read from."""
+
+    def names(self) -> frozenset[str]:
+        """Return the names of all files."""
+
+    def size(self, name: str) -> int:
+        """Return the size of one file of :meth:`names`, bytes; in a zip, the compressed size."""
+
+    def read(self, name: str, limit: int) -> bytes:
+        """Return the bytes of one file; raise InvalidContainerError if it is missing or has more than ``limit``."""
+
+
+class MemorySource:
+    """Files in memory."""
+
+    def __init__(self, files: Mapping[str, bytes]) -> None:
+        self._files = files
+
+    def names(self) -> frozenset[str]:
+        """See :class:`Source`."""
+        return frozenset(self._files)
+
+    def size(self, name: str) -> int:
+        """See :class:`Source`."""
+        return len(self._files[name])
+
+    def read(self, name: str, limit: int) -> bytes:
+        """See :class:`Source`."""
+        _check(name, name in self._files, len(self._files.get(name, b"")), limit)
+        return self._files[name]
+
+
+class DirectorySource:
+    """Files in a folder. :meth:`names` lists those directly in it; :meth:`read` also takes paths below it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        try:
+            self._names = frozenset(entry.name for entry in folder.iterdir() if entry.is_file())
+        except OSError as error:
+            raise InvalidContainerError(f"cannot read {folder}: {reason_of(error)}") from error
+
+    def names(self) -> frozenset[str]:
+        """See :class:`Source`."""
+        return self._names
+
+    def size(self, name: str) -> int:
+        """See :class:`Source`."""
+        return (self._folder / name).stat().st_size
+
+    def read(self, name: str, limit: int) -> bytes:
+        """See :class:`Source`."""
+        try:
+            present = is_below(name) and (self._folder / name).is_file()
+            _check(name, present, self.size(name) if present else 0, limit)
+            return (self._folder / name).read_bytes()
+        except (OSError, ValueError) as error:
+            raise InvalidContainerError(f"cannot read {self._folder / name}: {reason_of(error)}") from error
+
+
+class ZipSource:
+    """Files in a zip. Nothing is extracted to disk.
+
+    Without ``root`` they are known by their names alone, wherever in the zip they are. With ``root``, the name of a
+    file that must be there once, they are known by their paths from its folder.
+    """
+
+    def __init__(self, file: io.BufferedIOBase, label: str, root: str | None = None) -> None:
+        if sniff_format(file) == "ply":
+            raise InvalidContainerError(f"{label} is a .ply, not a container; kissgs convert reads both")
+        entries = _read_directory(file, label, MAX_TREE_ENTRIES if root else MAX_ZIP_ENTRIES)
+        self._file, self._lock = file, threading.Lock()
+        self._flat = root is None
+        folder = ""
+        if root is not None:
+            above = [entry.path[: -len(root)] for entry in entries if entry.path.rsplit("/", 1)[-1] == root]
+            if len(above) != 1:
+                raise InvalidContainerError(f"{label} holds {len(above)} files named {root!r}; one is needed")
+            folder = above[0]
+        self._entries: dict[str, _Entry] = {}
+        for entry in entries:
+            if not entry.path.startswith(folder) or entry.path.endswith("/"):
+                continue
+            name = self._key(entry.path) if self._flat else entry.path[len(folder) :]
+            if name in self._entries:
+                raise InvalidContainerError(f"{label} holds two files named {name!r}")
+            if name:
+                self._entries[name] = entry
+
+    def names(self) -> frozenset[str]:
+        """See :class:`Source`."""
+        return frozenset(self._entries)
+
+    def size(self, name: str) -> int:
+        """See :class:`Source`."""
+        return self._entries[self._key(name)].packed
+
+    def read(self, name: str, limit: int) -> bytes:
+        """See :class:`Source`."""
+        key = self._key(name)
+        _check(name, key in self._entries, self._entries[key].size if key in self._entries else 0, limit)
+        entry = self._entries[key]
+        if entry.method not in (_STORED, _DEFLATED):
+            raise InvalidContainerError(f"{name} has zip compression method {entry.method}; store or deflate it")
+        try:
+            return self._content(entry)
+        except (OSError, ValueError, zlib.error) as error:
+            raise InvalidContainerError(f"{name} cannot be read from the zip: it is damaged or encrypted") from error
+
+    def _content(self, entry: _Entry) -> bytes:
+        magic, name_length, extra_length = _LOCAL.unpack(self._bytes(entry.local, _LOCAL.size))
+        if magic != ZIP_MAGICS[0] or self._bytes(entry.local + _LOCAL.size, name_length) != entry.raw_name:
+            raise ValueError("no such entry there")
+        start = entry.local + _LOCAL.size + name_length + extra_length
+        if entry.method == _DEFLATED:
+            data = self._inflated(start, entry.packed, entry.size)
+        else:
+            data = self._bytes(start, min(entry.packed, entry.size + 1))
+        if entry.flags & 1 or len(data) != entry.size or zlib.crc32(data) != entry.crc:
+            raise ValueError("encrypted, or other bytes than were stored")
+        return data
+
+    def _inflated(self, start: int, packed: int, size: int) -> bytes:
+        """Unpack ``packed`` bytes; stop after ``size`` bytes and one more, since the declared size may be a lie."""
+        inflater, data = zlib.decompressobj(-zlib.MAX_WBITS), bytearray()
+        for at in range(start, start + packed, _BLOCK):
+            data += inflater.decompress(self._bytes(at, min(_BLOCK, start + packed - at)), size + 1 - len(data))
+            if len(data) > size or inflater.unused_data:
+                break
+        if not inflater.eof or inflater.unused_data:
+            raise ValueError("the compressed data ends elsewhere")
+        return bytes(data)
+
+    def _bytes(self, offset: int, count: int) -> bytes:
+        with self._lock:  # several threads read
+            self._file.seek(offset)
+            data = self._file.read(count)
+        if len(data) < count:
+            raise ValueError("the file ends before")
+        return data
+
+    def _key(self, name: str) -> str:
+        return name.rsplit("/", 1)[-1] if self._flat else name
+
+
+class _Entry(NamedTuple):
+    """Entry of a zip's directory: its path with slashes, and its fields; ``local`` is the offset in the file."""
+
+    path: str
+    raw_name: bytes
+    flags: int
+    method: int
+    crc: int
+    packed: int
+    size: int
+    local: int
+
+
+def _read_directory(file: io.BufferedIOBase, label: str, most: int) -> list[_Entry]:
+    """Return the entries of a zip, by the rule of docs/reference/format.md, which web_decoder/zip.js follows too."""
+    damaged = InvalidContainerError(f"{label} is not a readable zip file; export or download it again")
+    try:
+        length = file.seek(0, io.SEEK_END)
+        file.seek(max(0, length - _END_SIZE - _MAX_COMMENT))
+        tail = file.read()
+        at = tail.rfind(_END, 0, max(0, len(tail) - _END_SIZE + len(_END)))
+        if at < 0:
+            raise damaged
+        count, size, offset = struct.unpack_from("<HII", tail, at + 10)
+        if count == 0xFFFF or offset == 0xFFFFFFFF or tail[max(0, at - 20) : at].startswith(_END64):
+            raise InvalidContainerError(f"{label} is a zip64 file; pack it as an ordinary zip")
+        if count > most:
+            raise InvalidContainerError(f"{label} has {count} entries; a container has 12 files")
+        if size > MAX_DIRECTORY_BYTES:
+            raise InvalidContainerError(
+                f"{label} has a list of entries above {MAX_DIRECTORY_BYTES} bytes; pack it again"
+            )
+        start = length - len(tail) + at - size
+        if start < offset:
+            raise damaged
+        file.seek(start)
+        directory = file.read(size)
+    except (OSError, ValueError) as error:
+        raise damaged from error
+    entries, at = [], 0
+    for _ in range(count):
+        if at + _ENTRY.size > size:
+            raise damaged
+        magic, flags, method, crc, packed, unpacked, name, extra, comment, local = _ENTRY.unpack_from(directory, at)
+        raw_name = directory[at + _ENTRY.size : at + _ENTRY.size + name]
+        at += _ENTRY.size + name + extra + comment
+        if magic != b"PK\x01\x02" or at > size:
+            raise damaged
+        path = raw_name.decode("utf-8", "replace").replace("\\", "/")
+        # Data before the zip, such as a self-extractor, moves all entries.
+        entries.append(_Entry(path, raw_name, flags, method, crc, packed, unpacked, start - offset + local))
+    if at != size:
+        raise damaged
+    return entries
+
+
+def zip_names(file: io.BufferedIOBase) -> list[str]:
+    """Return the names of all entries of a zip, folders included; none if it cannot be read."""
+    try:
+        return [entry.path for entry in _read_directory(file, "the file", MAX_TREE_ENTRIES)]
+    except InvalidContainerError:
+        return []
+
+
+def is_below(name: str) -> bool:
+    """Whether a file name from inside a file is a relative path that does not leave its folder."""
+    parts = name.replace("\\", "/").split("/")
+    return bool(name) and ".." not in parts and parts[0] != "" and ":" not in parts[0] and "\0" not in name
+
+
+def is_file_name(name: object) -> bool:
+    """Whether a value is the relative path of a file below its folder, fit for a message."""
+    return isinstance(name, str) and len(name) <= 255 and name.isprintable() and is_below(name)
+
+
+def sniff_format(file: io.BufferedIOBase) -> Literal["ply", "zip"] | None:
+    """Return the format of a file, None for an unknown one; a zip may have data before it, a ``.ply`` may not."""
+    file.seek(0)
+    head = file.read(4)
+    file.seek(0)
+    if head[:3] == b"ply" and head[3:].isspace():
+        return "ply"
+    return "zip" if head in ZIP_MAGICS or zip_names(file) else None
+
+
+@contextlib.contextmanager
+def open_source(source: Path | bytes | Mapping[str, bytes], root: str | None = None) -> Iterator[Source]:
+    """Open a container for reading: a folder, a zip file, the bytes of one, or files in memory.
+
+    ``root`` is that of :class:`ZipSource`.
+
+    Raises:
+        InvalidContainerError: ``source`` cannot be read or is not a zip file.
+    """
+    if isinstance(source, bytes):
+        yield ZipSource(io.BytesIO(source), "the input", root)
+    elif not isinstance(source, Path):
+        yield MemorySource(source)
+    else:
+        try:
+            if source.exists() and not (source.is_file() or source.is_dir()):
+                raise InvalidContainerError(f"{source} is neither a file nor a folder")
+            file = None if source.is_dir() else source.open("rb")
+        except (OSError, ValueError) as error:
+            raise InvalidContainerError(f"cannot read {source}: {reason_of(error)}") from error
+        if file is None:
+            yield DirectorySource(source)
+            return
+        with file:
+            yield ZipSource(file, str(source), root)
+
+
+def _check(name: str, present: bool, size: int, limit: int) -> None:
+    if not present:
+        raise InvalidContainerError(f"the container has no file {name!r}; export or download it again")
+    if size > limit:
+        raise InvalidContainerError(f"{name} has {size} bytes; the limit for this file is {limit}")
+
+
+# Names of the containers that ``compress`` writes, and the endings of their files.
+
+ContainerName = Literal["sogxt", "sog"]
+"""SOG-XT, the default, or SOG of version 2, which other viewers open."""
+
+CONTAINERS: tuple[ContainerName, ...] = get_args(ContainerName)
+
+ENDINGS: dict[str, ContainerName] = {".zip": "sogxt", ".sog": "sog"}
+"""Container of a file by its ending."""
+
+LOD_NAME, LEVELS_NAME = "lod-meta.json", "levels.json"
+
+MANIFESTS: dict[str, ContainerName] = {LOD_NAME: "sog", LEVELS_NAME: "sogxt"}
+"""Containers of a streamed scene by the name of its manifest."""
+
+LEVELS_ENDING = ".sogxt"
+"""Ending of a folder for ``levels.json``."""
+
+SCENE_ENDINGS = (".ply", ".spz", ".splat", ".ksplat", ".glb", ".gltf")
+"""Endings of scenes that are no containers."""
+
+FOLDER_ENDING = ".container"
+"""Ending of folders that the command line names after their scenes."""
+
+_SLASHES = tuple({"/", os.sep})
+
+
+def ending_of(container: ContainerName) -> str:
+    """Return the ending of a container's files."""
+    return next(ending for ending, name in ENDINGS.items() if name == container)
+
+
+def names_folder(destination: str | PathLike[str]) -> bool:
+    """Whether a name is that of a folder: one that exists, or ends in a slash or in ``.container``.
+
+    A Path keeps no slash: one without an ending is a folder.
+    """
+    name = os.fspath(destination)
+    ending = Path(f"_{Path(name).name.rstrip('.')}").suffix  # also of ".zip" and "a.zip."
+    return (
+        name.endswith(_SLASHES)
+        or ending == FOLDER_ENDING
+        or (not ending and not isinstance(destination, str))
+        or os.path.isdir(name)  # noqa: PTH112  Path.is_dir raises where a name is too long
+    )
+
+
+def named_container(requested: str | None, destination: str | PathLike[str] | None) -> ContainerName:
+    """Return the container to write: the requested one, else that of the destination's ending, else SOG-XT.
+
+    A destination that ends in neither ``.zip`` nor ``.sog`` is a folder, and must look like one (:func:`names_folder`).
+
+    Raises:
+        UnsupportedError: there is no such container, or the destination has the name of another one, of another format
+            or of a streamed scene.
+    """
+    path = None if destination is None else Path(destination)
+    ending = "" if path is None else path.suffix.lower()
+    manifest = path is not None and named_manifest(path) is not None
+    if manifest or (destination is not None and ending not in ENDINGS and not names_folder(destination)):
+        remedy = "end it in .zip or .sog"
+        if ending in SCENE_ENDINGS:
+            remedy += " (kissgs convert writes other formats)"
+        elif ending in (".json", LEVELS_ENDING):
+            remedy += (
+                f"; levels of detail, which kissgs compress and kissgs.compress_streamed write, are FOLDER/{LOD_NAME}, "
+                f"FOLDER/{LEVELS_NAME} or NAME{LEVELS_ENDING}"
+            )
+        else:
+            remedy += ", or if it is a folder, in a slash"
+        raise UnsupportedError(f"{destination!s:.100} is not the name of a container: {remedy}")
+    by_ending = ENDINGS.get(ending)
+    if requested is None:
+        return by_ending or "sogxt"
+    for name in CONTAINERS:
+        if requested == name:
+            if by_ending not in (None, name):
+                raise UnsupportedError(
+                    f"{destination} is not the name of a {name} container: end it in {ending_of(name)}"
+                )
+            return name
+    raise UnsupportedError(f"there is no container {requested!r}; choose one of {', '.join(CONTAINERS)}")
+
+
+def named_manifest(destination: Path) -> Path | None:
+    """Return the manifest of the streamed scene that a destination names; None if it names something else.
+
+    It is the destination itself, or ``levels.json`` in a folder that ends in ``.sogxt``.
+    """
+    if destination.name in MANIFESTS:
+        return destination
+    return destination / LEVELS_NAME if destination.suffix.lower() == LEVELS_ENDING else None

@@ -1,1 +1,0 @@
-"""Procedural sample scene. Takes a count and a seed; gives Splats."""
