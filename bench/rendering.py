@@ -16,14 +16,14 @@ import torch
 
 from bench.common import arguments, head, positive, row, run
 from kissgs import CompactSettings, Splats, load, virtual_views
-from kissgs.core.progress import Pace
+from kissgs.core.progress import Pace, load_kernels
 from kissgs.core.resources import Workers, keep_free_memory
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.backward import Gradients
 from kissgs.rendering.cpu.frame import draw
 from kissgs.rendering.differentiable import photometric_loss, rasterize
-from kissgs.rendering.rasterizer import load_kernels, removal_scores, render
+from kissgs.rendering.rasterizer import removal_scores, render
 from kissgs.training.loop import TrainingPlan, torch_threads, train
 from kissgs.training.model import GaussianModel
 from kissgs.training.supervision import TrainingTargets

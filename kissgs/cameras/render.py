@@ -13,11 +13,11 @@ from kissgs.cameras.virtual.orbit import find_orbit
 from kissgs.cameras.virtual.select import best_view, virtual_views
 from kissgs.core.array_types import UInt8
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import Progress, load_kernels, silent
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.images import Label, contact_sheet, reframed, render_all
-from kissgs.rendering.rasterizer import BLACK, Colour, Device, load_kernels
+from kissgs.rendering.rasterizer import BLACK, Colour, Device
 
 IMAGE_SIZE, FRAME_SIZE, CELL_SIZE = (1280, 960), (640, 480), (320, 240)
 """Default (width, height), pixels: of a single image, of an animation's frames, of the images on a contact sheet."""

@@ -59,7 +59,7 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
         ) from error
     written = Path(attempt) / Path(arguments["target"]).name
     if arguments["evaluate"]:  # reported here, because evaluation reports only one stage
-        from kissgs.rendering.rasterizer import load_kernels
+        from kissgs.core.progress import load_kernels
 
         load_kernels(progress)
     result = compress(

@@ -35,7 +35,7 @@ def compress_here(options: CompressOptions, capture: Views | None, scene: str, t
     searches = decided(options.settings, capture).searches
     with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:
         if options.evaluate:  # reported here, because evaluation reports only one stage
-            from kissgs.rendering.rasterizer import load_kernels
+            from kissgs.core.progress import load_kernels
 
             load_kernels(progress)
         result = compress(

@@ -14,19 +14,19 @@ SAMPLE_COUNT = 20_000
 
 def warmup() -> None:
     """Compile and cache all kernels, and measure the speed of this machine, by which --time chooses what to do."""
-    from kissgs.planning.planner import load_kernels as load_encoder
-    from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
+    from kissgs.compaction import covariance_kernels, merging, nearest_kernels  # noqa: F401
+    from kissgs.core import numba_kernels
+    from kissgs.finetuning import kernels as finetuning_kernels  # noqa: F401
+    from kissgs.planning import form_kernels, kmeans_kernels, order_kernels, rdo_kernels, table_kernels, tour_kernels  # noqa: F401
+    from kissgs.planning import kernels as planning_kernels  # noqa: F401
+    from kissgs.rendering import ssim_kernels  # noqa: F401
+    from kissgs.rendering.cpu import backward, coverage, neighbours, sensitivity  # noqa: F401
+    from kissgs.training import optimizer  # noqa: F401
 
-    with progress_bar(False) as progress:  # one stage for all, so that it is reported once
-        progress("kernels", 0.0)
-        load_encoder()
-        load_rasterizer()
-        from kissgs.compaction import merging  # noqa: F401
-        from kissgs.finetuning import kernels  # noqa: F401
-        from kissgs.planning import rdo_kernels, table_kernels  # noqa: F401
-        from kissgs.training import optimizer as adam_kernels  # noqa: F401
-
-        progress("kernels", 1.0)
+    with progress_bar(False) as progress:
+        for number, kernel in enumerate(numba_kernels.kernels):
+            progress("kernels", number / len(numba_kernels.kernels))
+            kernel.load()
         try:
             _measure_speed()
         except OutputError as error:

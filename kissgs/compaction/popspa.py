@@ -22,12 +22,12 @@ from kissgs.compaction.scene_training import (
     work_key,
 )
 from kissgs.core.errors import OutputError
-from kissgs.core.progress import Progress, as_stage, silent
+from kissgs.core.progress import Progress, as_stage, load_kernels, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import ImageMetrics
-from kissgs.rendering.rasterizer import Device, load_kernels
+from kissgs.rendering.rasterizer import Device
 from kissgs.settings import CompactSettings, Preset, Settings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import encode

@@ -12,9 +12,8 @@ from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.compaction.scene_training import Phase, SceneTraining
 from kissgs.core.array_types import Int
-from kissgs.core.progress import Deadline
+from kissgs.core.progress import Deadline, load_kernels
 from kissgs.core.splats import Splats
-from kissgs.rendering.rasterizer import load_kernels
 
 if TYPE_CHECKING:
     from kissgs.training.supervision import TrainingTargets

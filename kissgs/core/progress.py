@@ -126,3 +126,11 @@ class Pace:
             per_step = (now - self._settled[1]) / (done - self._settled[0])
         fitting = max(left, 0.0) / per_step if per_step > 0 else (0.0 if left <= 0 else self._requested)
         self.steps = min(done + int(min(fitting, self._requested)), self._requested)
+
+
+def load_kernels(progress: Progress = silent) -> None:
+    """Load numba; ``progress`` receives the stage "kernels", during which and after which kernels may be compiled."""
+    progress("kernels", 0.0)
+    from kissgs.core import numba_kernels  # noqa: F401
+
+    progress("kernels", 1.0)

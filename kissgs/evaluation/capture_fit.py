@@ -17,11 +17,11 @@ from kissgs.cameras.views import Similarity, View, Views
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import InvalidViewsError, KissgsError
 from kissgs.core.origin import Origin
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import Progress, load_kernels, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.scene_parts import drawn_opacities, share_shown
 from kissgs.rendering.metrics import psnr
-from kissgs.rendering.rasterizer import load_kernels, render
+from kissgs.rendering.rasterizer import render
 
 LEAST_PSNR, USUAL_PSNR = 12.0, 18.0
 """Median PSNR, decibels, below which a capture is refused, and below which a note says so. Images of different scenes

@@ -16,7 +16,7 @@ from kissgs.cameras.views import View, Views
 from kissgs.core.array_types import Float32, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.origin import with_origin
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import Progress, load_kernels, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
 from kissgs.evaluation.capture_fit import in_scene_frame
@@ -24,7 +24,7 @@ from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Spli
 from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.metrics import Flip, Lpips, ms_ssim, psnr, ssim
-from kissgs.rendering.rasterizer import Device, load_kernels, render
+from kissgs.rendering.rasterizer import Device, render
 
 NOTHING_VISIBLE = "no rendering shows any of the reference, so these values mean nothing; choose other views"
 """Note of an evaluation whose views all miss the reference."""

@@ -16,7 +16,7 @@ from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.progress import Deadline, Progress, SearchNote, as_stage
+from kissgs.core.progress import Deadline, Progress, SearchNote, as_stage, load_kernels
 from kissgs.core.resources import blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, empty_splats
@@ -27,7 +27,6 @@ from kissgs.pipeline.goal import Trial
 from kissgs.pipeline.rate_control import Container, Encoder, RateControl
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.order_refinement import refine_order
-from kissgs.planning.planner import load_kernels as load_encoder
 from kissgs.planning.planner import plan_encoding
 from kissgs.planning.rate_distortion import ColorRefit
 from kissgs.rendering.gsplat_backend import need_cuda
@@ -299,14 +298,12 @@ class Encoding:
     def _rd_planner(self) -> Planner:
         """Measure the sensitivity once; return a planner that uses it for every plan."""
         from kissgs.cameras.virtual.regions import default_view_count, sensitivity_cameras
-        from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
 
         splats, views, settings = self.splats, self.views, self.settings.encode
         sensitivity, common = self.sensitivity, (self.threads, self.progress)
         if sensitivity is not None:
             sensitivity.check(splats)
-        load_encoder(self.progress)
-        load_rasterizer()
+        load_kernels(self.progress)
         captured = views is not None and len(views.train) > 0
         recolor = None
         if sensitivity is None or (captured and settings.color_refit_iterations):

@@ -9,7 +9,7 @@ import numpy as np
 from kissgs.core.array_types import Float32, Float64, Int, Int32, UInt16
 from kissgs.core.coarse_positions import coarse_note
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import Progress, load_kernels, silent
 from kissgs.core.resources import Workers, blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS, Splats
@@ -237,11 +237,3 @@ def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndar
     if not settings.prune_invisible:
         return np.arange(len(splats), dtype=np.int32)
     return np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT)).astype(np.int32)
-
-
-def load_kernels(progress: Progress = silent) -> None:
-    """Compile the encoder's kernels, or load them from numba's cache."""
-    progress("kernels", 0.0)
-    from kissgs.planning import kmeans_kernels as relocation_kernels  # noqa: F401
-
-    progress("kernels", 1.0)

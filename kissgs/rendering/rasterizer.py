@@ -91,13 +91,3 @@ def removal_scores(
             scores += frame_scores(draw(splats, camera, colour, pool), pool)
     progress("score", 1.0)
     return scores
-
-
-def load_kernels(progress: Progress = silent) -> None:
-    """Compile the rasteriser's kernels, or load them from numba's cache; ``progress`` receives the stage "kernels"."""
-    progress("kernels", 0.0)
-    from kissgs.rendering import ssim_kernels
-    from kissgs.rendering.cpu import backward as gradients  # noqa: F401
-
-    del ssim_kernels
-    progress("kernels", 1.0)

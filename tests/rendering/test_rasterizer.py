@@ -13,11 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.core.errors import InvalidSceneError, InvalidViewsError, KissgsError, UnsupportedError
+from kissgs.core.progress import load_kernels
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.gsplat_backend import alpha_max
-from kissgs.rendering.rasterizer import BLACK, load_kernels, render
+from kissgs.rendering.rasterizer import BLACK, render
 from kissgs.rendering.tensors import tensors_of
 
 
