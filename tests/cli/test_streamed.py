@@ -81,7 +81,7 @@ def test_the_message_of_an_interruption_says_whether_something_is_left(scene, tm
     # A sitecustomize that interrupts the partition once it has written a file, and perhaps the removal of that, too.
     (tmp_path / "sitecustomize.py").write_text(
         "import os, pathlib, signal\n"
-        "from kissgs.streaming import build, work_folder\n"
+        "from kissgs.streaming import build, items\n"
         f"work, again = pathlib.Path('city.partial'), {again}\n"
         "def partition(*arguments):\n"
         "    (work / 'chunk_0.f32').write_bytes(b'1234')\n"

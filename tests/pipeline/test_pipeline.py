@@ -240,7 +240,7 @@ def test_cancelling_keeps_the_existing_file(tmp_path):
 def test_a_full_disk_is_an_output_error_and_leaves_nothing(tmp_path, name):
     """A limit of 3 kB per file simulates a full disk; the error contains the message of the system."""
     program = """
-import resource, sys, kissgs
+import pathlib, resource, sys, kissgs
 scene, settings = kissgs.sample_scene(1500, sh_degree=1), kissgs.Settings(preset="fast")
 files = kissgs.compress(scene, settings=settings).files
 resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
@@ -248,7 +248,7 @@ try:
     if sys.argv[1].endswith(".ply"):
         kissgs.decompress(files, sys.argv[1])
     else:
-        kissgs.Compressed(files, None, None).save(sys.argv[1])
+        kissgs.Compressed(files, None, None).save(pathlib.Path(sys.argv[1]))
 except kissgs.OutputError as error:
     print(error)
 """

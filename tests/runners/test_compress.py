@@ -59,7 +59,7 @@ def test_files_and_reports_are_those_without_a_cluster(cluster, scenes, tmp_path
     (tmp_path / "broken.ply").write_bytes(b"ply\nnonsense\n")
     inputs = [scenes / "a.ply", tmp_path / "broken.ply", scenes / "b.ply"]
     for name, more in {"here": [], "there": ["--ray", cluster.address]}.items():
-        done = run("compress", *inputs, "-p", "fast", "-o", tmp_path / name, "--json", *more)
+        done = run("compress", *inputs, "-p", "fast", "-o", f"{tmp_path}/{name}/", "--json", *more)
         assert done.returncode == 2
         (tmp_path / f"{name}.json").write_bytes(done.stdout)
         (tmp_path / f"{name}.txt").write_bytes(done.stderr)
