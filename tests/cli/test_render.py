@@ -213,7 +213,9 @@ def test_an_interrupted_animation_leaves_no_file(folder: Path, tmp_path: Path) -
 def test_compilation_is_announced_when_it_happens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Regression: a timer announced it to whoever had a slow disk, and a second "kernels" stage raised."""
     module = tmp_path / "kernel.py"
-    module.write_text("from kissgs.core.numba_kernels import compiled\n@compiled('int64(int64)')\ndef f(x): return x\nf(1)\n")
+    module.write_text(
+        "from kissgs.core.numba_kernels import compiled\n@compiled('int64(int64)')\ndef f(x): return x\nf(1)\n"
+    )
     for expected in (1, 0):
         with console.progress_bar(False) as progress:
             for _ in range(2):
