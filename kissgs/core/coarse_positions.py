@@ -25,6 +25,9 @@ STREAMED_REMEDY = "no origin helps here, but compressing into FOLDER/lod-meta.js
 LEAST, MOST_CUTS = 32, 12
 """Number of Gaussians in a chunk, and of cuts one after another, up to which chunks are cut for finer positions."""
 
+TRIED = 1 << 16
+"""Largest number of Gaussians with which cuts are tried before they are named as a remedy."""
+
 
 def coarse_share(errors: Float[np.ndarray, " N"], scales: Float32[np.ndarray, "N 3"]) -> float:
     """Return the share of Gaussians whose position is off by more than a quarter of their visible size.
@@ -64,7 +67,7 @@ def coarse_note(
     near = wide - np.rint(np.median(wide, axis=0))
 
     def coarse_in_parts(positions: Float64[np.ndarray, "N 3"]) -> float:
-        rows = np.column_stack([positions, sizes]).astype(np.float32)
+        rows = np.column_stack([positions, sizes]).astype(np.float32)[:: 1 + len(sizes) // TRIED]
         return coarse_in_chunks(rows, cuts_without_coarse(rows, Cuts.of(rows[:, :3], 0), count))
 
     remedies: dict[str, Callable[[], float]] = {
@@ -166,12 +169,14 @@ def coarse_in_chunks(rows: Float32[np.ndarray, "S 4"], cuts: Cuts) -> float:
 
     ``rows`` are positions and visible sizes.
     """
+    if not len(rows):
+        return 0.0
     chunks, coarse = cuts.chunk_of(rows[:, :3]), 0.0
-    for chunk in np.unique(chunks):
-        part = rows[chunks == chunk].astype(np.float64)
+    order = np.argsort(chunks, kind="stable")
+    for part in np.split(rows[order].astype(np.float64), np.flatnonzero(np.diff(chunks[order])) + 1):
         extents = np.ptp(signed_log(part[:, :3]), axis=0)
         coarse += float(coarse_chances(part[:, :3], part[:, 3], extents).sum())
-    return coarse / max(len(rows), 1)
+    return coarse / len(rows)
 
 
 def cuts_without_coarse(sample: Float32[np.ndarray, "S 4"], cuts: Cuts, count: int) -> Cuts:
