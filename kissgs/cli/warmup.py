@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from importlib.util import find_spec
 
 from kissgs.cli.console import progress_bar
 from kissgs.core.errors import OutputError
@@ -21,7 +22,9 @@ def warmup() -> None:
     from kissgs.planning import kernels as planning_kernels  # noqa: F401
     from kissgs.rendering import ssim_kernels  # noqa: F401
     from kissgs.rendering.cpu import backward, coverage, neighbours, sensitivity  # noqa: F401
-    from kissgs.training import optimizer  # noqa: F401
+
+    if find_spec("torch"):  # without it nothing is trained
+        from kissgs.training import optimizer  # noqa: F401
 
     with progress_bar(False) as progress:
         for number, kernel in enumerate(numba_kernels.kernels):
