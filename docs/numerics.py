@@ -19,19 +19,28 @@ from helpers.extreme_stages import measured  # noqa: E402
 from helpers.extremes import BOUNDS, EXTREMES  # noqa: E402
 
 
-def table(measure: Callable[[str, str], float]) -> str:
-    """Return a table with a row of bounds, then a row per extreme with the errors that ``measure`` finds."""
-    lines = [f"| row | given | promise | {' | '.join(BOUNDS)} |", "|---" * (3 + len(BOUNDS)) + "|"]
-    lines.append(f"|  |  | unless said otherwise | {' | '.join(f'≤ {figure(bound)}' for bound in BOUNDS.values())} |")
-    for extreme in EXTREMES:
-        found = [cell(measure(extreme.name, stage), extreme.bounds.get(stage)) for stage in BOUNDS]
-        lines.append(f"| `{extreme.name}` | {extreme.given} | {extreme.promise} | {' | '.join(found)} |")
+def errors(measure: Callable[[str, str], float]) -> str:
+    """Return a table of the largest error of each stage, and of those rows that have a bound of their own."""
+    lines = ["| column | promised | largest | at |", "|---|---|---|---|"]
+    for stage, bound in BOUNDS.items():
+        usual = {extreme.name: measure(extreme.name, stage) for extreme in EXTREMES if stage not in extreme.bounds}
+        worst = max(usual, key=lambda name: usual[name])
+        lines.append(line(stage, bound, usual[worst], worst))
+        own = {extreme.name: extreme.bounds[stage] for extreme in EXTREMES if stage in extreme.bounds}
+        lines += [line(stage, own[name], measure(name, stage), name) for name in own]
     return "\n".join(lines) + "\n"
 
 
-def cell(value: float, bound: float | None) -> str:
-    """Return an error as text, followed by its bound where the row has a bound of its own."""
-    return figure(value) + ("" if bound is None else f" ≤ {figure(bound)}")
+def rows() -> str:
+    """Return a table of what each row is about and what happens to it."""
+    lines = ["| row | given | promise |", "|---|---|---|"]
+    lines += [f"| `{extreme.name}` | {extreme.given} | {extreme.promise} |" for extreme in EXTREMES]
+    return "\n".join(lines) + "\n"
+
+
+def line(stage: str, bound: float, error: float, name: str) -> str:
+    """Return a line of the table of errors."""
+    return f"| `{stage}` | ≤ {figure(bound)} | {figure(error)} | `{name}` |"
 
 
 def figure(value: float) -> str:
@@ -45,7 +54,8 @@ def figure(value: float) -> str:
 def main() -> None:
     """Measure everything, and replace the part of the page between its marks."""
     before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    PAGE.write_text(before + BEGIN + table(measured) + END + rest.partition(END)[2], encoding="utf-8")
+    written = errors(measured) + "\n" + rows()
+    PAGE.write_text(before + BEGIN + written + END + rest.partition(END)[2], encoding="utf-8")
 
 
 if __name__ == "__main__":
