@@ -16,7 +16,7 @@ BEGIN, END = "<!-- measured -->\n", "<!-- end -->\n"
 sys.path.append(str(ROOT / "tests"))
 
 from helpers.extreme_stages import measured  # noqa: E402
-from helpers.extremes import BOUNDS, EXTREMES  # noqa: E402
+from helpers.extremes import BOUNDS, EXTREMES, KEPT  # noqa: E402
 
 
 def errors(measure: Callable[[str, str], float]) -> str:
@@ -32,10 +32,11 @@ def errors(measure: Callable[[str, str], float]) -> str:
 
 
 def rows() -> str:
-    """Return a table of what each row is about and what happens to it."""
+    """Return a table of what happens to each row that is not kept as it is, and a list of the others."""
     lines = ["| row | given | promise |", "|---|---|---|"]
-    lines += [f"| `{extreme.name}` | {extreme.given} | {extreme.promise} |" for extreme in EXTREMES]
-    return "\n".join(lines) + "\n"
+    lines += [f"| `{row.name}` | {row.given} | {row.promise} |" for row in EXTREMES if row.promise != KEPT]
+    kept = [f"- `{row.name}`: {row.given}" for row in EXTREMES if row.promise == KEPT]
+    return "\n".join([*lines, "", f"{KEPT.capitalize()}:", "", *kept]) + "\n"
 
 
 def line(stage: str, bound: float, error: float, name: str) -> str:
