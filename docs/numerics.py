@@ -12,6 +12,20 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "reference" / "numerics.md"
 BEGIN, END = "<!-- measured -->\n", "<!-- end -->\n"
+ERRORS = {
+    "clean": "of the cleaned scene; opacities for logits, values above 1 relative",
+    "fast": "of the decoded scene, in the report's `max_quantization_error`",
+    "balanced": "the same",
+    "decode": "of decoded values, in ranges of their attribute",
+    "image": "of a pixel, relative to the brightest above 1",
+    "gradient": "relative to the largest of its kind (or to 1e-4 of the largest of all)",
+    "score": "of a removal score, relative to the largest",
+    "rank": "of the effective-rank loss and its gradient",
+    "step": "of three steps of training, in learning rates",
+    "levels": "levels that differ from fine-tuning's",
+    "browser": "of the JavaScript decoder's floats, in ulps",
+}
+"""Meaning of the error of each stage."""
 
 sys.path.append(str(ROOT / "tests"))
 
@@ -21,7 +35,7 @@ from helpers.extremes import BOUNDS, EXTREMES, KEPT  # noqa: E402
 
 def errors(measure: Callable[[str, str], float]) -> str:
     """Return a table of the largest error of each stage, and of those rows that have a bound of their own."""
-    lines = ["| column | promised | largest | at |", "|---|---|---|---|"]
+    lines = ["| column | error | promised | largest | at |", "|---|---|---|---|---|"]
     for stage, bound in BOUNDS.items():
         usual = {extreme.name: measure(extreme.name, stage) for extreme in EXTREMES if stage not in extreme.bounds}
         worst = max(usual, key=lambda name: usual[name])
@@ -41,7 +55,7 @@ def rows() -> str:
 
 def line(stage: str, bound: float, error: float, name: str) -> str:
     """Return a line of the table of errors."""
-    return f"| `{stage}` | ≤ {figure(bound)} | {figure(error)} | `{name}` |"
+    return f"| `{stage}` | {ERRORS[stage]} | ≤ {figure(bound)} | {figure(error)} | `{name}` |"
 
 
 def figure(value: float) -> str:
