@@ -11,32 +11,27 @@ import typer
 
 from kissgs.cli.files import for_each_input
 from kissgs.cli.options import (
-    AntialiasedOption,
     ContainerOption,
     ForceOption,
     ForceViewsOption,
     JsonOption,
-    LevelOption,
-    MaxGaussiansOption,
     MaxPsnrDropOption,
     MaxSsimDropOption,
     OriginOption,
     PresetOption,
     PsnrOption,
-    QuietOption,
-    RawAxesOption,
     RayOption,
+    SceneOptions,
     ScenesArgument,
     SeedOption,
     SetOption,
     TargetSizeOption,
-    ThreadsOption,
     TimeOption,
     budget_of,
     chosen,
     device_of,
     open_views,
-    reading_options,
+    reads_scenes,
     refuse_without_training,
 )
 
@@ -60,6 +55,7 @@ FinetuneOption = Annotated[
 ]
 
 
+@reads_scenes
 def compress(
     scenes: ScenesArgument,
     output: Annotated[
@@ -106,17 +102,13 @@ def compress(
             "--checkpoint", help="Save the state of --compact and --finetune next to the scene, and resume from it."
         ),
     ] = False,
-    max_gaussians: MaxGaussiansOption = None,
-    level: LevelOption = 0,
-    raw_axes: RawAxesOption = False,
     origin: OriginOption = None,
-    antialiased: AntialiasedOption = None,
     device: Annotated[str, typer.Option(help="Device of --compact and --finetune: cpu or cuda.")] = "cpu",
-    threads: ThreadsOption = 0,
     ray: RayOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
+    *,
+    common: SceneOptions,
 ) -> None:
     """Compress each scene into a SOG-XT container, into SOG, or into a folder with levels of detail."""
     from kissgs.cli.options import CompressOptions
@@ -126,7 +118,6 @@ def compress(
     named = None if output is None else Path(output)
     manifest = None if named is None else named_manifest(named)
     kind = named_container(container, None if manifest or output == "-" else output)
-    reading = reading_options(max_gaussians, level, raw_axes, origin, antialiased)
     settings = chosen(
         preset,
         changes,
@@ -142,11 +133,11 @@ def compress(
     renders = evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
     capture, training_device = open_views(views), device_of(device)
     refuse_without_training(decided(settings, capture), checkpoint=checkpoint, device=device)
-    if views is not None and not renders and not quiet:
+    if views is not None and not renders and not common.quiet:
         sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
     options = CompressOptions(
         settings=settings,
-        reading=reading,
+        reading=common.reading(origin),
         container=kind,
         cache=cache,
         evaluate=evaluate,
@@ -154,9 +145,9 @@ def compress(
         force_views=force_views,
         checkpoint=checkpoint,
         force=force,
-        threads=threads,
+        threads=common.threads,
         device=training_device,
-        quiet=quiet or as_json,
+        quiet=common.quiet or as_json,
     )
     ending = "" if unpacked else ending_of(kind)
     if manifest is not None:

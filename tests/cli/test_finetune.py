@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def settings(**changes: object) -> kissgs.Settings:
-    return kissgs.Settings.from_preset("balanced", finetune={"enabled": True, **SHORT, **changes}, **LOOK)
+    return kissgs.Settings.research("balanced", finetune={"enabled": True, **SHORT, **changes}, **LOOK)
 
 
 def test_output_and_report_are_those_of_the_library(folder: Path, tmp_path: Path) -> None:
