@@ -9,12 +9,16 @@ import typer
 
 from kissgs.cli.files import for_each_input, say_notes, show, sibling, source, stdout
 from kissgs.cli.options import (
+    CheckpointOption,
+    DeviceOption,
     ForceOption,
     ForceViewsOption,
     JsonOption,
+    PresetOption,
     ResearchOption,
     SceneOptions,
     ScenesArgument,
+    ViewsOption,
     chosen,
     count_of,
     device_of,
@@ -56,37 +60,24 @@ def compact(
             "takes seconds, needs neither views nor torch. Default: prune.",
         ),
     ] = None,
-    views: Annotated[
-        Path | None,
-        typer.Option(
-            "--views",
-            metavar="DATA",
-            help="Capture to train on and to evaluate with: a COLMAP or transforms.json folder. "
-            "Default: renderings of the scene.",
-        ),
-    ] = None,
+    views: ViewsOption = None,
     force_views: ForceViewsOption = False,
-    preset: Annotated[
-        str,
-        typer.Option("--preset", "-p", help="fast only prunes; balanced, small and paper also train."),
-    ] = "balanced",
+    preset: PresetOption = "balanced",
     changes: ResearchOption = None,
     evaluate: Annotated[
         bool, typer.Option("--evaluate", help="Measure PSNR, SSIM, MS-SSIM and compressed size after every step.")
     ] = False,
-    checkpoint: Annotated[
-        bool,
-        typer.Option("--checkpoint", help="Save the training state next to the scene, and resume from it next time."),
-    ] = False,
-    device: Annotated[
-        str, typer.Option(help="Device of the training: cpu (reproducible) or cuda (results vary slightly).")
-    ] = "cpu",
+    checkpoint: CheckpointOption = False,
+    device: DeviceOption = "cpu",
     force: ForceOption = False,
     as_json: JsonOption = False,
     *,
     common: SceneOptions,
 ) -> None:
-    """Reduce the number of Gaussians of scenes at nearly equal quality: score, prune and train (POPSpa), or merge."""
+    """Reduce the number of Gaussians of scenes at nearly equal quality: score, prune and train (POPSpa), or merge.
+
+    The preset fast only prunes; balanced, small and paper also train.
+    """
     from kissgs.cli.console import progress_bar
     from kissgs.cli.signals import stoppable
     from kissgs.io.ply import write_ply

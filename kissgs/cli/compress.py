@@ -11,7 +11,12 @@ import typer
 
 from kissgs.cli.files import for_each_input
 from kissgs.cli.options import (
+    CheckpointOption,
+    CompactOption,
     ContainerOption,
+    DeviceOption,
+    EvaluateOption,
+    FinetuneOption,
     ForceOption,
     ForceViewsOption,
     JsonOption,
@@ -27,6 +32,7 @@ from kissgs.cli.options import (
     SetOption,
     TargetSizeOption,
     TimeOption,
+    ViewsOption,
     budget_of,
     chosen,
     device_of,
@@ -34,25 +40,6 @@ from kissgs.cli.options import (
     reads_scenes,
     refuse_without_training,
 )
-
-CompactOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="BUDGET",
-        help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
-        "PSNR drop (0.2dB); 100% keeps all; auto searches the number that serves a goal best, which is the default "
-        "with held-out photographs, and without --views where it is fine-tuned.",
-    ),
-]
-FinetuneOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="[STEPS]",
-        help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
-        "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset; 0: never. "
-        "Default with a goal, if photographs are held out or there is no --views.",
-    ),
-]
 
 
 @reads_scenes
@@ -80,30 +67,15 @@ def compress(
     finetune: FinetuneOption = None,
     seed: SeedOption = None,
     unpacked: Annotated[bool, typer.Option("--unpacked", help="Write a folder instead of a zip.")] = False,
-    evaluate: Annotated[
-        bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
-    ] = False,
-    views: Annotated[
-        Path | None,
-        typer.Option(
-            "--views",
-            metavar="DATA",
-            help="Capture (COLMAP or transforms.json folder): training views give sensitivity and training targets, "
-            "held-out views evaluate. Default: virtual cameras.",
-        ),
-    ] = None,
+    evaluate: EvaluateOption = False,
+    views: ViewsOption = None,
     force_views: ForceViewsOption = False,
     cache: Annotated[
         bool, typer.Option("--cache", help="Cache the sensitivity next to the scene as NAME.sensitivity.npz.")
     ] = False,
-    checkpoint: Annotated[
-        bool,
-        typer.Option(
-            "--checkpoint", help="Save the state of --compact and --finetune next to the scene, and resume from it."
-        ),
-    ] = False,
+    checkpoint: CheckpointOption = False,
     origin: OriginOption = None,
-    device: Annotated[str, typer.Option(help="Device of --compact and --finetune: cpu or cuda.")] = "cpu",
+    device: DeviceOption = "cpu",
     ray: RayOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,

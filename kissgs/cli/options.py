@@ -125,8 +125,8 @@ ViewsOption = Annotated[
     typer.Option(
         "--views",
         metavar="DATA",
-        help="Capture with cameras and optionally photographs: a folder with a COLMAP model or a transforms.json. "
-        "Default: virtual cameras.",
+        help="Capture to work and evaluate with, cameras and optionally photographs: a folder with a COLMAP model or a "
+        "transforms.json. Default: virtual cameras.",
     ),
 ]
 ForceViewsOption = Annotated[
@@ -170,6 +170,33 @@ TimeOption = Annotated[
         help="Time for each scene, such as 30s, 2min or 1h: the best that is found in it. With a goal, which comes "
         "first, it bounds the search. --evaluate takes longer.",
     ),
+]
+CompactOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="BUDGET",
+        help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
+        "PSNR drop (0.2dB); 100% keeps all; auto searches the number that serves a goal best, which is the default "
+        "with held-out photographs, and without --views where it is fine-tuned.",
+    ),
+]
+FinetuneOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[STEPS]",
+        help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
+        "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset; 0: never. "
+        "Default with a goal, if photographs are held out or there is no --views.",
+    ),
+]
+EvaluateOption = Annotated[
+    bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
+]
+CheckpointOption = Annotated[
+    bool, typer.Option("--checkpoint", help="Save the state of training next to the scene, and resume from it.")
+]
+DeviceOption = Annotated[
+    str, typer.Option(help="Device of training: cpu (reproducible) or cuda (results vary slightly).")
 ]
 RayOption = Annotated[
     str | None,

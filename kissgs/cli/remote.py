@@ -11,8 +11,11 @@ import typer
 
 from kissgs.cli.files import for_each_input, print_json, show
 from kissgs.cli.options import (
+    CompactOption,
     ContainerOption,
+    EvaluateOption,
     FilesArgument,
+    FinetuneOption,
     ForceOption,
     MaxPsnrDropOption,
     MaxSsimDropOption,
@@ -32,22 +35,6 @@ if TYPE_CHECKING:
 ServerOption = Annotated[
     str, typer.Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="URL of the service.")
 ]
-CompactOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="BUDGET",
-        help="First reduce the number of Gaussians: 200k, 20% or 0.2dB; 100% keeps all; auto: the best for the goal, "
-        "the default where it is fine-tuned.",
-    ),
-]
-FinetuneOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="[STEPS]",
-        help="Fine-tune the quantised values on renderings of the scene; default with a goal. 0: never.",
-    ),
-]
-
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 
 app = typer.Typer(
@@ -76,9 +63,7 @@ def compress(
     max_ssim_drop: MaxSsimDropOption = None,
     compact: CompactOption = None,
     finetune: FinetuneOption = None,
-    evaluate: Annotated[
-        bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
-    ] = False,
+    evaluate: EvaluateOption = False,
     origin: OriginOption = None,
     force: ForceOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")] = False,

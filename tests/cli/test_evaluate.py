@@ -163,12 +163,6 @@ def test_errors_are_one_line(folder: Path, tmp_path: Path) -> None:
         (capture / "images" / "a.away").rename(capture / "images" / "a.png")
 
 
-def test_json_errors_have_a_code(folder: Path, tmp_path: Path) -> None:
-    done = run("evaluate", folder / "a.ply", folder / "b.zip", "--views", tmp_path, "--json")
-    assert done.returncode == 2
-    assert json.loads(done.stdout)["error"]["code"] == "invalid-views"
-
-
 @pytest.mark.quick(0)
 def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
     words = ["compress", folder / "a.ply", "-o", tmp_path / "a.zip", "--evaluate", "--views", folder / "capture"]

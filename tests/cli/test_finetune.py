@@ -55,13 +55,6 @@ def test_sog_is_fine_tuned_too(folder: Path, tmp_path: Path) -> None:
     assert len(kissgs.load(tmp_path / "b.sog")) == len(found.order)
 
 
-@pytest.mark.quick(0)
-def test_photographs_are_training_targets(folder: Path, tmp_path: Path) -> None:
-    words = ["compress", folder / "a.ply", "-o", tmp_path / "b.zip", "--finetune", "4", "--views", folder / "capture"]
-    report = json.loads(run(*words, *OPTIONS, "--json").stdout)["finetuning"]
-    assert (report["steps"], report["target_source"]) == (4, "photos")
-
-
 def test_the_default_number_of_steps_is_that_of_the_preset() -> None:
     assert with_default_values(["compress", "a.ply", "--finetune"]) == ["compress", "a.ply", "--finetune", "auto"]
     assert with_default_values(["--finetune", "a.ply", "-q"]) == ["--finetune", "auto", "a.ply", "-q"]

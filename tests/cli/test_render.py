@@ -192,12 +192,6 @@ def test_impossible_requests_are_refused(folder: Path, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_json_errors_have_a_code(folder: Path, tmp_path: Path) -> None:
-    done = run("render", folder / "a.ply", "-o", tmp_path / "a.png", "--view", "nobody", "--json")
-    assert done.returncode == 2
-    assert json.loads(done.stdout)["error"]["code"] == "invalid-views"
-
-
 def test_an_interrupted_animation_leaves_no_file(folder: Path, tmp_path: Path) -> None:
     words = ["render", folder / "a.ply", "--orbit", "--frames", "3600", "-o", tmp_path / "a.webp"]
     with subprocess.Popen([KISSGS, *map(str, words)], stderr=subprocess.PIPE) as process:
