@@ -15,32 +15,25 @@ BUDGETS = ("count", "ratio", "max_psnr_drop", "auto_count")
 class CompactSettings(TrainingViewSettings):
     """Settings of compaction: the number of Gaussians to keep, the pruning schedule and the training."""
 
-    count: int | None = Field(None, ge=1, description="Number of Gaussians to keep; a scene with fewer is unchanged.")
-    ratio: float | None = Field(None, gt=0, le=1, description="Share of the Gaussians to keep, up to 1.")
-    max_psnr_drop: float | None = Field(
-        None,
-        gt=0,
-        le=20,
-        description="Keep as few Gaussians as possible such that renderings of the held-out views lose at most this "
-        "PSNR, decibels. Takes several compactions. Without a capture, the loss is estimated at random poses from "
-        "which photographs might have been taken, as if the original scene had 30 dB to photographs.",
+    count: Annotated[int, Field(ge=1)] | None = Field(
+        None, description="Number of Gaussians to keep, if there are more."
+    )
+    ratio: Annotated[float, Field(gt=0, le=1)] | None = Field(None, description="Share of the Gaussians to keep.")
+    max_psnr_drop: Annotated[float, Field(gt=0, le=20)] | None = Field(
+        None, description="Keep as few Gaussians as lose at most this PSNR, decibels, measured as for that of encode."
     )
     auto_count: bool | None = Field(
         None,
-        description="Choose the number of Gaussians that meets the goal of encode best. Needs target_size, psnr, "
-        "max_psnr_drop or max_ssim_drop of encode. auto: with a goal other than psnr and held-out photographs, or with "
-        "fine-tuning and no capture, where torch is installed, unless count, ratio or max_psnr_drop is given.",
+        description="Choose the number of Gaussians that serves the goal of encode best. auto: with a goal other than "
+        "psnr, held-out photographs or fine-tuning without a capture, and torch, unless another budget is given.",
     )
     method: Literal["prune", "merge"] = Field(
         "prune",
         description="prune: remove the Gaussians that images miss least, and train the rest. merge: replace neighbours "
         "by one Gaussian with their mean, covariance, colour and opacity; no images, no cameras, no training.",
     )
-    max_compactions: int = Field(
-        3,
-        ge=1,
-        le=20,
-        description="With auto_count: largest number of containers that are made of trained scenes.",
+    max_compactions: Annotated[int, Field(ge=1, le=20)] = Field(
+        3, description="With auto_count: largest number of containers that are made of trained scenes."
     )
     min_keep_per_scoring: Annotated[float, Field(ge=0, le=0.99)] = of_preset(
         0.8, "Smallest share that pruning by one scoring may leave; deeper pruning scores again. 0: score once."

@@ -35,54 +35,33 @@ class EncodeSettings(StageSettings):
 
     rate_distortion: bool = of_preset(True, "Choose by squared image error plus lambda times bits, not uniform steps.")
     quality_offset_db: Annotated[float, Field(ge=-30, le=30)] = Field(
-        0.0,
-        description="PSNR to aim at, decibels above the estimated quality of preset paper or "
-        "fast on the same scene, whichever is better.",
+        0.0, description="PSNR to aim at, decibels above that of preset paper or fast, whichever is better here."
     )
-    rd_lambda: float | None = Field(
+    rd_lambda: Annotated[float, Field(gt=0, lt=1)] | None = Field(
+        None, description="Lambda, squared image error per bit; auto: from quality_offset_db."
+    )
+    psnr: Annotated[float, Field(gt=0, le=200)] | None = Field(
         None,
-        gt=0,
-        lt=1,
-        description="Lambda, squared image error per bit, instead of quality_offset_db; auto: from quality_offset_db.",
+        description="Search for the smallest container with at least this PSNR to renderings of the scene, decibels; a "
+        "view counts for at most 60.",
     )
-    psnr: float | None = Field(
+    target_size: Annotated[Size, Field(ge=1)] | None = Field(
         None,
-        gt=0,
-        le=200,
-        description="Search for the smallest container with at least this PSNR to renderings "
-        "of the scene, decibels, at held-out views or, without a capture, at random cameras other than those of "
-        "'evaluate'. A view counts for at most 60 dB. Takes a few encodings.",
+        description="Search for the best container of at most this size, bytes, such as 800kB or 2.5MB; with a limit "
+        "of quality, for the smallest container of that quality, which then must not be larger.",
     )
-    target_size: Size | None = Field(
+    max_psnr_drop: Annotated[float, Field(gt=0, le=20)] | None = Field(
         None,
-        ge=1,
-        description="Search for the best container of at most this size, bytes, such as 800kB "
-        "or 2.5MB; the result is usually within 3 % below it. Takes a few encodings. With psnr, max_psnr_drop or "
-        "max_ssim_drop, the smallest container of that quality, which then must have at most this size.",
+        description="Search for the smallest container that loses at most this PSNR to held-out photographs, decibels; "
+        "without a capture at poses from which they might have been taken, as if the scene had 30 dB to them.",
     )
-    max_psnr_drop: float | None = Field(
+    max_ssim_drop: Annotated[float, Field(gt=0, le=1)] | None = Field(
         None,
-        gt=0,
-        le=20,
-        description="Search for the smallest container whose renderings of the held-out views "
-        "lose at most this PSNR, decibels. Takes a few encodings. Without a capture, the loss is estimated at random "
-        "poses from which photographs might have been taken, as if the original scene had 30 dB to photographs.",
+        description="Search for the smallest container that loses at most this SSIM to held-out photographs; without a "
+        "capture to renderings of the scene, at poses from which they might have been taken.",
     )
-    max_ssim_drop: float | None = Field(
-        None,
-        gt=0,
-        le=1,
-        description="Search for the smallest container whose renderings of the held-out views "
-        "lose at most this SSIM to the photographs; without a capture, SSIM to renderings of the scene is at least 1 "
-        "minus this, at random poses from which photographs might have been taken. Takes a few encodings.",
-    )
-    max_encodes: int = Field(
-        10,
-        ge=1,
-        le=100,
-        description="With a goal: largest number of containers that are made of one scene. With fine-tuning, up to as "
-        "many fine-tuned ones, at most three, are added, and one at the finest or coarsest lambda if several missed "
-        "the goal.",
+    max_encodes: Annotated[int, Field(ge=1, le=100)] = Field(
+        10, description="With a goal: largest number of containers made of one scene, beside fine-tuned ones."
     )
     prune_threshold_bits: Bits = of_preset(18.0, "Prune what is worth fewer bits, times 1 - view_uncertainty.")
     step_classes: Annotated[int, Field(ge=1, le=32)] = of_preset(3, "Classes of sensitivity, each with its own steps.")

@@ -36,9 +36,8 @@ class Settings(StageSettings):
         gt=0,
         le=1e6,
         description="Seconds that a compression may take, or 30s, 2min, 1h. A goal comes first: then time bounds the "
-        "search. Without a goal: with photographs and torch, the smallest container found that loses at most 0.1 dB, "
-        "or as little as time allows; else the preset, or fast if that takes too long. The same bytes are made again "
-        "only where the machine is equally fast.",
+        "search. Without a goal: with photographs and torch, the smallest container found that loses at most 0.1 dB; "
+        "else the preset, or fast if that takes too long. Equal bytes need equally fast machines.",
     )
     compact: CompactSettings = Field(default_factory=CompactSettings)
     encode: EncodeSettings = Field(default_factory=EncodeSettings)

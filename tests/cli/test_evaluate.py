@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -178,22 +177,6 @@ def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
     assert f"{figures} to 1 held-out photograph; the scene itself {scene};" in text
     run(*[word for word in words if word != "--evaluate"], "--force")
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
-
-
-@pytest.mark.quick(0)
-def test_compressing_evaluates_on_drawn_cameras_by_default(tmp_path: Path) -> None:
-    stages: list[str] = []
-    result = kissgs.compress(
-        SCENE, tmp_path / "a.zip", evaluate=True, progress=lambda stage, fraction: stages.append(stage)
-    )
-    assert result.report.evaluation is not None
-    assert result.report.evaluation.against == "renderings"
-    assert 20 < result.report.evaluation.mean.candidate_vs_reference.psnr < math.inf
-    assert list(dict.fromkeys(stages))[-2:] == ["evaluate", "write"]
-    assert result.report.seconds["evaluate"] > 0
-    report = json.loads(json.dumps(result.report.as_dict(), allow_nan=False))
-    assert report["evaluation"]["count"]["reference"] == 1500
-    assert kissgs.compress(SCENE).report.as_dict()["evaluation"] is None
 
 
 def test_cancelling_the_evaluation_writes_nothing(tmp_path: Path) -> None:
