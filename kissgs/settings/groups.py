@@ -83,6 +83,15 @@ class Settings(StageSettings):
             encode = encode.model_copy(update={"max_psnr_drop": AIMED_DROP})
         return self.model_copy(update={"compact": compact, "encode": encode, "finetune": finetune})
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the settings as JSON that is valid again, also where a search has changed values of the preset."""
+        values = self.model_dump(mode="json")
+        try:
+            type(self).model_validate(values)
+        except ValidationError:
+            values["for_research"] = True
+        return values
+
     @model_validator(mode="after")
     def _a_goal_to_go_by(self) -> Self:
         if self.compact.auto_count and self.compact.method == "merge":

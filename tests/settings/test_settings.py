@@ -57,6 +57,14 @@ def test_settings_survive_json(preset, made):
         assert Settings.model_validate_json(chosen.model_dump_json()) == chosen
 
 
+def test_what_a_search_has_changed_is_valid_again():
+    """A report states the values of the last container, such as another threshold for pruning."""
+    plain = Settings()
+    used = plain.model_copy(update={"encode": plain.encode.model_copy(update={"prune_threshold_bits": 50.0})})
+    assert Settings.model_validate(used.as_json()).encode == used.encode
+    assert plain.as_json() == plain.model_dump(mode="json")
+
+
 def test_one_seed_is_for_everything():
     chosen = Settings.from_preset("balanced", seed=7)
     assert (chosen.encode.seed, chosen.compact.seed, chosen.finetune.seed) == (7, 7, 7)
