@@ -109,7 +109,7 @@ def training_steps(model: GaussianModel, camera: Camera) -> list[float]:
         "measure",
         Pace(REPEATS + 1),
         lambda done: NO_RATES,
-        ssim_weight=settings.used_ssim_weight,
+        ssim_weight=settings.ssim_weight,
         mse_weight=settings.mse_weight,
         seed=(0,),
     )

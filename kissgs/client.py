@@ -369,7 +369,7 @@ def _checked(response: httpx.Response) -> httpx.Response:
         return response
     try:
         problem = response.json()
-        hint = "; set KISSGS_KEY or give --key" if problem["code"] == "unauthorized" else ""
+        hint = "; set KISSGS_KEY (in Python key)" if problem["code"] == "unauthorized" else ""
         error = _error({"code": problem["code"], "detail": problem["detail"] + hint})
     except (ValueError, KeyError, TypeError):
         error = RemoteError(

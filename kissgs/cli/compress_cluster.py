@@ -32,16 +32,8 @@ if TYPE_CHECKING:
 def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
     """Compress a scene into a new folder within the work folder, from where whoever submitted it moves the result.
 
-    Args:
-        arguments: "scene" and its size "bytes", the work folder "work", the path "target" for which the output is
-            made, and arguments of :func:`kissgs.compress`; "width" and "color" of the terminal.
-        progress: receives the stages.
-
     Returns:
         "written", the path of the output; "report" for JSON; "table", the report as text for the terminal.
-
-    Raises:
-        KissgsError: as :func:`kissgs.compress`, or the files are not on storage that this machine shares.
     """
     from kissgs.cli.options import open_views
     from kissgs.pipeline.pipeline import compress
@@ -129,10 +121,6 @@ class ClusterCompression:
     All scenes are submitted at once, and their results are awaited in order. An item writes below a work folder beside
     its output, and the result is moved from there when its outcome has arrived: a node may be lost at any moment, and
     nothing is written twice or in part.
-
-    Attributes:
-        address: address of the cluster.
-        options: the command's options.
     """
 
     address: str
@@ -143,14 +131,7 @@ class ClusterCompression:
 
     @contextlib.contextmanager
     def submitted(self, inputs: list[tuple[str, Path]]) -> Iterator[None]:
-        """Connect to the cluster and submit all scenes, given each with the path of its output.
-
-        The end of the context cancels what has not ended.
-
-        Raises:
-            UnsupportedError: an input or output has no path, or no node has the resources.
-            RunnerError: the cluster cannot be reached.
-        """
+        """Connect to the cluster and submit all scenes; the end of the context cancels what has not ended."""
         if any("-" in (name, str(target)) for name, target in inputs):
             raise UnsupportedError("--ray needs files that all machines see, not standard input or output")
         with progress_bar(self.options.quiet) as bar:
@@ -172,11 +153,7 @@ class ClusterCompression:
                     shutil.rmtree(work, ignore_errors=True)
 
     def result(self, name: str, target: Path) -> dict[str, Any]:
-        """Wait for the result of one scene, move it to its place, show its table and return its report.
-
-        Raises:
-            KissgsError: the scene could not be compressed.
-        """
+        """Wait for the result of one scene, move it to its place, show its table and return its report."""
         handle = self._handles[target]
         if isinstance(handle, KissgsError):
             raise handle
@@ -195,10 +172,7 @@ class ClusterCompression:
         return report
 
     def _request(self, runner: Runner, count: int) -> Resources:
-        """Return the processors and GPUs that each of ``count`` scenes requests.
-
-        Without ``--threads``, all processors of the cluster are shared among the scenes.
-        """
+        """Return the processors and GPUs of each of ``count`` scenes, which share all without ``--threads``."""
         stats = runner.stats()
         share = min(stats.smallest_cpus, stats.cpus // count)
         cpus = self.options.threads or max(1, int(share))
@@ -247,11 +221,7 @@ class ClusterCompression:
         return runner.submit(WorkItem("kissgs.cli.compress_cluster:compress_scene", arguments, resources), progress)
 
     def _with_memory(self, runner: Runner, requested: Resources, memory: int) -> Resources:
-        """Return a request with memory, at most that of the largest node that has the rest of it.
-
-        Raises:
-            UnsupportedError: no node has the resources any more.
-        """
+        """Return a request with memory, at most that of the largest node that has the rest of it."""
         nodes = [node.total.memory for node in runner.stats().nodes if requested.fits(node.total)]
         resources = Resources(requested.cpus, min(memory, max(nodes, default=0)), requested.gpus)
         if refusal := runner.refusal(resources):

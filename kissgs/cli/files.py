@@ -38,17 +38,8 @@ def for_each_input(
     """Call ``work`` for every input. If one of several fails, the others are still processed; the exit code is then 2.
 
     A folder that is made for the outputs stays if all inputs fail: another command may be about to write into it.
-
-    Args:
-        names: inputs as given: paths, patterns or "-".
-        output: value of ``--output``, as text if a slash at its end counts; None if not given.
-        suffix: file ending of the outputs.
-        as_json: whether to print reports as JSON.
-        work: processes one input, given the path of its output, and returns the report.
-        writes: whether the command writes outputs.
-        unreadable: error class for an input that cannot be read.
-        during: receives all inputs and outputs; its context is entered before the first call of ``work``, and left
-            after the last one.
+    ``work`` gets an input and the path of its output, and returns the report; the context of ``during``, which gets all
+    of them, encloses its calls. A slash at the end of ``output`` names a folder.
     """
     inputs = expand(names)
     if writes and output is None:

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from kissgs.core.origin import relative_to
 from kissgs.core.splats import CLEANED_TEXTS
+from kissgs.evaluation.capture_fit import USUAL_PSNR
 from kissgs.evaluation.html import ReportScene
 from kissgs.evaluation.metric_text import format_metric
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics
@@ -312,6 +313,15 @@ def evaluation_table(
     """Format the output of ``kissgs evaluate``; ``asked`` is the value of ``--split``."""
     what = Text(f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}")
     notes = [Text(evaluation.note, "yellow")] if evaluation.note else []
+    own = evaluation.mean.reference
+    if own is not None and own.psnr < USUAL_PSNR:
+        notes.append(
+            Text(
+                f"the photographs differ much from renderings of {reference.name}: PSNR {own.psnr:.1f} dB, where more "
+                f"than {USUAL_PSNR:g} are usual",
+                "yellow",
+            )
+        )
     if evaluation.split == "train" != asked:
         notes.append(Text("no view is held out: the scene may have been trained on these views", "yellow"))
     views = [_views(evaluation), *_other_means(evaluation.mean)]

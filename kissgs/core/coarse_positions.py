@@ -19,6 +19,8 @@ COARSE_SHARE = 0.01
 CONTAINER_LEVELS = (1 << 16) - 1
 """Steps between the smallest and the largest signed logarithm of a container's positions."""
 
+ORIGIN = '--origin auto (in Python origin="auto")'
+
 STREAMED_REMEDY = "no origin helps here, but compressing into FOLDER/lod-meta.json does, whose parts have fine steps"
 """Remedy for coarse positions where no origin helps: streamed SOG."""
 
@@ -71,16 +73,16 @@ def coarse_note(
         return coarse_in_chunks(rows, cuts_without_coarse(rows, Cuts.of(rows[:, :3], 0), count))
 
     remedies: dict[str, Callable[[], float]] = {
-        "origin=auto moves the scene there": lambda: float(
+        f"{ORIGIN} moves the scene there": lambda: float(
             coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean()
         ),
         STREAMED_REMEDY: lambda: coarse_in_parts(wide),
-        "compressing into FOLDER/lod-meta.json with origin=auto gives its parts fine steps": lambda: coarse_in_parts(
+        f"compressing into FOLDER/lod-meta.json with {ORIGIN} gives its parts fine steps": lambda: coarse_in_parts(
             near
         ),
     }
     helpful = (name for name, coarse in remedies.items() if coarse() <= COARSE_SHARE)
-    remedy = next(helpful, "compress objects so far apart into files of their own, with origin=auto")
+    remedy = next(helpful, f"compress objects so far apart into files of their own, with {ORIGIN}")
     return (
         f"positions have steps of about {step:.2g}, too coarse for {share:.0%} of the Gaussians, because a container "
         f"has fine steps only near the origin: {remedy}"

@@ -331,7 +331,7 @@ def _settings_as_used(decided: Settings, used: EncodeSettings, requested: Settin
         auto_count, tuned = requested.compact.auto_count, requested.finetune.enabled
         groups["compact"] = decided.compact.model_copy(update={"auto_count": auto_count})
         groups["finetune"] = decided.finetune.model_copy(update={"enabled": tuned})
-    return decided.model_copy(update=groups).model_dump(mode="json")
+    return decided.model_copy(update=groups).as_json()
 
 
 class _Common(TypedDict):

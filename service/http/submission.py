@@ -116,7 +116,9 @@ def parse_options(text: str | bytes) -> JobOptions:
     except ValidationError as error:
         named, found = field_errors(error.errors())
         raise ProblemError(
-            "invalid-request", f"the options are invalid: {named}; GET /v1/presets lists all settings", errors=found
+            "invalid-request",
+            f"the options are invalid: {named}; JobOptions in /openapi.json lists all settings",
+            errors=found,
         ) from error
     if options.trains and not can_train():
         raise ProblemError(

@@ -202,7 +202,7 @@ def test_a_file_that_is_no_checkpoint_is_not_overwritten(tmp_path):
 def test_without_training_the_checkpoint_file_is_not_touched(tmp_path, compact):
     path = tmp_path / "thesis.npz"
     path.write_text("years of work")
-    fast = kissgs.Settings.from_preset("fast", compact=compact)
+    fast = kissgs.Settings.research("fast", compact=compact)
     kissgs.compress(cloud(50), tmp_path / "o.zip", settings=fast, checkpoint=path)
     assert path.read_text() == "years of work"
 

@@ -17,7 +17,7 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 def check(splats, preset="fast", **changes):
     """Assert a finite result within the errors that the report states; return the decoded scene and the result."""
-    result = compress(splats, settings=Settings.from_preset(preset, **{"sh_tolerance": 0, **GLANCE, **changes}))
+    result = compress(splats, settings=Settings.research(preset, **{"sh_tolerance": 0, **GLANCE, **changes}))
     found = decompress(result.files)
     assert all(np.isfinite(getattr(found, name)).all() for name in ATTRIBUTES)
     reference_decoder.assert_equal_scenes(found, reference_decoder.decode(result.files), result.files)

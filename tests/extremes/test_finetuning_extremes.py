@@ -14,7 +14,7 @@ QUICK = {"enabled": True, "steps": 25, "lr": 0.1, "view_size": 48}
 
 
 def check(scene, preset="balanced", container="sogxt", **changes):
-    settings = Settings.from_preset(preset, finetune={**QUICK, **changes}, sensitivity_view_size=48)
+    settings = Settings.research(preset, finetune={**QUICK, **changes}, sensitivity_view_size=48)
     views = Views(around(5), around(3), black(), "circle")
     result = kissgs.compress(scene, settings=settings, views=views, container=container)
     found = kissgs.decompress(result.to_zip())

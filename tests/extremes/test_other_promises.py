@@ -23,7 +23,7 @@ from kissgs.training.optimizer import PrunableAdam
 
 
 def compressed(splats, preset="fast"):
-    return kissgs.compress(splats, settings=Settings.from_preset(preset, **GLANCE))
+    return kissgs.compress(splats, settings=Settings.research(preset, **GLANCE))
 
 
 def test_steps_of_a_world_1e6_across():

@@ -45,7 +45,7 @@ def tuned(scene, *, checkpoint=None, progress=None, preset="fast", encode=COARSE
     work = tuner(scene, **changes)
     if progress is not None:
         work = replace(work, progress=progress)
-    settings = Settings.from_preset(preset, **encode).encode
+    settings = Settings.research(preset, **encode).encode
     plan = chosen(scene, preset, **encode)
     return work(plan, plan, scene, written(scene, settings), checkpoint)
 
@@ -130,7 +130,7 @@ def test_a_worse_container_is_not_kept():
     assert not report.kept
     assert "did not help" in report.note
     assert report.psnr_after < report.psnr_before
-    settings = Settings.from_preset("fast", **COARSE).encode
+    settings = Settings.research("fast", **COARSE).encode
     assert encoded.files == written(scene, settings)(chosen(scene, "fast", **COARSE), 0, silent).files
 
 
@@ -143,7 +143,7 @@ def test_the_result_depends_on_the_seed_but_not_on_threads(batch):
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
         work = replace(tuner(scene, batch=batch, size=140, view_size=160, **GENTLE), threads=threads)
-        settings = Settings.from_preset("fast", **COARSE).encode
+        settings = Settings.research("fast", **COARSE).encode
         plan = chosen(scene, "fast", **COARSE)
         found.append(work(plan, plan, scene, written(scene, settings))[0].files)
     torch.set_num_threads(before)
@@ -197,7 +197,7 @@ def test_training_continues_if_a_checkpoint_cannot_be_saved(tmp_path, monkeypatc
 
 
 def test_compress_fine_tunes_and_reports_it(tmp_path):
-    settings = Settings.from_preset("fast", finetune=SHORT)
+    settings = Settings.research("fast", finetune=SHORT)
     result = kissgs.compress(cloud(200), tmp_path / "a.zip", settings=settings, checkpoint=tmp_path / "c.npz")
     report = result.report
     assert report.finetuning.steps == 12
@@ -227,7 +227,7 @@ def test_more_gaussians_are_pruned_before_fine_tuning(monkeypatch, encode, finet
 
     def compressed(threshold, tuning=None):
         return kissgs.compress(
-            scene, settings=Settings.from_preset("balanced", **common, prune_threshold_bits=threshold, finetune=tuning)
+            scene, settings=Settings.research("balanced", **common, prune_threshold_bits=threshold, finetune=tuning)
         )
 
     found = compressed(encode, SHORT | {"prune_threshold_bits": finetune})
@@ -241,9 +241,9 @@ def test_more_gaussians_are_pruned_before_fine_tuning(monkeypatch, encode, finet
 @pytest.mark.quick(0)
 def test_the_fine_tuned_container_meets_a_target_size():
     scene = cloud(600, 1)
-    plain = kissgs.compress(scene, settings=Settings(encode={"sensitivity_views": 4, "sensitivity_view_size": 60}))
+    plain = kissgs.compress(scene, settings=Settings.research(sensitivity_views=4, sensitivity_view_size=60))
     size = int(0.8 * plain.report.container_bytes)
-    settings = Settings.from_preset(
+    settings = Settings.research(
         "balanced", finetune={**SHORT, **GENTLE}, target_size=size, sensitivity_views=4, sensitivity_view_size=60
     )
     found = kissgs.compress(scene, settings=settings)
@@ -256,7 +256,7 @@ def test_the_fine_tuned_container_meets_a_target_size():
 def test_the_order_is_refined_for_the_trained_levels_too(monkeypatch):
     """The order that is reported is that of the container; each refinement is a stage of its own."""
     scene, stages = cloud(500, 1), []
-    settings = Settings.from_preset("fast", order="refined", finetune={**SHORT, **GENTLE})
+    settings = Settings.research("fast", order="refined", finetune={**SHORT, **GENTLE})
     monkeypatch.setattr("kissgs.finetuning.tune._Result.cost", lambda result, rd_lambda: result.bytes)
     found = kissgs.compress(scene, settings=settings, progress=lambda stage, *rest: stages.append(stage))
     assert found.report.finetuning.kept
@@ -275,7 +275,7 @@ def test_a_target_size_is_met_if_fine_tuned_containers_are_too_large(monkeypatch
 
     monkeypatch.setattr("kissgs.pipeline.rate_control.stored_sizes", sizes)
     common = {"target_size": 1000, "sensitivity_views": 4, "sensitivity_view_size": 60}
-    gentle = Settings.from_preset("balanced", finetune={**SHORT, **GENTLE}, **common)
+    gentle = Settings.research("balanced", finetune={**SHORT, **GENTLE}, **common)
     found = kissgs.compress(cloud(60), settings=gentle)
     assert b"finetune" not in found.files[YAML_NAME]
     assert not found.report.finetuning.kept
@@ -286,7 +286,7 @@ def test_a_target_size_is_met_if_fine_tuned_containers_are_too_large(monkeypatch
 def test_a_search_does_not_change_existing_checkpoints(tmp_path):
     (tmp_path / "c-finetune.npz").write_bytes(b"mine")
     whole = {"auto_count": False}  # the search for the number of Gaussians refuses a checkpoint
-    settings = Settings.from_preset(
+    settings = Settings.research(
         "balanced", finetune=SHORT, compact=whole, target_size=50_000, sensitivity_views=4, sensitivity_view_size=60
     )
     found = kissgs.compress(cloud(60), tmp_path / "a.zip", settings=settings, checkpoint=tmp_path / "c.npz")
@@ -327,9 +327,7 @@ def test_a_psnr_goal_is_rejected_if_photographs_are_the_targets(tmp_path):
     for view in around(3):
         Image.new("RGB", (view.camera.width, view.camera.height)).save(tmp_path / f"{view.name}.png")
         views.append(replace(view, photo=tmp_path / f"{view.name}.png"))
-    settings = Settings.from_preset(
-        "balanced", finetune=SHORT, psnr=30.0, sensitivity_views=4, sensitivity_view_size=60
-    )
+    settings = Settings.research("balanced", finetune=SHORT, psnr=30.0, sensitivity_views=4, sensitivity_view_size=60)
     with pytest.raises(UnsupportedError, match="give a target size"):
         kissgs.compress(cloud(60), settings=settings, views=Views(tuple(views), (), black(), "photos"))
 
@@ -339,7 +337,7 @@ def test_a_psnr_goal_is_rejected_if_photographs_are_the_targets(tmp_path):
 def test_scenes_of_no_or_one_gaussian(count):
     scene = cloud(9).select(np.arange(count))
     for preset in ("fast", "balanced"):
-        result = kissgs.compress(scene, settings=Settings.from_preset(preset, finetune=SHORT))
+        result = kissgs.compress(scene, settings=Settings.research(preset, finetune=SHORT))
         assert (result.report.finetuning is None) == (count == 0)
         assert len(decompress(result.to_zip())) == count
 
@@ -348,7 +346,7 @@ def test_an_antialiased_scene_is_fine_tuned_with_the_opacities_that_its_images_s
     """Training on other images would make all of its small Gaussians fainter."""
     scene = cloud(200)
     scene = replace(scene, scales=scene.scales - np.float32(1.5), antialiased=True)
-    result = kissgs.compress(scene, settings=Settings.from_preset("fast", finetune=SHORT))
+    result = kissgs.compress(scene, settings=Settings.research("fast", finetune=SHORT))
     report = result.report.finetuning
     assert report.psnr_before > 35
     assert report.psnr_after > report.psnr_before - 5  # the levels of so few steps; 12 less with the wrong images

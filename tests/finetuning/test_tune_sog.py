@@ -34,7 +34,7 @@ def tuner(scene, **changes):
 
 def written(scene):
     def files(plan, steps, progress):
-        return write_files(plan, Settings.from_preset("fast", **COARSE).encode, threads=1)
+        return write_files(plan, Settings.research("fast", **COARSE).encode, threads=1)
 
     return files
 
@@ -108,12 +108,12 @@ def test_a_checkpoint_belongs_to_one_container_and_its_tables(tmp_path, monkeypa
 @pytest.mark.quick(2)
 def test_compress_fine_tunes_sog_of_every_degree(tmp_path, degree):
     scene = cloud(120, degree)
-    settings = Settings.from_preset("fast", finetune=SHORT, **COARSE)
+    settings = Settings.research("fast", finetune=SHORT, **COARSE)
     result = kissgs.compress(scene, tmp_path / "a.sog", settings=settings)
     report = result.report.finetuning
     assert report.steps == 12
     assert result.report.container_bytes == (report.bytes_after if report.kept else report.bytes_before)
-    plain = kissgs.compress(scene, settings=Settings.from_preset("fast", **COARSE), container="sog")
+    plain = kissgs.compress(scene, settings=Settings.research("fast", **COARSE), container="sog")
     assert (result.files == plain.files) == (not report.kept)
     found, other = kissgs.load(tmp_path / "a.sog"), read_files(result.files)
     assert found.sh_degree == degree
@@ -125,9 +125,9 @@ def test_compress_fine_tunes_sog_of_every_degree(tmp_path, degree):
 def test_a_fine_tuned_container_meets_a_target_size():
     common = {"sensitivity_views": 4, "sensitivity_view_size": 60}
     scene = cloud(600, 1)
-    plain = kissgs.compress(scene, settings=Settings(encode=common), container="sog")
+    plain = kissgs.compress(scene, settings=Settings.research(**common), container="sog")
     size = int(0.8 * plain.report.container_bytes)
-    settings = Settings.from_preset("balanced", finetune={**SHORT, "lr": 0.05}, target_size=size, **common)
+    settings = Settings.research("balanced", finetune={**SHORT, "lr": 0.05}, target_size=size, **common)
     found = kissgs.compress(scene, settings=settings, container="sog")
     assert found.report.container_bytes <= size
     assert found.report.finetuning is not None
@@ -138,5 +138,5 @@ def test_a_fine_tuned_container_meets_a_target_size():
 def test_scenes_of_few_gaussians(count):
     scene = cloud(9).select(np.arange(count))
     for preset in ("fast", "balanced"):
-        result = kissgs.compress(scene, settings=Settings.from_preset(preset, finetune=SHORT), container="sog")
+        result = kissgs.compress(scene, settings=Settings.research(preset, finetune=SHORT), container="sog")
         assert len(decompress(result.to_zip())) == count

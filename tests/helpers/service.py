@@ -32,7 +32,9 @@ SMALL = scene_bytes()
 """Scene whose job takes hardly longer than the start of its process."""
 
 FAST = json.dumps({"preset": "fast"})
-SLOW = json.dumps({"preset": "paper", "encode": {"plas_radius_decay": 0.99, "sh_kmeans_iterations": 50}})
+SLOW = json.dumps(
+    {"preset": "paper", "encode": {"plas_radius_decay": 0.99, "sh_kmeans_iterations": 50}, "for_research": True}
+)
 """Settings that keep a worker busy."""
 
 

@@ -12,7 +12,7 @@ from kissgs.sogxt import streamed as streamed_sogxt
 from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.streaming import build
 
-ALL = Settings.from_preset("fast", prune_invisible=False)
+ALL = Settings.research("fast", prune_invisible=False)
 FAST = Settings.from_preset("fast")
 
 

@@ -35,7 +35,7 @@ TUNED = FinetuneReport(
 
 def settings(compact=None, finetune=None, **goal):
     finetune = finetune or {"enabled": False}
-    return Settings.from_preset("balanced", compact=compact, finetune=finetune, **FEW_VIEWS, **goal)
+    return Settings.research("balanced", compact=compact, finetune=finetune, **FEW_VIEWS, **goal)
 
 
 def stop_at(wanted, number=1):
@@ -110,9 +110,7 @@ def test_an_empty_scene_takes_bytes_too(goal, message):
 
 def test_the_smallest_is_best_with_or_without_fine_tuning():
     """The goal is a PSNR; the report says that fine-tuning was in vain."""
-    small, large = (
-        encode(SCENE, Settings.from_preset("fast", scale_step=step).encode, threads=1) for step in (0.2, 0.1)
-    )
+    small, large = (encode(SCENE, Settings.research("fast", scale_step=step).encode, threads=1) for step in (0.2, 0.1))
     wanted = settings(psnr=20.0).encode
     search = RateControl(SCENE, wanted, SearchEvaluation(SCENE, None, 1), 1, SearchNote(silent))
     search.run(lambda chosen: Container(small, chosen))
@@ -156,9 +154,7 @@ def test_no_goal_is_met_if_an_object_is_lost(goal):
 @pytest.mark.parametrize("worse", [True, False])
 def test_the_highest_psnr_is_best_if_the_goal_is_a_size(worse):
     """A fine-tuned container below the target size may be worse than one that is not fine-tuned."""
-    small, large = (
-        encode(SCENE, Settings.from_preset("fast", scale_step=step).encode, threads=1) for step in (0.2, 0.1)
-    )
+    small, large = (encode(SCENE, Settings.research("fast", scale_step=step).encode, threads=1) for step in (0.2, 0.1))
     search = RateControl(
         SCENE, settings(target_size=10**6).encode, SearchEvaluation(SCENE, None, 1), 1, SearchNote(silent)
     )
@@ -175,7 +171,7 @@ def test_the_reported_settings_reproduce_the_container(goal):
     report = found.report.settings["encode"]
     assert {name: report[name] for name in goal} == goal
     again = {**report, "psnr": None, "max_psnr_drop": None, "rd_lambda": found.report.rd_lambda}
-    assert kissgs.compress(SCENE, settings=Settings(encode=again)).to_zip() == found.to_zip()
+    assert kissgs.compress(SCENE, settings=Settings.research(**again)).to_zip() == found.to_zip()
 
 
 def test_infinity_is_null_in_json():

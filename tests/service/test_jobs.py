@@ -37,7 +37,7 @@ def test_submitting_a_form(service, first):
 
 
 def test_fewer_gaussians(service):
-    options = {"preset": "fast", "compact": {"ratio": 0.5, "views": 24, "view_size": 48}}
+    options = {"preset": "fast", "compact": {"ratio": 0.5, "views": 24, "view_size": 48}, "for_research": True}
     status = service.ended(service.submit(options=json.dumps(options)))
     expected = kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(options))
     assert (status["compacted"], status["kept"]) == (150, expected.report.count)
@@ -48,7 +48,8 @@ def test_fewer_gaussians(service):
 
 def test_training_in_a_job(service):
     changes = {"count": 100, "sparsify_steps": 4, "refine_steps": 4, "views": 24, "view_size": 48}
-    status = service.ended(service.submit(options=json.dumps({"preset": "fast", "compact": changes})))
+    options = {"preset": "fast", "compact": changes, "for_research": True}
+    status = service.ended(service.submit(options=json.dumps(options)))
     assert (status["state"], status["compacted"]) == ("succeeded", 200)
     assert status["timings"]["stages"].keys() >= {"score", "targets", "sparsify", "refine"}
 
@@ -91,7 +92,7 @@ def test_goals_and_count_search(service):
         "view_size": 48,
     }
     options = {"encode": {"target_size": "6kB", "sensitivity_views": 4, "sensitivity_view_size": 48}, "compact": prune}
-    options["finetune"] = {"enabled": False}
+    options |= {"finetune": {"enabled": False}, "for_research": True}
     assert not parse_options(json.dumps(options)).resumable
     status = service.ended(service.submit(options=json.dumps(options)))
     assert status["state"] == "succeeded", status
@@ -103,6 +104,7 @@ def test_goals_and_count_search(service):
         "encode": {"max_psnr_drop": 0.5, "sensitivity_views": 4},
         "compact": few,
         "finetune": {"steps": 4, **few},
+        "for_research": True,
     }
     assert parse_options(json.dumps(options)).kind == "balanced+compact+finetune+search"
     lost = service.ended(service.submit(options=json.dumps(options)))

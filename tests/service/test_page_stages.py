@@ -61,7 +61,8 @@ def in_node(options, *, gaussians=300, sh_degree=1, training=True):
 @pytest.mark.parametrize("name", JOBS)
 @pytest.mark.quick(2)
 def test_expected_stages(name, tmp_path):
-    options, scene, reported = parse_options(json.dumps(JOBS[name])), tmp_path / "scene.ply", []
+    options = parse_options(json.dumps({**JOBS[name], "for_research": True}))
+    scene, reported = tmp_path / "scene.ply", []
     scene.write_bytes(SMALL)
     settings = kissgs.Settings.model_validate(options.model_dump(exclude={"format", "evaluate", "origin"}))
     kissgs.compress(

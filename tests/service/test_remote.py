@@ -54,7 +54,7 @@ def test_training_notes_are_received(service, scene, tmp_path):
         remote.compress(
             scene,
             tmp_path / "x.zip",
-            settings=kissgs.Settings.from_preset("fast", compact=changes),
+            settings=kissgs.Settings.research("fast", compact=changes),
             progress=lambda *event: received.append(event),
         )
     notes = {stage: note for stage, _, *optional in received for note in optional}

@@ -23,7 +23,7 @@ pytest.importorskip("torch")
 
 def options(steps):
     changes = {"count": 100, "sparsify_steps": steps, "refine_steps": steps, "views": 24, "view_size": 48}
-    return {"preset": "fast", "compact": changes}
+    return {"preset": "fast", "compact": changes, "for_research": True}
 
 
 STEPS = 8
@@ -204,7 +204,8 @@ def test_training_notes(start_held):
     assert any(data.get("note") == note for data in sent)
 
 
-FINETUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": STEPS, "views": 24, "view_size": 48}}
+TUNING = {"enabled": True, "steps": STEPS, "views": 24, "view_size": 48}
+FINETUNED = {"preset": "fast", "finetune": TUNING, "for_research": True}
 
 
 @pytest.mark.quick(0)

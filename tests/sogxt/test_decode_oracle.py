@@ -14,7 +14,7 @@ COUNTS = (0, 1, 7, 8, 9, 63, 64, 65, 1000)
 
 
 def encoded(splats, preset, **settings):
-    return compress(splats, settings=Settings.from_preset(preset, **GLANCE, **settings)).files
+    return compress(splats, settings=Settings.research(preset, **GLANCE, **settings)).files
 
 
 def check(files):

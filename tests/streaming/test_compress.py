@@ -130,7 +130,7 @@ def test_work_of_other_settings_is_not_continued(scene, tmp_path):
 
     with pytest.raises(Stop):
         compress_streamed(scene, target, settings=FAST, progress=stop)
-    other = Settings.from_preset("fast", sh0_step=0.1)
+    other = Settings.research("fast", sh0_step=0.1)
     with pytest.raises(OutputError, match=r"city\.partial belongs to other or older work; delete it"):
         compress_streamed(scene, target, settings=other)
     shutil.rmtree(tmp_path / "city.partial")
@@ -250,7 +250,7 @@ def test_a_streamed_scene_is_replaced_only_if_allowed(scene, target, tmp_path):
     compress_streamed(scene, target, settings=FAST)
     with pytest.raises(OutputError, match="exists already"):
         compress_streamed(scene, target, settings=FAST)
-    other = Settings.from_preset("fast", sh0_step=0.1)
+    other = Settings.research("fast", sh0_step=0.1)
     for name in ("lod-meta.json", "levels.json", "lod-meta.json"):
         compress_streamed(scene, target.parent / name, settings=other, overwrite=True)
         shutil.rmtree(tmp_path / "new", ignore_errors=True)
@@ -349,7 +349,7 @@ def test_a_missing_folder_above_is_named(scene, tmp_path):
 @pytest.mark.parametrize("changes", [{"target_size": "1MB"}, {"compact": {"ratio": 0.5}}, {"order": "plas"}])
 def test_settings_that_do_not_fit_are_refused(scene, tmp_path, changes):
     with pytest.raises(UnsupportedError):
-        compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=Settings.from_preset("fast", **changes))
+        compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=Settings.research("fast", **changes))
 
 
 @pytest.mark.parametrize("name", ["lod-meta.json", "levels.json"])

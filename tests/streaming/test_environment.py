@@ -137,7 +137,7 @@ def test_interrupted_work_ends_with_the_same_bytes_and_is_replaced_as_a_whole(sc
             compress_streamed(scene, target, settings=FAST, progress=stop)
     compress_streamed(scene, target, settings=FAST)
     assert files_of(target.parent) == files_of((tmp_path / "whole" / name).parent)
-    compress_streamed(scene, target, settings=Settings.from_preset("fast", sh0_step=0.1), overwrite=True)
+    compress_streamed(scene, target, settings=Settings.research("fast", sh0_step=0.1), overwrite=True)
     assert not list(target.parent.parent.glob("*.partial"))
 
 

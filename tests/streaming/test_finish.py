@@ -13,7 +13,7 @@ from kissgs import Settings
 from kissgs.core.errors import OutputError
 from kissgs.streaming.compress import compress_streamed
 
-OTHER = Settings.from_preset("fast", sh0_step=0.1)
+OTHER = Settings.research("fast", sh0_step=0.1)
 
 
 @pytest.fixture(autouse=True)

@@ -56,7 +56,7 @@ def assert_equal(report, source):
 
 @functools.cache
 def ours(preset, degree, count):
-    settings = kissgs.Settings.from_preset(preset, sensitivity_views=4, sensitivity_view_size=48)
+    settings = kissgs.Settings.research(preset, sensitivity_views=4, sensitivity_view_size=48)
     return dict(kissgs.compress(scene_of(count, degree), settings=settings, container="sog").files)
 
 

@@ -51,7 +51,7 @@ async def get_limits(context: Service) -> Limits:
 
 @router.get("/v1/presets", tags=["facts"], operation_id="presets", summary="List the presets")
 async def get_presets() -> Presets:
-    """All presets, with the typical size, time and quality of each, and all settings that options may change."""
+    """All presets, with the typical size, time and quality of each, and all values that each states."""
     return presets()
 
 
