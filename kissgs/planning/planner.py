@@ -127,8 +127,10 @@ def _table_fields(
         steps = (FINEST, FINEST, FINEST, FINEST)
     opacity, scale, rotation, color = (step * equal for step in steps)
     unit = log_extent(means) / MEANS_TOP
+    wanted = table_fields.stored_values(values, tables)
+    shapes = table_fields.rounded_shapes(wanted, equal, (opacity, scale, rotation), tables)
     fields = {
-        **table_fields.shape_fields(values, (opacity, scale, rotation), equal, tables),
+        **table_fields.finished_shapes(shapes, values[:, 0], tables),
         "means": table_fields.means_field(means, max(unit, 1e-30) * 2.0 ** (16 - bits)),
         "f_dc": table_fields.color_field(colors.astype(np.float64), color, equal),
     }

@@ -15,7 +15,7 @@ from kissgs.planning import table_fields
 from kissgs.planning.container_model import ContainerModel
 from kissgs.planning.quantize import MEANS_TOP, Quantized, clip_outliers, log_extent, means_bits, quantize_means
 from kissgs.planning.rd_criterion import RdCriterion
-from kissgs.planning.rdo_quantize import quantize_by_class, rdo_quantize_shapes
+from kissgs.planning.rdo_quantize import quantize_by_class, rdo_quantize
 from kissgs.planning.rotation_forms import StoredShapes
 from kissgs.planning.rows import Rows, for_each_block, selected
 from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook
@@ -50,25 +50,30 @@ class RdFields:
             values: the Gaussians in their stored form.
             hessians: ``(M, 10)`` shape Hessians of :class:`kissgs.Sensitivity`.
         """
-        criterion, largest, pool = self.criterion, self.largest, self.pool
-        if self.container.tables is not None:
-            wanted = hessians[:] if self.settings.rdo_quantization else None
-            bounds = {name: rows[:] for name, rows in largest.items()}
-            return table_fields.rd_shape_fields(
-                values[:], wanted, values.forms, criterion, bounds, self.container.tables, pool
+        criterion, largest, tables = self.criterion, self.largest, self.container.tables
+        wanted: StoredShapes | Float64[np.ndarray, "M 8"] = values
+        if tables is None:
+            fields = {
+                field: quantize_by_class(rows, criterion.steps_of(name), criterion.classes, largest[field], self.pool)
+                for rows, name, field in (
+                    (values.opacities, "opacity", "opacities"),
+                    (values.scales, "scale", "scales"),
+                    (values.quats, "rotation", "quaternions"),
+                )
+            }
+        else:
+            logits = values.opacities[:][:, 0].astype(np.float64)
+            wanted = table_fields.stored_values(values[:], tables)
+            opacity, scale, rotation = (
+                table_fields.criterion_steps(name, criterion, largest[field][:])
+                for name, field in (("opacity", "opacities"), ("scale", "scales"), ("rotation", "quaternions"))
             )
-        opacities, scales, quats = (
-            quantize_by_class(rows, criterion.steps_of(name), criterion.classes, largest[field], pool)
-            for rows, name, field in (
-                (values.opacities, "opacity", "opacities"),
-                (values.scales, "scale", "scales"),
-                (values.quats, "rotation", "quaternions"),
-            )
-        )
-        parts = opacities, scales, quats
+            fields = table_fields.rounded_shapes(wanted, criterion.costs.scale, (opacity, scale, rotation), tables)
         if self.settings.rdo_quantization:
-            parts = rdo_quantize_shapes(values, parts, hessians, values.forms, criterion, largest, pool)
-        return dict(zip(("opacities", "scales", "quaternions"), parts, strict=True))
+            fields = rdo_quantize(wanted, fields, hessians, values.forms, criterion, largest, self.pool, tables)
+            if tables is None:
+                fields = {name: field.from_zero() for name, field in fields.items()}
+        return fields if tables is None else table_fields.finished_shapes(fields, logits, tables)
 
     def means(self, splats: Splats, order: Int[np.ndarray, " M"], coarser: Int[np.ndarray, " M"]) -> Quantized:
         """Quantise the positions of the Gaussians ``order``, with the bits that lambda asks for in each class.

@@ -100,10 +100,7 @@ def nearest_levels(table: Float[np.ndarray, " levels"], values: Float[np.ndarray
 
 def table_field(table: Float32[np.ndarray, " levels"], levels: UInt8[np.ndarray, "N C"]) -> Quantized:
     """Return levels that stand for the values of a table, which are rounded to the digits that are stored."""
-    short = short_values(table)
-    channels = levels.shape[1]
-    low, high = (np.full(channels, end, np.float32) for end in (short[0], short[-1]))
-    return Quantized(levels, low, high, max(len(short) - 1, 1), table=short)
+    return Quantized(levels, short_values(table).astype(np.float64)[:, None])
 
 
 def short_values(table: Float32[np.ndarray, " levels"]) -> Float32[np.ndarray, " levels"]:
