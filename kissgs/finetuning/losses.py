@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.core.progress import Pace
 from kissgs.finetuning import kernels
-from kissgs.finetuning.planes import EvenPlane, Plane, TablePlane
+from kissgs.finetuning.planes import Plane
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.planning.layout import Grid
 from kissgs.planning.rdo_quantize import UNUSED_COUNT
@@ -43,7 +43,7 @@ class CodebookRate:
 
     table: Float32[np.ndarray, "3 15"]
 
-    def __init__(self, plane: EvenPlane) -> None:
+    def __init__(self, plane: Plane) -> None:
         """Prepare the rate of the codebook ``plane``, of S · S entries in row-major order."""
         self._base = plane.base_multiples.float()
         self._side = math.isqrt(len(self._base))
@@ -99,13 +99,13 @@ class RateLoss:
             plane = scene.planes[name]
             self._rates[name] = _LevelRate(plane, scene.classes, np.arange(plane.base_multiples.shape[1]))
         codebook = scene.planes["f_rest_centroids"]
-        if isinstance(codebook, EvenPlane):
+        if not scene.trained_tables:
             self._rates["f_rest_centroids"] = CodebookRate(codebook)
-        elif isinstance(codebook, TablePlane):
+        else:
             used = (codebook.min_latent < codebook.max_latent).any(dim=0).cpu().numpy()
             # An image has one code per colour, for all coefficients; those that are not stored get one of their own.
             colors = np.where(used, np.arange(len(used)) // COEFFICIENTS, 3)
-            self._rates["f_rest_centroids"] = _LevelRate(codebook, np.zeros(len(codebook.first), np.int64), colors)
+            self._rates["f_rest_centroids"] = _LevelRate(codebook, np.zeros(len(codebook.start), np.int64), colors)
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
         """Return the weighted bits of the current levels, but for a constant; ``parameters`` are not used."""

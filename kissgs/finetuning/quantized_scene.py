@@ -15,7 +15,7 @@ from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.finetuning.kernels import each_part, sum_by_label
-from kissgs.finetuning.planes import EvenPlane, planes_of
+from kissgs.finetuning.planes import planes_of
 from kissgs.planning import smallest_three
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoding_plan import EncodingPlan
@@ -129,12 +129,11 @@ class _LookUp(torch.autograd.Function):
 
 # ``QuantizedScene``: the differentiable decoder of fine-tuning, from latents to levels to a scene.
 #
-# Every level has a latent, which is rounded to one of the levels that its row may use. Levels are even
-# (:class:`~kissgs.finetuning.planes.EvenPlane`) or stand for the values of a table
-# (:class:`~kissgs.finetuning.planes.TablePlane`), which is trained as well. The unit of a latent is the step size of
-# the row's sensitivity class. Rounding passes gradients straight through (Bengio et al. 2013): the gradient of a
-# decoded value becomes that of its latent. Order, rotation forms, labels and ranges are those of the plan; the images
-# that are written contain exactly the rounded levels.
+# Every level has a latent, which is rounded to one of the levels that its row may use
+# (:class:`~kissgs.finetuning.planes.Plane`). Free tables of values are trained as well. The unit of a latent is the
+# step size of the row's sensitivity class. Rounding passes gradients straight through (Bengio et al. 2013): the
+# gradient of a decoded value becomes that of its latent. Order, rotation forms, labels and ranges are those of the
+# plan; the images that are written contain exactly the rounded levels.
 #
 # Straight-through training alone does not converge: if the best value is between two levels, its latent oscillates
 # across the boundary and may end at the worse level. So a quadratic term attracts each latent to its current level,
@@ -263,13 +262,7 @@ class QuantizedScene:
             tables = self.tables()
             for name, latents in self.latents.items():
                 if latents.grad is not None:
-                    plane = self.planes[name]
-                    if isinstance(plane, EvenPlane) and latents.device.type == "cpu":
-                        plane.add_attraction(latents.grad, latents, self._weights[name], factor)
-                        continue
-                    level = (torch.round(plane.base_multiples + latents) - plane.base_multiples).float()
-                    curvature = (self._weights[name] * plane.units(latents, tables.get(name)) ** 2).float()
-                    latents.grad += factor * curvature * (latents - level)
+                    self.planes[name].attract(latents.grad, latents, tables.get(name), self._weights[name], factor)
 
     def _keep_unit_length(self, former: Float32[Tensor, "M 3"]) -> None:
         """Take back a step after which the three components of a rotation leave no room for a fourth."""

@@ -317,9 +317,8 @@ class Tuner:
         settings = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {plan.rd_lambda} "
         key = hashlib.sha256(f"{settings}{targets.synthetic} {targets.synthetic_per_epoch}".encode())
         for name, field in plan.fields.items():
-            key.update(f"{name} {field.top} {field.level_offset} {field.levels.shape}".encode())
-            table = np.zeros(0) if field.table is None else field.table
-            for array in (field.levels, field.low, field.high, np.asarray(field.level_stride), table):
+            key.update(f"{name} {field.level_offset} {field.levels.shape} {field.table.shape}".encode())
+            for array in (field.levels, field.table, np.asarray(field.level_stride)):
                 key.update(array.tobytes())
         for array in (plan.codebook.labels, plan.classes, plan.grid.mask):
             key.update(array.tobytes())
