@@ -106,27 +106,16 @@ def attract(
     "float64(float64[:, ::1], float32[:, ::1], int64[:, ::1], float32[::1], int64, int64, int64, float32[:, ::1])"
 )
 def level_bits(
-    base: np.ndarray,
-    latents: np.ndarray,
-    rows: np.ndarray,
-    table: np.ndarray,
-    symbols: int,
+    base: Float64[np.ndarray, "R C"],  # symbol of each level of the plan
+    latents: Float32[np.ndarray, "R C"],
+    rows: Int64[np.ndarray, "R C"],  # index of each level's code in ``table``
+    table: Float32[np.ndarray, " _"],  # bits of the symbols of all codes; between two symbols they are interpolated
+    symbols: int,  # number of symbols of a code; ``symbols + 1`` entries of ``table`` belong to it
     first: int,
-    last: int,
-    slopes: np.ndarray,
+    last: int,  # exclusive
+    slopes: Float32[np.ndarray, "R C"],  # written: gradient by the latents
 ) -> float:
-    """Return the bits of the levels of rows ``first`` to ``last`` (exclusive).
-
-    Args:
-        base: ``(R, C)`` symbol of each level of the plan.
-        latents: ``(R, C)``.
-        rows: ``(R, C)`` index of each level's code in ``table``.
-        table: bits of the symbols of all codes; between two symbols they are interpolated.
-        symbols: number of symbols of a code; ``symbols + 1`` entries of ``table`` belong to it.
-        first: first row.
-        last: end of the rows, exclusive.
-        slopes: out, ``(R, C)``, gradient by the latents.
-    """
+    """Return the bits of the levels of rows ``first`` to ``last`` (exclusive)."""
     total = 0.0
     for n in range(first, last):
         for c in range(base.shape[1]):
@@ -140,25 +129,15 @@ def level_bits(
 
 @compiled("void(float32[:, ::1], int64[::1], int64[::1], int64[::1], int64, int64, float32[:, ::1])")
 def sum_by_label(
-    rows: np.ndarray,
-    order: np.ndarray,
-    used: np.ndarray,
-    starts: np.ndarray,
+    rows: Float32[np.ndarray, "M C"],
+    order: Int64[np.ndarray, " M"],  # rows sorted by label
+    used: Int64[np.ndarray, " U"],  # labels that occur
+    starts: Int64[np.ndarray, " U+1"],  # start of each of these in ``order``, and the end
     first: int,
-    last: int,
-    totals: np.ndarray,
+    last: int,  # exclusive
+    totals: Float32[np.ndarray, "E C"],  # sums; rows are added
 ) -> None:
-    """Add up the rows of each label, of the labels ``used[first:last]``.
-
-    Args:
-        rows: ``(M, C)``.
-        order: ``(M,)`` rows sorted by label.
-        used: ``(U,)`` labels that occur.
-        starts: ``(U + 1,)`` start of each of these in ``order``, and the end.
-        first: first index into ``used``.
-        last: end of the indices, exclusive.
-        totals: ``(E, C)`` sums; rows are added.
-    """
+    """Add up the rows of each label, of the labels ``used[first:last]``."""
     for u in range(first, last):
         for i in range(starts[u], starts[u + 1]):
             for c in range(rows.shape[1]):

@@ -35,13 +35,9 @@ class CodebookRate:
     level are those of its difference from the entries beside and above it, in Laplace distributions: the mean of both
     differences, over ln 2 times the mean difference of its colour and coefficient. Only their derivative matters; the
     constant is left out.
-
-    Attributes:
-        table: ``(3, 15)`` float32, mean difference by colour and coefficient, plus :data:`DIFFERENCE_OFFSET`,
-            levels; the colours are red - green, green and blue - green.
     """
 
-    table: Float32[np.ndarray, "3 15"]
+    table: Float32[np.ndarray, "3 15"]  # mean difference plus DIFFERENCE_OFFSET of red - green, green and blue - green
 
     def __init__(self, plane: Plane) -> None:
         """Prepare the rate of the codebook ``plane``, of S · S entries in row-major order."""
@@ -145,13 +141,7 @@ class TotalVariationLoss:
     """
 
     def __init__(self, scene: QuantizedScene, weight: float, pace: Pace) -> None:
-        """Prepare the loss.
-
-        Args:
-            scene: the scene that is trained.
-            weight: factor of the paper's weights.
-            pace: number of training steps.
-        """
+        """Prepare the loss."""
         self._scene, self._weight, self._pace = scene, weight, pace
         device = scene.latents["means"].device
         self._one, self._other = (torch.from_numpy(side).to(device) for side in _neighbours(scene.grid))
@@ -191,13 +181,9 @@ def _bytes(levels: Float64[Tensor, "M 3"]) -> tuple[Float64[Tensor, "M 3"], Floa
 
 
 class _LevelRate:
-    """Rate of the levels of one field.
+    """Rate of the levels of one field."""
 
-    Attributes:
-        table: ``(classes, channels, symbols + 1)`` float32, bits of each level; the last entry is repeated.
-    """
-
-    table: Float32[np.ndarray, "classes channels symbols"]
+    table: Float32[np.ndarray, "classes channels symbols"]  # bits of each level; the last entry is repeated
 
     def __init__(self, plane: Plane, classes: Int[np.ndarray, " M"], channels: Int[np.ndarray, " C"]) -> None:
         """Prepare the rate of ``plane``; rows of one of ``classes`` and columns of one of ``channels`` share a code."""

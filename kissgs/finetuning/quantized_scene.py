@@ -74,15 +74,7 @@ class _SmallestThree(torch.autograd.Function):
 
 
 class Labels:
-    """Codebook entry of each Gaussian.
-
-    Attributes:
-        entries: number of entries.
-        index: ``(M,)`` entry of each Gaussian.
-        order: ``(M,)`` Gaussians sorted by entry.
-        used: entries that occur, ascending.
-        starts: start of each of these in ``order``, and its end.
-    """
+    """Codebook entry of each Gaussian."""
 
     def __init__(self, labels: Int[np.ndarray, " M"], entries: int, device: Device) -> None:
         self.entries = entries
@@ -146,14 +138,7 @@ ATTRIBUTE_FIELDS = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}
 
 
 class QuantizedScene:
-    """An encoding plan whose levels :func:`kissgs.training.loop.train` can fit.
-
-    Attributes:
-        planes: planes by field of the plan.
-        trained_tables: tables whose values are trained, by field; none for even levels.
-        classes: ``(M,)`` sensitivity class of each Gaussian.
-        grid: cell of each Gaussian.
-    """
+    """An encoding plan whose levels :func:`kissgs.training.loop.train` can fit."""
 
     def __init__(
         self, plan: EncodingPlan, sh_degree: int, device: Device = "cpu", container: ContainerModel = EVEN_LEVELS
@@ -190,12 +175,7 @@ class QuantizedScene:
         return {name: self.trained_tables[name].values(latents) for name, latents in self.table_latents.items()}
 
     def set_curvature(self, costs: Costs, loss_per_error: float) -> None:
-        """Set the curvature of the quadratic attraction, 0 before, to that of the loss.
-
-        Args:
-            costs: mean squared image error per squared unit of each attribute, ``(M,)`` each.
-            loss_per_error: derivative of the loss with respect to the mean squared image error.
-        """
+        """Set the curvature of the quadratic attraction, 0 before, from the loss per mean squared image error."""
         labels = self._labels
         # All SH basis functions have one norm, so a coefficient of shN costs as much as one of the base colour.
         entries = np.bincount(labels.index.cpu().numpy(), costs.color, labels.entries)
@@ -240,9 +220,7 @@ class QuantizedScene:
     def step(self, rates: Mapping[str, float]) -> None:
         """Make an Adam step of the latents, with quadratic attraction, within the levels that the images can hold.
 
-        Args:
-            rates: learning rates by field and by :func:`table_name`, and ``"attraction"``: factor of the quadratic
-                attraction, 0 to 1.
+        ``rates`` has learning rates by field and :func:`table_name`, and the factor of the ``"attraction"``, 0 to 1.
         """
         rotations = self.latents["quaternions"].detach().clone() if self._omitted is not None else None
         if self._weights and rates["attraction"] > 0:

@@ -70,34 +70,21 @@ Decode = Callable[..., Splats]
 
 @dataclass(slots=True, eq=False)
 class Tuner:
-    """Fine-tunes encoding plans of one scene.
+    """Fine-tunes encoding plans of one scene."""
 
-    Attributes:
-        original: the original scene, clean; its renderings are the targets if there are no photographs.
-        settings: settings of the training.
-        supervision: training and evaluation views.
-        targets: target images of the training views.
-        device: device that trains.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        progress: receives the stage "finetune", and then those of writing.
-        container: what the container can hold.
-        decode: decoder of the container.
-        deadline: time until which a container shall be finished: training makes as many steps as fit in, up to
-            :data:`MOST_STEPS` times the setting ``steps``. None for exactly that setting.
-        ending_seconds: expected time of what comes after the training, seconds; measured by the first container.
-    """
-
-    original: Splats
+    original: Splats  # the original scene, clean; its renderings are the targets if there are no photographs
     settings: FinetuneSettings
     supervision: SupervisionViews
     targets: TrainingTargets
     device: Device
     threads: int
-    progress: Progress
+    progress: Progress  # receives the stage "finetune", and then those of writing
     container: ContainerModel = EVEN_LEVELS
     decode: Decode = decode_sogxt
-    deadline: Deadline | None = None
-    ending_seconds: float = 0.0
+    deadline: Deadline | None = (
+        None  # until then training makes as many steps as fit in; None for those of the settings
+    )
+    ending_seconds: float = 0.0  # expected time of what comes after the training; measured by the first container
 
     @classmethod
     def of(
@@ -117,10 +104,6 @@ class Tuner:
         """Prepare the targets: photographs of ``views``, or renderings of the original from virtual cameras.
 
         ``prepared`` are views and targets that exist already for these settings.
-
-        Raises:
-            InvalidViewsError: a photograph cannot be read.
-            UnsupportedError: an image would take too much memory.
         """
         if prepared is None:
             views_by_role = supervision_views(
@@ -138,20 +121,10 @@ class Tuner:
         write: Write,
         checkpoint: Path | None = None,
     ) -> tuple[Encoded, FinetuneReport]:
-        """Fine-tune, and return the better container with a report: the tuned one, or that of ``plan``.
+        """Fine-tune from ``start``, and return the better container with a report: the tuned one, or that of ``plan``.
 
-        Args:
-            plan: plan of the container without fine-tuning, with at least one Gaussian; None where the training is part
-                of that of the scene, so that no such container is made.
-            start: plan from which training starts: ``plan``, or one with fewer Gaussians, at least one.
-            scene: the scene of both plans.
-            write: writes the files of a plan.
-            checkpoint: file for the state of the training, saved every half minute. If it exists and belongs to this
-                work, training continues from it.
-
-        Raises:
-            InvalidViewsError: a photograph cannot be read.
-            OutputError: ``checkpoint`` belongs to other work.
+        Without ``plan``, the training is part of that of the scene, and no container is made before it. If the file
+        ``checkpoint`` exists and belongs to this work, training continues from it.
         """
         started = time.perf_counter()
         as_finetune = as_stage("finetune", self.progress)

@@ -31,17 +31,7 @@ CANDIDATES = 4
 def start(
     data: Vectors, spread: float, size: int, *, seed: int, neighbors: int, tolerance: float, pool: Workers
 ) -> Clustering:
-    """Return a hierarchical clustering: about K^(1/3) cells, each of them split likewise, and their centroids.
-
-    Args:
-        data: the vectors.
-        spread: their root mean square distance from the mean, per dimension.
-        size: K, largest number of centroids.
-        seed: seed of all random choices.
-        neighbors: number of near centroids of each centroid.
-        tolerance: root mean square error per dimension below which a cluster is not split further.
-        pool: threads.
-    """
+    """Return a hierarchical clustering: about K^(1/3) cells, each of them split likewise, and their centroids."""
     rng = np.random.Generator(np.random.PCG64(seed))
     dimensions = data.table.shape[1]
     labels = np.zeros(len(data.rows), dtype=np.int32)
@@ -70,11 +60,7 @@ def _split(
     rng: np.random.Generator,
     pool: Workers,
 ) -> tuple[Float32[np.ndarray, "K D"], Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
-    """Cluster the vectors of every cell into its share of clusters.
-
-    Returns:
-        The centroids, cell by cell; the nearest centroid of its cell to each vector; and the squared distance to it.
-    """
+    """Cluster the vectors of every cell into its share of clusters."""
     members, edges = sorted_by_label(cells, len(shares))
     firsts = np.concatenate([[0], np.cumsum(shares)])
     seeds = rng.integers(0, 2**63, len(shares))
@@ -202,40 +188,25 @@ OUTLIERS = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KMeansOptions:
-    """Options of :func:`fit`.
-
-    Attributes:
-        seed: seed of all random choices.
-        iterations: iterations after the hierarchical start.
-        neighbors: number of centroids, the nearest to a vector's present one, that are compared in an iteration.
-        tolerance: root mean square error per dimension below which a cluster is not split further.
-        lattice: step that centroids are rounded to, in units of the codebook's root mean square error; vectors are
-            then assigned to the rounded centroids. 0 does not round.
-        from_zero: whether the lattice holds 0 in all dimensions, instead of each dimension's smallest value, and any
-            number of its points may be used, instead of 255 per dimension.
-    """
+    """Options of :func:`fit`."""
 
     seed: int
-    iterations: int
-    neighbors: int
-    tolerance: float
-    lattice: float
+    iterations: int  # iterations after the hierarchical start
+    neighbors: int  # number of centroids, the nearest to a vector's present one, that are compared in an iteration
+    tolerance: float  # root mean square error per dimension below which a cluster is not split further
+    lattice: float  # step that centroids are rounded to, in units of the codebook's root mean square error
+    # whether the lattice holds 0 in all dimensions, instead of each dimension's smallest value, and any number of its
+    # points may be used, instead of 255 per dimension
     from_zero: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Clusters:
-    """Result of a clustering.
-
-    Attributes:
-        centroids: ``(K, D)``.
-        labels: ``(N,)`` centroid of each vector.
-        step: step of the lattice that the centroids lie on; 0 for none.
-    """
+    """Result of a clustering."""
 
     centroids: Float32[np.ndarray, "K D"]
-    labels: Int32[np.ndarray, " N"]
-    step: float
+    labels: Int32[np.ndarray, " N"]  # centroid of each vector
+    step: float  # step of the lattice that the centroids lie on; 0 for none
 
 
 def fit(
@@ -249,22 +220,7 @@ def fit(
     metric: ShMetric | None = None,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Clusters:
-    """Find at most ``size`` centroids of small weighted squared error.
-
-    Args:
-        table: finite vectors, of which some are clustered.
-        rows: their rows in the table, N at least 1.
-        weights: positive weight of each vector's squared error.
-        size: K, largest number of centroids, at most 65,536.
-        pool: threads.
-        options: options of the clustering.
-        metric: forms of the errors of the table's rows, by which the clustering is then improved; the Euclidean
-            distance for None.
-        report: receives the fraction done, 0 to 1.
-
-    Returns:
-        The clusters; fewer than ``size`` if the vectors are few, similar or repeated.
-    """
+    """Find at most ``size`` centroids of small weighted squared error."""
     # The kernels take contiguous, writeable arrays only, although they do not write to these.
     data = Vectors(
         np.require(table, requirements=("C", "W")),
@@ -337,11 +293,7 @@ def _mean_square_error(state: Clustering, pool: Workers) -> float:
 
 
 def _round_to_lattice(centroids: np.ndarray, step: float, options: KMeansOptions) -> float:
-    """Round in place to whole steps from each dimension's smallest value; a constant dimension keeps its value.
-
-    Returns:
-        The step: ``step``, or the one that 256 levels or the tolerance need if that is larger.
-    """
+    """Round in place to whole steps from each dimension's smallest value; a constant dimension keeps its value."""
     tolerance, low = options.tolerance, np.zeros(centroids.shape[1])
     step = max(step, 2 * tolerance)
     if not options.from_zero:

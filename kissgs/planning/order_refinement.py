@@ -80,13 +80,6 @@ def refined_order(
 
     Gaussians at the same position keep their order, because renderers blend them in it. The first and the last Gaussian
     of a run stay.
-
-    Args:
-        means: levels of positions, along a curve through space.
-        colors: levels of base colours.
-        runs: equal for Gaussians that follow one another anyway; only these change places.
-        pool: threads. The result does not depend on their number.
-        report: receives the fraction done, 0 to 1.
     """
     pixels, order = _pixels(means, colors), np.arange(len(means), dtype=np.int32)
     ends = np.concatenate([np.flatnonzero(np.diff(runs)) + 1, [len(runs)]]).tolist()

@@ -112,14 +112,6 @@ def _table_fields(
     """Return the levels by field, and the largest errors, for a container with tables.
 
     Without ``shared_step_size``, every table has as many values as it may, and rotations have all their levels.
-
-    Args:
-        means: position of each cell's Gaussian.
-        colors: its ``sh0``.
-        values: its opacity logit, log-scales and unit quaternion, in the stored form.
-        bits: precision of positions.
-        settings: settings of the encoder.
-        tables: tables of the container.
     """
     equal = np.ones(len(means))
     steps = (settings.opacity_step, settings.scale_step, settings.quat_step, settings.sh0_step)
@@ -179,24 +171,8 @@ def plan_encoding(
 ) -> EncodingPlan:
     """Choose order, rotation forms, codebook and levels for a clean scene.
 
-    Args:
-        splats: the scene.
-        settings: settings of the encoder.
-        sensitivity: squared image error of changes of the scene, for rate-distortion planning. Without it, or if no
-            camera saw any Gaussian, planning is uniform, with the steps of the settings.
-        recolor: for rate-distortion planning: returns better ``sh0`` for the decoded Gaussians and their indices in
-            the scene.
-        container: what the container can hold.
-        keep_costs: whether the plan of rate-distortion planning has its costs, which fine-tuning needs.
-        groups: group of each Gaussian, below 16,384: those of a group follow one another in the container, the groups
-            in ascending order. Not with PLAS. None for one group.
-        threads: number of threads; 0 means one per processor.
-        progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook", "rounding" and
-            "reorder".
-
-    Raises:
-        InvalidSceneError: ``sensitivity`` does not fit the scene.
-        UnsupportedError: the scene is too large for one container; groups with PLAS.
+    Without sensitivity, or if no camera saw any Gaussian, planning is uniform, with the steps of the settings. With
+    ``groups``, the Gaussians of each follow one another in the container, the groups in ascending order.
     """
     if groups is not None and settings.order == "plas":
         raise UnsupportedError("a container with groups of Gaussians needs order=hilbert or order=refined")

@@ -81,19 +81,10 @@ def quantize(
     max_top: int = 255,
     pool: Workers | None = None,
 ) -> Quantized:
-    """Round to uniform steps.
+    """Round to uniform steps of at most ``step``, unless ``max_top`` steps do not span the widest channel.
 
-    Args:
-        values: finite values.
-        step: largest allowed step, in the unit of the values. It is exceeded only if ``max_top`` steps do not span
-            the widest channel.
-        shared: one step for all channels (least error for a given entropy). If false, every channel spreads
-            ``max_top`` levels over its own range, and ``step`` has no effect.
-        max_top: largest level.
-        pool: threads; None for the calling one.
-
-    Returns:
-        Levels whose values are at most half a step away; a constant channel is exact.
+    One step for all channels has the least error for a given entropy. If it is not shared, every channel spreads
+    ``max_top`` levels over its own range.
     """
     low, high = _range(values, pool)
     extent = high.astype(np.float64) - low
@@ -135,14 +126,8 @@ def quantize_means(
 ) -> Quantized:
     """Quantise positions to 16-bit levels of their signed logarithm, with one range for all three axes.
 
-    Args:
-        means: finite positions, float32.
-        bits: precision, 8 to 16, of all Gaussians or of each. Below 16 the levels are multiples of a power of two (the
-            low bytes then compress); the outermost level stays 65535.
-        pool: threads; None for the calling one.
-
-    Returns:
-        Levels (uint16) with ``low`` and ``high`` in the signed-log domain, equal in all channels.
+    Below 16 ``bits``, of all or of each, levels are multiples of a power of two, so that low bytes compress; the
+    outermost level stays 65535.
     """
     if len(means) == 0:
         return Quantized(np.empty((0, 3), np.uint16), np.zeros((MEANS_TOP + 1, 3)), *_strides(bits))

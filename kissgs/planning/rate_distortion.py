@@ -71,16 +71,7 @@ def choose_lambda(
     view_uncertainty: float,
     refits: int,
 ) -> tuple[float, float]:
-    """Return the lambda of the settings, and that of the default quality.
-
-    Args:
-        usual: mean squared error of the default quality (:func:`default_error`).
-        costs: costs of all Gaussians that a renderer draws.
-        sh_model: error of the view-dependent colour, by codebook size.
-        settings: settings of the encoder.
-        view_uncertainty: that of the sensitivity, from 0 to 1.
-        refits: number of iterations of the colour refit.
-    """
+    """Return the lambda of the settings, and that of the default quality."""
 
     def for_error(error: float, quality_offset_db: float) -> float:
         """Return the lambda at which the squared error is about ``quality_offset_db`` decibels below ``error``."""
@@ -106,12 +97,6 @@ def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_
 
     The paper's 100 levels for rotations, 256 for the rest and 65,536 for positions are spread from each channel's
     smallest to its largest value, so that a single outlier makes them coarse; the steps of ``fast`` are absolute.
-
-    Args:
-        costs: costs of all Gaussians of ``kept``, ``(M,)``.
-        splats: the scene.
-        kept: indices of the ``M`` Gaussians that a renderer draws.
-        sh_model: error of the view-dependent colour, by codebook size.
     """
     scene = {"opacities": splats.opacities[:, None], "scales": splats.scales, "sh0": splats.sh0, "means": splats.means}
     ends = {name: row_range(selected(values, kept)) for name, values in scene.items()}

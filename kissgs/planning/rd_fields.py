@@ -27,29 +27,16 @@ OUTLIERS = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RdFields:
-    """Quantises the attributes of M Gaussians.
-
-    Attributes:
-        container: what the container can hold.
-        settings: settings of the encoder.
-        criterion: costs, sensitivity classes and lambda.
-        largest: largest change of each attribute, see :func:`kissgs.planning.rdo_quantize.largest_changes`.
-        pool: threads.
-    """
+    """Quantises the attributes of M Gaussians."""
 
     container: ContainerModel
     settings: EncodeSettings
     criterion: RdCriterion
-    largest: Mapping[str, Rows]
+    largest: Mapping[str, Rows]  # see largest_changes
     pool: Workers
 
     def shapes(self, values: StoredShapes, hessians: Rows) -> dict[str, Quantized]:
-        """Quantise opacity, log-scales and rotation.
-
-        Args:
-            values: the Gaussians in their stored form.
-            hessians: ``(M, 10)`` shape Hessians of :class:`kissgs.Sensitivity`.
-        """
+        """Quantise opacity, log-scales and rotation."""
         criterion, largest, tables = self.criterion, self.largest, self.container.tables
         wanted: StoredShapes | Float64[np.ndarray, "M 8"] = values
         if tables is None:
@@ -139,15 +126,7 @@ def largest_errors(
     colors: Float32[np.ndarray, "M 3"] | Rows,
     pool: Workers | None = None,
 ) -> dict[str, list[float]]:
-    """Return the largest error per field and channel, in the unit of the field (positions: of the signed logarithm).
-
-    Args:
-        fields: levels of the Gaussians, in order.
-        values: opacity logit, log-scales and quaternion, in the stored form of each Gaussian.
-        means: positions.
-        colors: ``sh0``.
-        pool: threads; None for the calling one.
-    """
+    """Return the largest error per field and channel, in the unit of the field (positions: of the signed logarithm)."""
 
     def largest(rows: slice) -> dict[str, np.ndarray]:
         wanted, some = values[rows], {name: field.take(rows) for name, field in fields.items()}

@@ -46,11 +46,6 @@ def largest_changes(
 
     Optimal steps grow as the root of lambda. These bounds grow more slowly: they protect views in which a change is
     more visible than in the measured ones, where pruning or coarser colours would be the smaller loss.
-
-    Args:
-        coverage: from 0 to 1, see :class:`kissgs.Sensitivity`.
-        captured: from 0 to ``coverage``, see :class:`kissgs.Sensitivity`.
-        slack: ratio of the optimal steps to those of the default quality, from 1.
     """
 
     def change(name: str, rows: slice) -> Float64[np.ndarray, " n"]:
@@ -82,17 +77,9 @@ def quantize_by_class(
     coarsest: Float64[np.ndarray, " M"] | Rows,
     pool: Workers | None = None,
 ) -> Quantized:
-    """Round to the nearest of the levels that each sensitivity class uses.
+    """Round to the nearest of the levels that each sensitivity class uses: multiples of one step for all channels.
 
-    Args:
-        values: finite.
-        optimal: best step of each sensitivity class.
-        classes: class of each Gaussian.
-        coarsest: largest step, per Gaussian.
-        pool: threads; None for the calling one.
-
-    Returns:
-        Levels from 0 to at most 255, with one step for all channels, of which each class uses multiples.
+    ``optimal`` is the best step of each class; no step is above ``coarsest`` of the Gaussian.
     """
     smallest, largest = row_range(values, pool)
     low32 = smallest.astype(np.float32) + np.float32(0)

@@ -46,19 +46,12 @@ CHUNK = 1 << 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredShapes:
-    """Opacity logits, log-scales and rotations of Gaussians in their stored form, computed a block at a time.
-
-    Attributes:
-        splats: the scene.
-        index: ``(M,)`` the Gaussians.
-        forms: ``(M,)`` form of each.
-        w_is_one: whether quaternions are scaled such that w is 1, which must not be 0; else they have length 1.
-    """
+    """Opacity logits, log-scales and rotations of Gaussians in their stored form, computed a block at a time."""
 
     splats: Splats
     index: Int[np.ndarray, " M"]
     forms: UInt8[np.ndarray, " M"]
-    w_is_one: bool = False
+    w_is_one: bool = False  # whether quaternions are scaled such that w, not 0, is 1; else they have length 1
 
     def __len__(self) -> int:
         return len(self.index)
@@ -111,9 +104,6 @@ def choose_forms(
 
     Where the container stores whole quaternions, which decoders normalise, those of canonical forms have w = 1: x, y
     and z hold the whole rotation, and w takes no bits.
-
-    Returns:
-        The Gaussians in these forms, and the largest relative change of a covariance, by rounding only.
     """
     if settings.rotation_form == "canonical":
         forms = np.empty(len(cells), np.uint8)
@@ -176,16 +166,8 @@ def pras_forms(
 ) -> UInt8[np.ndarray, " N"]:
     """Choose forms that make neighbours on the grid similar: the closest to 8-bit proxies, blurred less and less.
 
-    Args:
-        quats: unit quaternions, row-major on the grid of ``side`` × ``side`` cells.
-        scales: log-scales. One proxy range serves all three axes, so that permuting them changes no proxy.
-        side: cells per axis.
-        pool: threads for the rows; the result does not depend on their number.
-        decay: factor from one blur radius to the next.
-        report: receives the fraction done, 0 to 1.
-
-    Returns:
-        The chosen forms of the input, not of an intermediate form, so that rounding errors do not add up.
+    One proxy range serves the scales of all three axes, so that permuting them changes no proxy. All forms are those of
+    the input, not of an intermediate form, so that rounding errors do not add up.
     """
     from kissgs.planning import kernels
 

@@ -46,20 +46,12 @@ PAPER_TOP = 99
 
 @dataclass(frozen=True, slots=True)
 class Codebook:
-    """Codebook of S × S entries, and the entry of each Gaussian.
-
-    Attributes:
-        side: S.
-        centroids: ``(S*S, 45)`` levels, channel-major (15 of red, 15 of green, 15 of blue), entries row-major; at most
-            S × S rows where the container's entries are a list.
-        labels: ``(M,)`` entry of each Gaussian; a scene without Gaussians has one label, for padding.
-        errors: ``(45,)`` largest error of the entries by rounding, per channel.
-    """
+    """Codebook of S × S entries, and the entry of each Gaussian."""
 
     side: int
-    centroids: Quantized
-    labels: Int[np.ndarray, " M"]
-    errors: list[float]
+    centroids: Quantized  # 15 of red, 15 of green, 15 of blue; entries are row-major, or a list
+    labels: Int[np.ndarray, " M"]  # entry of each Gaussian; a scene without Gaussians has one label, for padding
+    errors: list[float]  # largest error of the entries by rounding, per channel
 
 
 def fit_codebook(
@@ -77,18 +69,6 @@ def fit_codebook(
     """Build the codebook for the Gaussians ``chosen``.
 
     Bands that are missing, or zero in all Gaussians, take almost no bytes: their tiles are constant.
-
-    Args:
-        splats: the scene.
-        chosen: indices of the Gaussians.
-        weights: weight of each Gaussian's squared shN error.
-        size: largest number of entries. In SOG-XT the image's side is a multiple of 8 and unused entries repeat
-            others; in SOG any number will do.
-        settings: settings of the encoder.
-        container: what the container can hold.
-        pool: threads.
-        progress: receives "codebook" and "sort codebook" events.
-        metric: forms of the errors; by default every coefficient counts alike.
     """
     dimensions = splats.shN.shape[1] * 3
     if dimensions == 0 or len(chosen) == 0:
@@ -223,17 +203,11 @@ SH_MEAN_SQUARE = 0.0796
 
 @dataclass(frozen=True, slots=True)
 class CodebookErrorModel:
-    """Error of a scene's shN by codebook size, extrapolated from a small codebook.
-
-    Attributes:
-        entries: number of entries of that codebook.
-        weighted: its squared image error, weighted by sensitivity.
-        unweighted: squared image error of a codebook of that size with equal weights.
-    """
+    """Error of a scene's shN by codebook size, extrapolated from a small codebook."""
 
     entries: int = 1
-    weighted: float = 0.0
-    unweighted: float = 0.0
+    weighted: float = 0.0  # its squared image error, weighted by sensitivity
+    unweighted: float = 0.0  # squared image error of a codebook of that size with equal weights
 
     def error(self, entries: float) -> float:
         """Return the squared image error of a codebook with that number of entries."""

@@ -86,10 +86,7 @@ def color_field(
 def means_field(means: Float32[np.ndarray, "M 3"], steps: float | Float64[np.ndarray, " M"]) -> Quantized:
     """Return 16-bit levels of the positions' signed logarithms, with a range per axis.
 
-    Args:
-        means: finite positions.
-        steps: wanted step of each Gaussian's signed logarithm. Levels are multiples of a power of two, up to 256, of
-            about this step, so that the low bytes have trailing zeros.
+    Levels are multiples of a power of two, up to 256, of about the step of each Gaussian, so that low bytes compress.
     """
     logs = signed_log(means)
     low, high = (_as_text(end.astype(np.float32)) for end in (logs.min(axis=0), logs.max(axis=0)))

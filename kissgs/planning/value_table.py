@@ -29,14 +29,7 @@ MAX_POINTS = 1 << 14
 def fit_table(
     values: Float[np.ndarray, " V"], weights: Float64[np.ndarray, " V"], step: float, *, with_zero: bool = False
 ) -> Float32[np.ndarray, " levels"]:
-    """Return ascending values of a table for ``values``.
-
-    Args:
-        values: finite, at least one.
-        weights: weight of each value's squared error, not negative.
-        step: distance of the lattice points, above 0.
-        with_zero: whether 0 must be a value of the table.
-    """
+    """Return ascending values of a table for at least one value; ``step`` is the distance of the lattice points."""
     wide = np.asarray(values, np.float64)
     span = float(np.ptp(wide))
     step = max(step, span * 2.0**-40, 1e-30)
@@ -115,15 +108,7 @@ def refit_table(
     weights: Float64[np.ndarray, " N"],
     largest: tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]],
 ) -> Float32[np.ndarray, " levels"]:
-    """Move each value of a table to the weighted mean of what it stands for, as far as the largest errors permit.
-
-    Args:
-        table: ascending values.
-        levels: level of each value.
-        values: the values that were quantised.
-        weights: weight of each row's squared error.
-        largest: largest decrease and increase of each row's values.
-    """
+    """Move each value of a table to the weighted mean of what it stands for, within the largest changes down and up."""
     size, rows = len(table), np.broadcast_to(weights[:, None], levels.shape).ravel()
     index, flat = levels.ravel(), values.ravel()
     mass = np.bincount(index, rows, minlength=size)
