@@ -120,8 +120,8 @@ class Plane:
             allowed = np.searchsorted(levels, [usable[0], usable[1] + 1])
             ends = _reachable(field.table[levels, 0], allowed, largest_gap)
             lowest[inside], highest[inside] = (end[place[inside]] for end in ends)
-        bounds = (np.where(frozen, 0, bound - place) for bound in (lowest, highest))
-        return cls._from(field, place, *bounds, lists, starts[numbers], device)
+        least, most = (np.where(frozen, 0, bound - place) for bound in (lowest, highest))
+        return cls._from(field, place, least, most, lists, starts[numbers], device)
 
     @classmethod
     def even(cls, field: Quantized, device: Device, *, freeze_top: bool = False) -> Plane:
@@ -142,8 +142,8 @@ class Plane:
         starts = np.cumsum([1] + [len(own) + 2 for own in lists])
         start = starts[numbers.reshape(levels.shape)] - first
         start = np.where(frozen, starts[-1] + levels - multiples, start)
-        bounds = (np.where(frozen, 0, bound - multiples) for bound in (first, last))
-        return cls._from(field, multiples, *bounds, [*lists, np.arange(field.top + 1)], start, device)
+        least, most = (np.where(frozen, 0, bound - multiples) for bound in (first, last))
+        return cls._from(field, multiples, least, most, [*lists, np.arange(field.top + 1)], start, device)
 
     @classmethod
     def _from(
@@ -203,10 +203,12 @@ class Plane:
 
         kernels.each_part(part, len(latents), torch.get_num_threads())
 
-    def _arrays(self, latents: Float32[Tensor, "R C"], table: Float64[Tensor, "L _"]) -> tuple[np.ndarray, ...]:
+    def _arrays(
+        self, latents: Float32[Tensor, "R C"], table: Float64[Tensor, "L _"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return what the kernels need of a plane on the CPU."""
-        parts = (self.base_multiples, latents.detach(), self.start, self.lists, table.detach())
-        return tuple(part.contiguous().numpy() for part in parts)
+        own, values = latents.detach().contiguous().numpy(), table.detach().contiguous().numpy()
+        return self.base_multiples.numpy(), own, self.start.numpy(), self.lists.numpy(), values
 
     def quantized(self, latents: Float32[Tensor, "R C"], table: Tensor | None = None) -> Quantized:
         """Return the field with the levels of these latents, and the values of ``table``."""

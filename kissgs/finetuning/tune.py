@@ -143,40 +143,31 @@ class Tuner:
             pace = Pace(most, self.deadline.earlier(self.ending_seconds))
             pace.update(0)
         if before is not None and first is not None and pace.steps == 0:
-            return before, self._untuned(first, started)
+            return before, self._report(0, first, first, started, kept=False, notes=[NO_TIME])
         tuned, checkpoint_note = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, pace, checkpoint)
         trained = time.perf_counter()
         after = write(tuned, pace.steps, self.progress)
         second = self._evaluate(after, self._report_images_done)
         self.ending_seconds = time.perf_counter() - trained
         kept = first is None or second.cost(rd_lambda) < first.cost(rd_lambda)
-        report = FinetuneReport(
-            steps=pace.steps,
-            target_source=self.targets.target_source,
-            source=self.supervision.source,
-            psnr_before=None if first is None else first.psnr,
-            psnr_after=second.psnr,
-            bytes_before=None if first is None else first.bytes,
-            bytes_after=second.bytes,
-            kept=kept,
-            seconds=time.perf_counter() - started,
-            note="; ".join(filter(None, [self.supervision.note, "" if kept else NOT_KEPT, checkpoint_note])),
-        )
+        notes = ["" if kept else NOT_KEPT, checkpoint_note]
+        report = self._report(pace.steps, first, second, started, kept=kept, notes=notes)
         return (after if kept or before is None else before), report
 
-    def _untuned(self, result: _Result, started: float) -> FinetuneReport:
-        """Return the report where no training step fits into the time."""
+    def _report(
+        self, steps: int, before: _Result | None, after: _Result, started: float, *, kept: bool, notes: list[str]
+    ) -> FinetuneReport:
         return FinetuneReport(
-            steps=0,
+            steps=steps,
             target_source=self.targets.target_source,
             source=self.supervision.source,
-            psnr_before=result.psnr,
-            psnr_after=result.psnr,
-            bytes_before=result.bytes,
-            bytes_after=result.bytes,
-            kept=False,
+            psnr_before=None if before is None else before.psnr,
+            psnr_after=after.psnr,
+            bytes_before=None if before is None else before.bytes,
+            bytes_after=after.bytes,
+            kept=kept,
             seconds=time.perf_counter() - started,
-            note="; ".join(filter(None, [self.supervision.note, NO_TIME])),
+            note="; ".join(filter(None, [self.supervision.note, *notes])),
         )
 
     def _report_images_done(self, stage: str, fraction: float, note: str = "") -> None:

@@ -1,12 +1,16 @@
-"""``ContainerModel``: which values the levels of a container can stand for, as its package tells the planner."""
+"""``ContainerModel``: the values that a container can hold; ``Planning``: inputs that all steps of planning share."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from kissgs.core.array_types import Float64
+from kissgs.core.progress import Progress
+from kissgs.core.resources import Workers
+from kissgs.settings import EncodeSettings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,3 +38,18 @@ class ContainerModel:
 
 EVEN_LEVELS = ContainerModel()
 """Evenly spaced levels, and a mask that says which cells hold a Gaussian: the default."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Planning:
+    """Inputs that all steps of one planning share."""
+
+    settings: EncodeSettings
+    container: ContainerModel
+    pool: Workers
+    progress: Progress
+
+    def report(self, stage: str) -> Callable[[float], None]:
+        """Report that a stage begins, and return what reports the fraction of it that is done."""
+        self.progress(stage, 0.0)
+        return lambda fraction: self.progress(stage, fraction)

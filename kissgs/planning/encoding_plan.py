@@ -13,8 +13,6 @@ from kissgs.planning.quantize import Quantized
 from kissgs.planning.rd_criterion import Costs
 from kissgs.planning.sh_codebook import Codebook
 
-# ``EncodingPlan``: the encoder's decisions for a scene, independent of the container format.
-
 
 @dataclass(frozen=True, slots=True)
 class PlannedScene:
@@ -45,9 +43,6 @@ class EncodingPlan:
     rd_lambda: float | None = None  # squared error per bit; None for uniform planning
     note: str = ""  # a sentence for the user if many Gaussians were pruned; else empty
     coarse: str = ""  # a sentence for the user if the positions are too coarse for the Gaussians; else empty
-
-
-# ``Encoded``: the files of a container in memory, and figures of its encoding.
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,11 +28,9 @@ CANDIDATES = 4
 """Centroids of nearby cells among which the nearest ones are found, in multiples of the number to be found."""
 
 
-def start(
-    data: Vectors, spread: float, size: int, *, seed: int, neighbors: int, tolerance: float, pool: Workers
-) -> Clustering:
+def start(data: Vectors, spread: float, size: int, options: KMeansOptions, pool: Workers) -> Clustering:
     """Return a hierarchical clustering: about K^(1/3) cells, each of them split likewise, and their centroids."""
-    rng = np.random.Generator(np.random.PCG64(seed))
+    rng = np.random.Generator(np.random.PCG64(options.seed))
     dimensions = data.table.shape[1]
     labels = np.zeros(len(data.rows), dtype=np.int32)
     counts, errors = np.array([len(labels)]), np.array([len(labels) * dimensions * spread**2])
@@ -41,11 +39,11 @@ def start(
         (round(size ** (2 / 3)), CELL_ITERATIONS),
         (size, START_ITERATIONS),
     ):
-        shares = allocate(errors, counts, max(number, len(counts)), dimensions * tolerance**2)
+        shares = allocate(errors, counts, max(number, len(counts)), dimensions * options.tolerance**2)
         centroids, labels, distances = _split(data, labels, shares, iterations, rng, pool)
         counts = np.bincount(labels, minlength=len(centroids))
         errors = np.bincount(labels, distances * data.weights, minlength=len(centroids))
-    near = near_centroids(centroids, np.concatenate([[0], np.cumsum(shares)]), neighbors, pool)
+    near = near_centroids(centroids, np.concatenate([[0], np.cumsum(shares)]), options.neighbors, pool)
     members, edges = sorted_by_label(labels, len(centroids))
     state = Clustering(data, centroids, labels, distances, near, members, edges, np.zeros(len(centroids)), errors)
     state.update(pool)
@@ -162,18 +160,17 @@ def near_centroids(
     return near
 
 
-# Weighted k-means of many vectors with many centroids, in time proportional to the vectors.
-#
 # Comparing every vector with every centroid takes too long for a million vectors and 65,536 centroids. Three methods
 # from the literature replace it:
 #
 # - The start is hierarchical: vectors are split among cells, cells among smaller cells, and each of these gets
-# centroids   in proportion to sqrt(its error × its count). - A vector then moves only to one of the centroids nearest
-# to its present one (k²-means: Agustsson, Timofte and Van   Gool, CVPR 2017). The lists of near centroids are made from
-# the cells; later iterations search them again, because the   centroids move. - Between two such iterations, pairs of
-# similar clusters are merged and spread-out clusters are split, as long as that   lowers the error (iterative splitting
-# and merging: Kaukoranta, Fränti and Nevalainen, Optical Engineering 37, 1998).   Plain k-means cannot move a centroid
-# from where it is useless to where it is needed; with this step the error ends   below that of an exhaustive search.
+#   centroids in proportion to sqrt(its error × its count).
+# - A vector then moves only to one of the centroids nearest to its present one (k²-means: Agustsson, Timofte and Van
+#   Gool, CVPR 2017). The lists of near centroids are made from the cells, and searched again as the centroids move.
+# - Between two such iterations, pairs of similar clusters are merged and spread-out clusters are split, as long as that
+#   lowers the error (iterative splitting and merging: Kaukoranta, Fränti and Nevalainen, Optical Engineering 37, 1998).
+#   Plain k-means cannot move a centroid from where it is useless to where it is needed; with this step the error ends
+#   below that of an exhaustive search.
 #
 # Vectors are read where they are, by their index; beside them the clustering needs some 20 bytes for each and some 600
 # for each centroid. Sums run in a fixed order in float64, each cluster belongs to one task, and all random numbers come
@@ -235,15 +232,7 @@ def fit(
         step = _round_to_lattice(unique, 0.0, options) if options.lattice else 0.0
         return Clusters(unique, exact.reshape(-1).astype(np.int32), step)
 
-    state = start(
-        data,
-        spread,
-        size,
-        seed=options.seed,
-        neighbors=options.neighbors,
-        tolerance=options.tolerance,
-        pool=pool,
-    )
+    state = start(data, spread, size, options, pool)
     report(0.4)
     all_iterations = options.iterations + (0 if metric is None else METRIC_ITERATIONS)
     for iteration in range(options.iterations):

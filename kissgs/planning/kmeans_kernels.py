@@ -7,8 +7,6 @@ import numpy as np
 from kissgs.core.array_types import Bool, Float32, Float64, Int32, Int64, UInt16
 from kissgs.core.numba_kernels import compiled
 
-# Compiled inner loops of the k-means of the SH codebook: sorting by label, means, near centroids and assignment.
-
 
 @compiled("void(int32[::1], int64[::1], int32[::1])")
 def sort_by_label(
@@ -241,9 +239,6 @@ def assign_by_form(
                 if scores[j] < scores[best]:
                     best = j
             labels[members[i]] = near[first + cluster, best]
-
-
-# Compiled inner loops by which k-means merges clusters and gives their numbers to halves of others.
 
 
 @compiled("void(float32[:, ::1], float64[::1], uint16[:, ::1], int64, int64, int32[::1], float64[::1])")

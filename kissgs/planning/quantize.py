@@ -1,9 +1,4 @@
-"""Uniform quantisers, and the ranges that decoders need to invert them.
-
-A SOG-XT decoder does not know the number of levels. It maps the smallest level observed in an image to each channel's
-``low`` and the largest to its ``high``, linearly (docs/reference/format.md). So the ranges that are written must be
-those of the levels that occur in the image; :func:`observed_range` returns them.
-"""
+"""Levels and the values that they stand for; uniform quantisers, and the ranges that decoders need to invert them."""
 
 from __future__ import annotations
 
@@ -65,7 +60,9 @@ class Quantized:
         return Quantized((self.levels - first).astype(np.uint8), table, self.level_stride, self.level_offset + first)
 
 
-def even_table(low: Float[np.ndarray, " C"], high: Float[np.ndarray, " C"], top: int) -> Float64[np.ndarray, "top+1 C"]:
+def even_table(
+    low: Float[np.ndarray, " C"], high: Float[np.ndarray, " C"], top: int
+) -> Float64[np.ndarray, "values C"]:
     """Return evenly spaced values from ``low`` to ``high``, per channel."""
     low, high = low.astype(np.float64), high.astype(np.float64)
     table = low + np.arange(top + 1)[:, None] * ((high - low) / max(top, 1))
@@ -189,7 +186,8 @@ def log_extent(means: Float32[np.ndarray, "N 3"] | Rows, pool: Workers | None = 
 def observed_range(quantized: Quantized) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
     """Return the range to write: values of the smallest and the largest level that occur, over all channels.
 
-    An image of a single level decodes to ``low`` everywhere, so both ends are then that level's value.
+    A SOG-XT decoder does not know the number of levels: it maps the smallest level of an image to one end and the
+    largest to the other (docs/reference/format.md). An image of a single level decodes to the first everywhere.
     """
     if quantized.levels.size == 0:
         return quantized.low, quantized.low

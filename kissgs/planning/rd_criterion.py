@@ -14,11 +14,6 @@ from kissgs.core.sensitivity import OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.planning.rows import Rows, for_each_block, sorted_order
 
-# Costs of errors of each Gaussian, its sensitivity class, and which Gaussians are pruned.
-#
-# Gaussians are ordered in classes of similar sensitivity, and each class has its own quantisation steps
-# (:mod:`kissgs.planning.rd_criterion`).
-
 FLOOR = 1e-3
 """Smallest sensitivity, in units of the median, so that Gaussians that no camera saw keep a bounded error."""
 

@@ -1,8 +1,6 @@
 """RDO quantisation: levels of the smallest squared image error plus lambda · bits.
 
-Rounding to the nearest level treats a Gaussian that fills the image and one behind a wall alike. Here every sensitivity
-class has its own step, a whole multiple of the plane's; and within a class, frequent levels are preferred where the
-error is small, so that the entropy code needs fewer bits.
+Every sensitivity class has its own step, and within a class, frequent levels are preferred where the error is small.
 """
 
 from __future__ import annotations

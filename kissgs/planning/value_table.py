@@ -1,8 +1,4 @@
-"""Tables of at most 256 values that all channels of an attribute share: where the values lie, and the nearest levels.
-
-A table holds the occupied points of an even lattice, so that outliers cost no step of the others. If more than 256
-points are occupied, the neighbours whose union adds the least weighted squared error are joined until 256 remain.
-"""
+"""Tables of at most 256 values that all channels of an attribute share, and the nearest levels."""
 
 from __future__ import annotations
 
@@ -29,7 +25,11 @@ MAX_POINTS = 1 << 14
 def fit_table(
     values: Float[np.ndarray, " V"], weights: Float64[np.ndarray, " V"], step: float, *, with_zero: bool = False
 ) -> Float32[np.ndarray, " levels"]:
-    """Return ascending values of a table for at least one value; ``step`` is the distance of the lattice points."""
+    """Return ascending values of a table for at least one value: the occupied points of a lattice of this ``step``.
+
+    So outliers cost no step of the others. If more than 256 points are occupied, the neighbours whose union adds the
+    least weighted squared error are joined.
+    """
     wide = np.asarray(values, np.float64)
     span = float(np.ptp(wide))
     step = max(step, span * 2.0**-40, 1e-30)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from helpers.codec_scenes import random_scene
 
+from kissgs.core.progress import silent
 from kissgs.core.resources import Workers
-from kissgs.planning.container_model import EVEN_LEVELS
+from kissgs.planning.container_model import EVEN_LEVELS, Planning
 from kissgs.planning.quantize import means_bits, quantize, quantize_means
 from kissgs.planning.rd_criterion import Costs
 from kissgs.planning.rdo_quantize import level_bits
@@ -81,8 +82,8 @@ def test_the_stored_form_is_the_largest_w_of_the_24_rotations(count):
     splats = random_scene(count, 0, seed=count)
     cells = np.random.default_rng(count).permutation(count).astype(np.int32)
     with Workers(2) as pool:
-        shapes, error = choose_forms(splats, cells, 8, Settings().encode, pool, lambda fraction: None, SOG)
-        free, _ = choose_forms(splats, cells, 8, Settings().encode, pool, lambda fraction: None, EVEN_LEVELS)
+        shapes, error = choose_forms(splats, cells, 8, Planning(Settings().encode, SOG, pool, silent))
+        free, _ = choose_forms(splats, cells, 8, Planning(Settings().encode, EVEN_LEVELS, pool, silent))
     quats = splats.quats[cells].astype(float)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     w = quats @ (ROTATIONS * (1, -1, -1, -1)).T
