@@ -32,17 +32,9 @@ SMALLEST_DIVISOR = 0.05
 """Smallest missing component of a rotation by which its gradient is divided."""
 
 
-def positions(logs: Float64[Tensor, "..."]) -> Float32[Tensor, "..."]:
-    """Return the positions of signed logarithms, sign(y) (e^|y| - 1): computed in float64, rounded to float32."""
-    return _SignedExp.apply(logs)  # type: ignore[no-untyped-call]
-
-
-def quaternions(small: Float64[Tensor, "M 3"], omitted: Int[Tensor, "M 1"]) -> Float32[Tensor, "M 4"]:
-    """Return quaternions of length 1 from three components and the index of the missing one, which is not negative."""
-    return _SmallestThree.apply(small, omitted)  # type: ignore[no-untyped-call]
-
-
 class _SignedExp(torch.autograd.Function):
+    """Positions of signed logarithms, sign(y) (e^|y| - 1): computed in float64, rounded to float32."""
+
     @staticmethod
     def forward(ctx: Any, y: Float64[Tensor, "..."]) -> Float32[Tensor, "..."]:  # noqa: ANN401
         x = torch.from_numpy(signed_exp(y.detach().cpu().numpy())).to(y.device)
@@ -57,6 +49,8 @@ class _SignedExp(torch.autograd.Function):
 
 
 class _SmallestThree(torch.autograd.Function):
+    """Quaternions of length 1 from three components and the index of the missing one, which is not negative."""
+
     @staticmethod
     def forward(ctx: Any, small: Float64[Tensor, "M 3"], omitted: Int[Tensor, "M 1"]) -> Float32[Tensor, "M 4"]:  # noqa: ANN401
         whole = smallest_three.whole(small.detach().cpu().numpy(), omitted[:, 0].cpu().numpy())
@@ -84,15 +78,9 @@ class Labels:
         self.starts = np.append(starts, len(labels))
 
 
-def look_up(entries: Float32[Tensor, "E K 3"], labels: Labels) -> Float32[Tensor, "M K 3"]:
-    """Return the codebook entry of each Gaussian.
-
-    On the CPU, gradients are summed in a fixed order, unlike those of torch's indexing.
-    """
-    return _LookUp.apply(entries, labels)  # type: ignore[no-untyped-call]
-
-
 class _LookUp(torch.autograd.Function):
+    """Codebook entry of each Gaussian. On the CPU, gradients are summed in a fixed order, unlike those of torch."""
+
     @staticmethod
     def forward(ctx: Any, entries: Float32[Tensor, "E K 3"], labels: Labels) -> Float32[Tensor, "M K 3"]:  # noqa: ANN401
         ctx.labels = labels
@@ -200,11 +188,11 @@ class QuantizedScene:
         values = {name: self.planes[name].values(latents, tables.get(name)) for name, latents in self.latents.items()}
         decoded = {name: values[field].float() for name, field in ATTRIBUTE_FIELDS.items()}
         if self._omitted is not None:
-            decoded["quats"] = quaternions(values["quaternions"], self._omitted)
+            decoded["quats"] = _SmallestThree.apply(values["quaternions"], self._omitted)  # type: ignore[no-untyped-call]
         coefficients = SH_REST_COUNTS[self._sh_degree]
         entries = values["f_rest_centroids"].float().reshape(-1, 3, COEFFICIENTS)[:, :, :coefficients]
-        decoded["shN"] = look_up(entries.transpose(1, 2).contiguous(), self._labels)
-        decoded["means"] = positions(values["means"])
+        decoded["shN"] = _LookUp.apply(entries.transpose(1, 2).contiguous(), self._labels)  # type: ignore[no-untyped-call]
+        decoded["means"] = _SignedExp.apply(values["means"])  # type: ignore[no-untyped-call]
         decoded["opacities"] = values["opacities"][:, 0].float()
         return decoded
 
