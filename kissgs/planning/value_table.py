@@ -6,7 +6,7 @@ import heapq
 
 import numpy as np
 
-from kissgs.core.array_types import Float, Float32, Float64, Int, UInt8
+from kissgs.core.array_types import Float, Float32, Float64, Integer, UInt8
 from kissgs.planning.quantize import Quantized
 
 SIZE = 256
@@ -103,7 +103,7 @@ def short_values(table: Float32[np.ndarray, " levels"]) -> Float32[np.ndarray, "
 
 def refit_table(
     table: Float32[np.ndarray, " levels"],
-    levels: Int[np.ndarray, "N C"],
+    levels: Integer[np.ndarray, "N C"],
     values: Float64[np.ndarray, "N C"],
     weights: Float64[np.ndarray, " N"],
     largest: tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]],
@@ -122,7 +122,7 @@ def refit_table(
 
 
 def without_unused(
-    table: Float32[np.ndarray, " levels"], levels: Int[np.ndarray, "N C"] | UInt8[np.ndarray, "N C"]
+    table: Float32[np.ndarray, " levels"], levels: Integer[np.ndarray, "N C"]
 ) -> tuple[Float32[np.ndarray, " used"], UInt8[np.ndarray, "N C"]]:
     """Return the table without the values that no level uses, and the levels in it."""
     used, index = np.unique(levels, return_inverse=True)

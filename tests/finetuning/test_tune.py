@@ -61,18 +61,19 @@ def tuned(
 
 
 def test_fine_tuning_raises_the_psnr_to_the_original_scene():
-    """Mean of four scenes: with twelve small training images each, single gains are 1.1 to 2.0 dB.
+    """Mean of scenes with and without SH: with twelve small training images each, single gains are 1.1 to 2.0 dB.
 
     Bits have no weight, which would trade PSNR for them.
     """
     gains = []
-    for seed in range(4):
-        encoded, report = tuned(cloud(150, 2, seed), steps=150, rate_weight=0)
+    for degree, seed in ((2, 0), (2, 1), (0, 0)):
+        encoded, report = tuned(cloud(150, degree, seed), steps=150, rate_weight=0)
         gains.append(report.psnr_after - report.psnr_before)
         assert report.kept
         assert report.target_source == "renderings"
         assert report.bytes_after == len(zip_bytes(encoded.files))
         assert len(decompress(encoded.files)) == 150
+    assert min(gains) > 0
     assert np.mean(gains) > 0.8
 
 
@@ -116,14 +117,6 @@ def capture(plans):
         plans.append(plan)
 
     return train
-
-
-def test_a_scene_without_sh_is_fine_tuned():
-    encoded, report = tuned(cloud(150, 0), steps=150)
-    assert report.kept
-    assert report.psnr_after > report.psnr_before
-    assert report.bytes_after == len(zip_bytes(encoded.files))
-    assert len(decompress(encoded.files)) == 150
 
 
 @pytest.mark.parametrize("degree", [2, 0])
