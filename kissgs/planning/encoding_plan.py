@@ -47,22 +47,19 @@ class EncodingPlan:
 
 @dataclass(frozen=True, slots=True)
 class Encoded:
-    """A container in memory, and figures of its encoding."""
+    """A container in memory, and figures of its encoding, some of them those of :class:`EncodingPlan`."""
 
     files: dict[str, bytes]  # name -> bytes, in the order in which they are best stored
-    # index in the encoded scene of every Gaussian of the container, in the container's order
-    order: Int[np.ndarray, " M"]
-    form_error: float  # largest relative change of a covariance by the plan of its equivalent form
+    order: Int[np.ndarray, " M"]  # index in the encoded scene of every Gaussian, in the container's order
+    form_error: float
     invisible: int  # number of Gaussians pruned because no renderer draws them
     pruned_by_rd: int  # number of Gaussians pruned because removing them costs less than their bits
-    # number of Gaussians with a clipped base colour (:func:`kissgs.planning.quantize.clip_outliers`)
     clipped_colors: int
-    # largest quantisation error by field and channel (:class:`kissgs.planning.encoding_plan.EncodingPlan`)
     errors: dict[str, list[float]]
-    rd_lambda: float | None  # squared error per bit; None for uniform planning
+    rd_lambda: float | None
     codebook_side: int  # S; the codebook has up to S × S entries
-    note: str = ""  # a sentence for the user if many Gaussians were pruned; else empty
-    coarse: str = ""  # a sentence for the user if the positions are too coarse for the Gaussians; else empty
+    note: str = ""
+    coarse: str = ""
 
     @classmethod
     def of(cls, plan: EncodingPlan, files: dict[str, bytes]) -> Encoded:

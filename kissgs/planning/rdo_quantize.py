@@ -123,22 +123,21 @@ def rdo_quantize(
     from kissgs.planning import rdo_kernels
 
     costs, classes = criterion.costs, criterion.classes
-    columns = [parts[name].levels.shape[1] for name in SHAPE_FIELDS]
     levels = np.concatenate([parts[name].levels for name in SHAPE_FIELDS], axis=1)
-    ends = np.array([_usable(parts[name], column) for name, column in _columns(columns)])
-    if tables is not None:
-        ends[0] = tables.first_drawn, tables.last_drawn
     omitted = parts["omitted"].levels[:, 0] if "omitted" in parts else None
     floor = np.array([float(cost.min(initial=np.inf)) for cost in (costs.opacity, costs.scale, costs.rotation)])
 
     for _ in range(ROUNDS):
         rate_table = criterion.rd_lambda * level_bits(levels, classes, pool)
-        values_of_levels = np.stack([_padded(parts[name].table, column) for name, column in _columns(columns)])
+        values_of_levels, ends = _values_of_levels([parts[name] for name in SHAPE_FIELDS])
+        if tables is not None:
+            ends[0] = tables.first_drawn, tables.last_drawn
 
         def choose(
             rows: slice,
             rate_table: Float64[np.ndarray, "classes C 256"] = rate_table,
             values_of_levels: Float64[np.ndarray, "C 256"] = values_of_levels,
+            ends: Int[np.ndarray, "C 2"] = ends,
         ) -> None:
             chosen = levels[rows].astype(np.int64)
             missing = np.full(len(chosen), -1) if omitted is None else omitted[rows].astype(np.int64)
@@ -153,7 +152,7 @@ def rdo_quantize(
                 values_of_levels,
                 ends,
                 rate_table,
-                _bounds(largest, rows, sum(columns)),
+                _bounds(largest, rows, levels.shape[1]),
                 floor,
                 chosen,
             )
@@ -165,26 +164,20 @@ def rdo_quantize(
             table = parts["scales"].table[:, 0].astype(np.float32)
             moved = refit_table(table, levels[:, 1:4], values[:][:, 1:4], costs.scale, bounds)
             parts = {**parts, "scales": replace(parts["scales"], table=moved.astype(np.float64)[:, None])}
-    chosen = np.split(levels, np.cumsum(columns)[:-1], axis=1)
+    chosen = np.split(levels, [1, 4], axis=1)
     found = {name: replace(parts[name], levels=own) for name, own in zip(SHAPE_FIELDS, chosen, strict=True)}
     return {**parts, **found}
 
 
-def _columns(columns: list[int]) -> list[tuple[str, int]]:
-    """Return the field of each column of levels, and its number in the field."""
-    return [(name, column) for name, number in zip(SHAPE_FIELDS, columns, strict=True) for column in range(number)]
-
-
-def _usable(part: Quantized, column: int) -> tuple[int, int]:
-    """Return the smallest and the largest level of a channel: the same if it is constant."""
-    table = part.table[:, column % part.table.shape[1]]
-    return 0, part.top if table[-1] > table[0] else 0
-
-
-def _padded(table: Float64[np.ndarray, "values _"], column: int) -> Float64[np.ndarray, " 256"]:
-    """Return the values of a channel, with the last one repeated to 256."""
-    own = table[:, column % table.shape[1]]
-    return np.pad(own, (0, SIZE - len(own)), mode="edge")
+def _values_of_levels(fields: list[Quantized]) -> tuple[Float64[np.ndarray, "C 256"], Int[np.ndarray, "C 2"]]:
+    """Return the values of the levels of every channel, and the first and last level to use: one if it is constant."""
+    values, ends = [], []
+    for field in fields:
+        for column in range(field.levels.shape[1]):
+            table = field.table[:, column % field.table.shape[1]]
+            values.append(np.pad(table, (0, SIZE - len(table)), mode="edge"))
+            ends.append((0, field.top if table[-1] > table[0] else 0))
+    return np.stack(values), np.array(ends)
 
 
 def _bounds(
