@@ -18,7 +18,7 @@ def warmup() -> None:
     from kissgs.compaction import covariance_kernels, merging, nearest_kernels  # noqa: F401
     from kissgs.core import numba_kernels
     from kissgs.finetuning import kernels as finetuning_kernels  # noqa: F401
-    from kissgs.planning import form_kernels, kmeans_kernels, order_kernels, rdo_kernels, table_kernels, tour_kernels  # noqa: F401
+    from kissgs.planning import form_kernels, kmeans_kernels, order_kernels, rdo_kernels, tour_kernels  # noqa: F401
     from kissgs.planning import kernels as planning_kernels  # noqa: F401
     from kissgs.rendering import ssim_kernels  # noqa: F401
     from kissgs.rendering.cpu import backward, coverage, neighbours, sensitivity  # noqa: F401

@@ -139,5 +139,5 @@ def metadata(plan: EncodingPlan, sh_degree: int) -> bytes:
 
 def _table(field: Quantized) -> list[float]:
     """Return 256 ascending values; the last is repeated."""
-    values = [0.0] if field.table is None else [float(str(value)) for value in field.table]
+    values = [float(str(value)) for value in field.table[:, 0].astype(np.float32)]
     return values + values[-1:] * (256 - len(values))
