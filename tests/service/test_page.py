@@ -6,22 +6,14 @@ import json
 import pytest
 from helpers.preview_browser import VENDOR
 from helpers.service import SLOW, SMALL, scene_bytes
-from helpers.viewers import chromium
+from helpers.viewers import NO_GPU, chromium
 
 import kissgs
-
-QUIET = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 
 
 @pytest.fixture(scope="module")
 def browser():
-    with chromium(QUIET) as browser:
+    with chromium(NO_GPU) as browser:
         yield browser
 
 

@@ -93,7 +93,7 @@ def kill_the_job(service, training):
 )
 @pytest.mark.quick(0)
 def test_training_continues_after_an_interruption(start_held, expected, stage, interrupt):
-    service, training = start_held(stage, KISSGS_DRAIN_SECONDS=0)
+    service, training = start_held(stage, drain_seconds=0)
     job = service.submit(options=json.dumps(BRIEF))
     training.wait()
     service.running(job, stage)
@@ -117,8 +117,8 @@ def of_another_version(path):
 
 @pytest.mark.parametrize("damage", [damaged, of_another_version])
 @pytest.mark.quick(0)
-def test_unusable_checkpoints_are_replaced(start, damage):
-    service = start()
+def test_unusable_checkpoints_are_replaced(start_process, damage):
+    service = start_process()
     job = service.submit(options=json.dumps(BRIEF))
     service.running(job)
     service.kill(signal.SIGKILL)
@@ -209,7 +209,7 @@ FINETUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": STEPS, "vi
 
 @pytest.mark.quick(0)
 def test_fine_tuning_continues_and_its_gain_is_reported(start_held):
-    service, training = start_held("finetune", KISSGS_DRAIN_SECONDS=0)
+    service, training = start_held("finetune", drain_seconds=0)
     job = service.submit(options=json.dumps(FINETUNED))
     training.wait()
     kept = folder_of(service, job) / "checkpoint-finetune.npz"

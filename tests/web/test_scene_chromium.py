@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from helpers.viewers import chromium
+from helpers.viewers import NO_GPU, chromium
 from helpers.web_scenes import (
     IMAGES,
     assert_progress,
@@ -18,10 +18,6 @@ from helpers.web_tools import Site
 
 import kissgs
 
-ARGUMENTS = [
-    *("--no-sandbox", "--disable-gpu", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync"),
-]
 MAX_ULPS = 1
 PAGE = b"<!doctype html><title>test</title>"
 # Counts calls of the browser's own decoder, makes it errors or fail, and counts workers.
@@ -82,7 +78,7 @@ def site():
 
 @pytest.fixture(scope="module")
 def browser():
-    with chromium(ARGUMENTS) as browser:
+    with chromium(NO_GPU) as browser:
         yield browser
 
 

@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 from helpers.streamed_scenes import small_sizes
-from helpers.viewers import chromium, opened, scattered, seen_from
+from helpers.viewers import chromium, opened, psnr, scattered, seen_from
 
 import kissgs
 from kissgs import Settings
@@ -30,10 +30,6 @@ def streamed(scene, folder, site):
     compress_streamed(folder / "scene.ply", folder / "city" / "lod-meta.json", settings=Settings.from_preset("fast"))
     files = {str(path.relative_to(folder)): path.read_bytes() for path in (folder / "city").rglob("*.*")}
     return folder / "city" / "lod-meta.json", site.put(folder.name, files) + "city/lod-meta.json"
-
-
-def psnr(a, b):
-    return -10 * np.log10(max(np.mean((a - b) ** 2), 1e-10))
 
 
 @pytest.mark.quick(0)

@@ -192,18 +192,18 @@ def assert_exact(folder, cases):
 
 
 @pytest.mark.parametrize("content", CONTENTS, ids=lambda content: content.__name__)
-@pytest.mark.quick(10)
+@pytest.mark.quick(6)
 def test_every_effort_and_size(content, tmp_path):
-    """All methods and qualities at one size, all sizes with one method, ``exact`` or not."""
+    """Methods and qualities at one size, all sizes with one method, ``exact`` or not."""
     cases = []
     image = image_of(content, 65, 49)
-    for method, quality in itertools.product(range(7), (0, 25, 50, 75, 100)):
+    for method, quality in itertools.product((0, 2, 4, 6), (0, 50, 100)):
         data = webp(image, method=method, quality=quality)
         cases.append((f"method {method} quality {quality}", data, image))
     for w, h in SIZES if content not in SLOW else SIZES[:8]:
         image = image_of(content, w, h)
         cases.append((f"{w} x {h}", webp(image, method=3), image))
-        cases.append((f"{w} x {h}, not exact", webp(image, exact=False, method=3), None))
+    cases.append(("not exact", webp(image, exact=False, method=3), None))
     assert_exact(tmp_path, cases)
 
 
