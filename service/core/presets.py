@@ -18,7 +18,7 @@ EVALUATION = 60.0
 
 @dataclass(frozen=True, slots=True)
 class _Facts:
-    """What users read about a preset, and approximate CPU seconds: a fixed part, and a part per million Gaussians."""
+    """Texts and figures of a preset, and approximate CPU seconds: a fixed part, and a part per million Gaussians."""
 
     title: str
     text: str

@@ -125,6 +125,11 @@ class Service:
         assert answer.status_code == 202, answer.text
         return answer.json()
 
+    def cancel(self, job: dict) -> dict:
+        answer = self.http.post(f"/v1/jobs/{job['id']}/cancel")
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
     def status(self, job: dict, wait: float = 0) -> dict:
         answer = self.http.get(f"/v1/jobs/{job['id']}", params={"wait": wait})
         assert answer.status_code == 200, answer.text

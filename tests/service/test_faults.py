@@ -8,21 +8,19 @@ import time
 
 import pytest
 from helpers.running import is_alive, wait_until
-from helpers.service import FAST, SLOW, SMALL, Service, ServiceProcess, problem, scene_bytes
+from helpers.service import FAST, SLOW, Service, ServiceProcess, problem, scene_bytes
 from sqlalchemy.exc import OperationalError
 
-import kissgs
 from service.http.server import config_of
 from service.jobs.worker import JobCompletion
 from service.storage.job_files import RESERVE_BYTES
 
 BIG = scene_bytes(20_000, 3)
 MEDIUM = scene_bytes(6_000, 2)
-EXPECTED = kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast")).to_zip()
 
 
 @pytest.mark.quick(0)
-def test_the_job_process_is_killed_twice(start):
+def test_the_job_process_is_killed_twice(start, local):
     service = start()
     job, next_one = service.submit(BIG, SLOW), service.submit()
     for start_number in (1, 2):
@@ -33,7 +31,7 @@ def test_the_job_process_is_killed_twice(start):
     assert (status["state"], status["starts"]) == ("failed", 2)
     assert (status["problem"]["code"], status["problem"]["retryable"]) == ("crashed", True)
     assert "SIGKILL" in status["problem"]["detail"]
-    assert service.only_result(next_one) == EXPECTED
+    assert service.only_result(next_one) == local.to_zip()
 
 
 @pytest.fixture
@@ -47,18 +45,18 @@ def tiny_disk(tmp_path):
     os.system(f"umount -l '{folder}'")
 
 
-def test_a_disk_that_fills_up_during_an_upload(tiny_disk):
+def test_a_disk_that_fills_up_during_an_upload(tiny_disk, local):
     with Service(tiny_disk / "data") as service:
         service.log = tiny_disk.parent / "log"
         for body in (BIG, iter([BIG[:2_000_000], BIG[2_000_000:]])):
             answer = service.http.post("/v1/jobs", content=body, params={"options": FAST})
             problem(answer, 507, "disk-full")
             assert service.leftovers() == []
-        assert service.only_result(service.submit()) == EXPECTED
+        assert service.only_result(service.submit()) == local.to_zip()
 
 
 @pytest.mark.quick(0)
-def test_a_disk_that_fills_up_during_a_job(tiny_disk):
+def test_a_disk_that_fills_up_during_a_job(tiny_disk, local):
     with Service(tiny_disk / "data") as service:
         job = service.submit(MEDIUM)
         service.running(job)
@@ -72,7 +70,7 @@ def test_a_disk_that_fills_up_during_a_job(tiny_disk):
         assert status["state"] in ("failed", "succeeded")
         if status["state"] == "failed":
             assert (status["problem"]["code"], status["problem"]["retryable"]) == ("output", True)
-        assert service.only_result(service.submit()) == EXPECTED
+        assert service.only_result(service.submit()) == local.to_zip()
 
 
 def fill(folder):

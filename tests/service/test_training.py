@@ -42,13 +42,13 @@ def expected():
 
 
 @pytest.fixture
-def start_held(start, tmp_path):
+def start_held(start_process, tmp_path):
     """Start a service and return it with the training of its jobs, which waits after so many checkpoints."""
 
     def begin(stage, pause=0.0, **settings):
         training = HeldTraining(tmp_path, SAVES[stage], pause=pause)
         (tmp_path / "sitecustomize.py").write_text(training.program)
-        return start(PYTHONPATH=f"{ROOT}{os.pathsep}{tmp_path}", **settings), training
+        return start_process(PYTHONPATH=f"{ROOT}{os.pathsep}{tmp_path}", **settings), training
 
     return begin
 

@@ -112,8 +112,8 @@ def test_too_many_pixels_are_refused_before_memory_is_allocated(tmp_path):
 
 # --- Damage ---------------------------------------------------------------------------------------
 
-CHANGES = 10_000
-PARTS = 8
+CHANGES = 5_000
+PARTS = 4
 LIMIT = 1 << 20
 
 
