@@ -71,7 +71,6 @@ def test_the_files_and_the_decoded_scene(service, job, local, tmp_path):
     ("options", "ending", "media_type"),
     [
         (FAST, ".zip", "application/zip"),
-        (json.dumps({"preset": "fast", "format": "sogxt"}), ".zip", "application/zip"),
         (SOG, ".sog", "application/octet-stream"),
     ],
 )

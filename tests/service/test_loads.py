@@ -224,7 +224,7 @@ def test_an_upload_while_the_service_stops(start, more):
     service = start()
     head = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(BIG)
     with service.raw(head + BIG[:100_000]) as connection:
-        wait_until(service.uploads)
+        wait_until(lambda: "kissgs_uploads_in_flight 1.0" in service.http.get("/metrics").text)
         service.interrupt()
         with contextlib.suppress(ConnectionError):
             connection.sendall(BIG[100_000 : 100_000 + more])
