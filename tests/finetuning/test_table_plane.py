@@ -98,6 +98,7 @@ def unrounded(work, levels, tables):
 
 
 @pytest.mark.parametrize(("preset", "degree"), [("balanced", 3), ("fast", 1), ("paper", 2)])
+@pytest.mark.quick(1)
 def test_gradients_of_levels_and_tables_are_finite_differences(preset, degree):
     scene = cloud(120, degree)
     work = quantized(scene, preset)

@@ -93,6 +93,7 @@ def test_jobs_have_the_bytes_of_the_library_and_report_every_stage(service):
     assert service.http.get("/readyz").status_code == 200
 
 
+@pytest.mark.quick(1)
 def test_an_expected_error_is_that_of_the_library_without_paths(service, tmp_path):
     """Headers are checked on arrival; that a file is cut short is found by the job."""
     kissgs.save(kissgs.sample_scene(300, sh_degree=1), tmp_path / "a.spz")
@@ -116,6 +117,7 @@ def test_a_waiting_and_a_running_job_are_cancelled(service):
     assert result_of(service, service.submit()) == compressed(SMALL)
 
 
+@pytest.mark.quick(1)
 def test_a_job_whose_process_is_killed_is_started_once_more(service):
     job = service.submit(MEDIUM, FAST)
     os.kill(*processes_of(service, job), signal.SIGKILL)
