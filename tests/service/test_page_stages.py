@@ -20,10 +20,8 @@ JOBS = {
     "fast": {"preset": "fast"},
     "evaluated": {"preset": "fast", "evaluate": True},
     "pruned": {"preset": "fast", "compact": {"ratio": 0.5, **VIEWS}},
-    "tuned fast": {"preset": "fast", "finetune": TUNED},
     "balanced": {"encode": FEW},
     "a share": {"encode": FEW, "compact": {"ratio": 0.5, **TRAINED}},
-    "more than all": {"encode": FEW, "compact": {"count": 300, **TRAINED}},
     "a loss by pruning": {"encode": FEW, "compact": {"max_psnr_drop": 3, **TRAINED}},
     "a size, tuned": {"encode": {"target_size": 6000, **FEW}, "finetune": TUNED},
     "merged": {"encode": FEW, "compact": {"ratio": 0.5, "method": "merge"}},
@@ -35,7 +33,6 @@ JOBS = {
         "finetune": {**TUNED, "enabled": None},
     },
     "time alone": {"time_limit": LONG, "encode": FEW, "finetune": {**TUNED, "enabled": None}},
-    "a loss": {"encode": {"max_psnr_drop": 0.5, **FEW}, "finetune": UNTUNED},
     "a loss by training": {
         "encode": {"max_psnr_drop": 3, **FEW},
         "compact": VIEWS,
@@ -46,7 +43,6 @@ JOBS = {
         "compact": {"auto_count": True, **TRAINED},
         "finetune": UNTUNED,
     },
-    "time and a size": {"time_limit": LONG, "encode": {"target_size": 6000, **FEW}, "finetune": UNTUNED},
     "time and tuning": {"time_limit": LONG, "encode": FEW, "finetune": TUNED},
 }
 

@@ -267,14 +267,6 @@ def test_the_command_says_once_that_the_service_refuses_and_why(scene, words):
 
 
 @pytest.mark.quick(0)
-def test_the_command_with_a_goal(service, scene, tmp_path):
-    words = f"--server {service.url} --target-size 14.5kB --finetune 0 --set sensitivity_views=4 -f -q"
-    done = kissgs_command("compress", scene, *words.split())
-    assert (done.returncode, done.stderr) == (0, "")
-    assert (tmp_path / "Schloß 1.zip").stat().st_size <= 14_500
-
-
-@pytest.mark.quick(0)
 def test_the_command_with_keys(start, scene):
     service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
     without = kissgs_command("compress", scene, "--server", service.url)

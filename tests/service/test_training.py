@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 from dataclasses import asdict
 
@@ -45,8 +44,8 @@ def expected():
 def start_held(start_process, tmp_path):
     """Start a service and return it with the training of its jobs, which waits after so many checkpoints."""
 
-    def begin(stage, pause=0.0, **settings):
-        training = HeldTraining(tmp_path, SAVES[stage], pause=pause)
+    def begin(stage, **settings):
+        training = HeldTraining(tmp_path, SAVES[stage])
         (tmp_path / "sitecustomize.py").write_text(training.program)
         return start_process(PYTHONPATH=f"{ROOT}{os.pathsep}{tmp_path}", **settings), training
 
@@ -188,20 +187,6 @@ def test_the_largest_record_of_steps():
     step = asdict(CompactionStep(name="sparsify", count=20_000_000, seconds=123.456789012345))
     (most,) = [limit.le for limit in CompactSettings.model_fields["prune_rounds"].metadata if hasattr(limit, "le")]
     assert len(json.dumps([step] * (2 * most + 3))) < STEPS_BYTES
-
-
-@pytest.mark.quick(0)
-def test_training_notes(start_held):
-    service, training = start_held("refine", pause=0.4)  # progress is sent a few times per second
-    job = service.submit(options=json.dumps(BRIEF))
-    training.wait()
-    note = service.running(job, "refine")["progress"]["note"]
-    assert re.fullmatch(r"1\d\d Gaussians, loss 0\.\d{4}, PSNR \d\d\.\d\d", note)
-    training.release()
-    assert service.ended(job)["state"] == "succeeded"
-    sent = [data for _, kind, data in events(service.http.get(job["links"]["events"]).text) if kind == "progress"]
-    assert {data["stage"] for data in sent if "note" in data} == {"sparsify", "refine"}
-    assert any(data.get("note") == note for data in sent)
 
 
 FINETUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": STEPS, "views": 24, "view_size": 48}}
