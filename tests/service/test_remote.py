@@ -125,6 +125,7 @@ def test_the_note_about_a_service_that_is_down_leaves_its_address_to_the_command
     assert url not in str(raised.value)
 
 
+@pytest.mark.quick(0)
 def test_cancelled_raised_by_progress_cancels_the_job(start, tmp_path):
     service = start()
     scene = tmp_path / "scene.ply"

@@ -263,6 +263,7 @@ def test_relative_addresses(do, site, large):
         assert assert_scene(report, large) <= MAX_ULPS
 
 
+@pytest.mark.quick(0)
 def test_a_real_scene(do, site, shared_data):
     files = dict(kissgs.compress(shared_data / "guitar" / "guitar.ply", settings=kissgs.Settings(preset="fast")).files)
     report = do(job(site.put("guitar", files), options={"keepPlanes": True}))

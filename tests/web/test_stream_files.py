@@ -88,7 +88,6 @@ def test_damaged_manifests(path, value, why):
     assert found["error"].startswith("The list of this scene's files is damaged: ")
 
 
-@pytest.mark.quick(0)
 def test_a_manifest_of_very_many_leaves_and_files():
     """The whole is one flat list of leaves, each with its own file."""
     count = 200_000

@@ -55,6 +55,7 @@ def with_sky(scene):
     return concatenate([scene, sky])
 
 
+@pytest.mark.quick(0)
 def test_the_environment_is_drawn_at_every_level(playcanvas, tmp_path, monkeypatch):
     small_sizes(monkeypatch, chunk=400, leaf=80, coarsest=200)
     monkeypatch.setattr(environment, "FEWEST", 100)

@@ -195,6 +195,7 @@ def test_a_file_read_by_spark_and_a_decoded_scene_agree(page, ending, beside, tm
 
 
 @pytest.mark.parametrize("ending", ["ply", "spz"])
+@pytest.mark.quick(1)
 def test_an_antialiased_scene_is_drawn_with_compensated_opacities(page, ending, tmp_path):
     """Decoded, and read from a marked file beside it; a classic scene after it is drawn as such."""
     scene = kissgs.sample_scene(5000, sh_degree=1)
