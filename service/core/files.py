@@ -18,10 +18,8 @@ DEFAULT: Format = "sogxt"
 class ContainerFile:
     """Ending and media type of a container.
 
-    Attributes:
-        ending: ending of the file's name.
-        media_type: type of the response. A ``.sog`` is a zip as well, but some browsers unpack what is called a zip, or
-            change the ending of its name; SOG has no registered type of its own.
+    A ``.sog`` is a zip as well, but some browsers unpack what is called a zip, or change the ending of its name; SOG
+    has no registered type of its own.
     """
 
     ending: str
@@ -49,9 +47,6 @@ def container_file(options: dict[str, Any]) -> ContainerFile:
 
 BYTES_PER_GAUSSIAN = (68, 104, 164, 248)
 """Bytes per Gaussian of a ``.ply``, by SH degree."""
-
-RESULT_BYTES_PER_GAUSSIAN, RESULT_BYTES = 64, 32 << 20
-"""Upper bound for a result, which has every file of its container twice: per Gaussian, and for codebooks and report."""
 
 STEPS_BYTES = 300_000
 """Upper bound for a checkpoint's record of completed steps, at the largest step count that the settings allow."""

@@ -63,11 +63,7 @@ class JobRunners:
 
     @classmethod
     def open(cls, settings: ServiceSettings) -> JobRunners:
-        """Open the runner that the settings name.
-
-        Raises:
-            kissgs.RunnerError: Ray is not installed or its cluster cannot be reached.
-        """
+        """Open the runner that the settings name."""
         local = runners.open_runner("local", unlimited=True)
         if settings.ray_address is None:
             return cls(settings, local, local)

@@ -368,6 +368,7 @@ def test_negative_scales_are_those_of_a_draft():
 @needs_splat_transform
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [1, 65])
+@pytest.mark.quick(3)
 def test_splat_transform_writes_what_we_read(degree, count, tmp_path):
     scene = made_scene(count, degree)
     with (tmp_path / "a.ply").open("wb") as file:

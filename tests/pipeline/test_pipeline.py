@@ -355,6 +355,7 @@ def test_given_sensitivity_is_used():
 
 @pytest.mark.parametrize("changes", [{"preset": "fast"}, {"preset": "balanced", "sensitivity_views": 2}])
 @pytest.mark.parametrize("needed", [False, True])
+@pytest.mark.quick(2)
 def test_a_scene_from_a_file_is_dropped_before_its_images_are_compressed(tmp_path, changes, needed):
     count = 1234
     kissgs.save(kissgs.sample_scene(count, sh_degree=1), tmp_path / "scene.ply")

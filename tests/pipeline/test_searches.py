@@ -116,6 +116,7 @@ def test_the_psnr_in_the_error_message_can_be_met():
     assert max(trial.psnr for trial in search(highest - 0.3).report.trials) >= highest - 0.3
 
 
+@pytest.mark.quick(0)
 def test_equal_gaussians_can_meet_a_psnr():
     """The PSNR over lambda is a staircase: the goal is met only after several attempts without gain."""
     equal = kissgs.sample_scene(400, sh_degree=1, seed=3).select([5] * 400)

@@ -51,6 +51,7 @@ WEIGHTS = [(0.0, 0.0), (0.2, 0.0), (1.0, 0.0), (0.2, 5.0), (1.0, 100.0)]
 
 @pytest.mark.parametrize(("weight", "mse_weight"), WEIGHTS)
 @pytest.mark.parametrize(("height", "width"), SIZES)
+@pytest.mark.quick(12)
 def test_the_value_agrees_with_the_textbook_formula(height, width, weight, mse_weight):
     image, target = pair(height, width, 3)
     expected = textbook_loss(image, target, weight, mse_weight)

@@ -71,6 +71,7 @@ def differences(splats, view, n):
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.quick(2)
 def test_shape_hessians_agree_with_derivatives_of_the_image(seed):
     splats, view = clean(blobs(6, seed % 3, seed=seed, log_scale=-1.5))[0], camera(seed=seed)
     found = measure_sensitivity(splats, weighted(view))
@@ -108,6 +109,7 @@ def test_shape_hessians_of_antialiased_scenes_agree_with_derivatives_of_the_imag
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.quick(1)
 def test_position_hessians_of_small_gaussians_agree_with_derivatives(seed):
     """The change of a footprint's shape by position is neglected; it is small for small Gaussians."""
     splats, view = clean(blobs(6, 0, seed=seed, log_scale=-3.5))[0], camera(90, 70, seed=seed)

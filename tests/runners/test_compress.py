@@ -113,7 +113,7 @@ def test_a_scene_whose_node_is_killed_has_the_same_bytes(cluster, scenes, tmp_pa
 
 
 @pytest.mark.quick(0)
-@pytest.mark.parametrize("moment", range(10))
+@pytest.mark.parametrize("moment", [1, 4, 8])
 def test_a_node_is_killed_at_any_moment(cluster, scenes, whole, tmp_path, moment):
     inputs = [scenes / "b.ply", scenes / "c.ply"]
     words = [KISSGS, "compress", *inputs, "-p", "fast", "-o", f"{tmp_path}/out/", "-q", "--ray", cluster.address]
@@ -129,7 +129,7 @@ def test_a_node_is_killed_at_any_moment(cluster, scenes, whole, tmp_path, moment
 
 
 @pytest.mark.quick(0)
-@pytest.mark.parametrize("moment", range(10))
+@pytest.mark.parametrize("moment", [1, 4, 8])
 def test_the_command_is_killed_at_any_moment_and_repeated(cluster, scenes, whole, tmp_path, moment):
     words = [KISSGS, "compress", scenes / "c.ply", "-p", "fast", "-o", tmp_path, "-q", "--ray", cluster.address]
     with subprocess.Popen(words) as command:

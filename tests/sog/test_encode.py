@@ -197,6 +197,7 @@ def test_a_target_size_counts_the_bytes_of_the_file(tmp_path):
     assert len(result.report.trials) > 1
 
 
+@pytest.mark.quick(0)
 def test_a_quality_goal_and_evaluation_decode_the_file():
     scene = sample_scene(250, sh_degree=0, seed=4)
     settings = Settings.research("balanced", psnr=32, max_encodes=3, **GLANCE)

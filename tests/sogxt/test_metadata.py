@@ -21,6 +21,7 @@ from kissgs.sogxt.metadata_reader import read_layout
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize(("count", "degree"), [(1, 0), (100, 3)])
+@pytest.mark.quick(4)
 def test_what_we_write_follows_the_schema(preset, count, degree):
     files = compress(random_scene(count, degree), settings=Settings.research(preset, **GLANCE)).files
     jsonschema.validate(yaml.safe_load(files["container_meta.yaml"]), ContainerMeta.model_json_schema())
@@ -230,6 +231,7 @@ def test_the_degree_of_foreign_containers_is_that_of_their_highest_band(degree):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.quick(1)
 def test_meta_json_alone_gives_the_same_scene(degree):
     files = dict(compress(random_scene(40, degree)).files)
     wanted = decompress(files)

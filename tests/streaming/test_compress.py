@@ -40,6 +40,7 @@ def target(request, tmp_path):
     return tmp_path / request.param
 
 
+@pytest.mark.quick(1)
 def test_every_level_is_read_and_every_leaf_has_every_level(scene, target):
     report = compress_streamed(scene, target, settings=FAST)
     original = kissgs.load(scene)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated
 
 from anyio.to_thread import run_sync
@@ -58,7 +59,7 @@ async def get_presets() -> Presets:
 @router.get("/v1/problems", tags=["facts"], operation_id="problems", summary="List the problem types")
 async def get_problems() -> list[ProblemKind]:
     """All codes that a problem document can have."""
-    return [_kind(code) for code in PROBLEM_TYPES]
+    return [ProblemKind(code=code, **asdict(kind)) for code, kind in PROBLEM_TYPES.items()]
 
 
 @router.get(
@@ -72,7 +73,7 @@ async def get_problem(code: Annotated[str, Path(description="Code of a problem t
     """Description of a problem type; the `type` of a problem document links to it."""
     if code not in PROBLEM_TYPES:
         raise ProblemError("not-found", f"there is no code {code!r}; GET /v1/problems lists all")
-    return _kind(code)
+    return ProblemKind(code=code, **asdict(PROBLEM_TYPES[code]))
 
 
 @router.head("/version", include_in_schema=False)
@@ -131,11 +132,6 @@ async def get_metrics(context: Service) -> Response:
     counts, disk = await run_sync(lambda: (context.store.counts(), context.store.disk_bytes()))
     context.metrics.uploads.set(context.admission.uploads)
     return Response(context.metrics.text(counts, disk), media_type=CONTENT_TYPE)
-
-
-def _kind(code: str) -> ProblemKind:
-    kind = PROBLEM_TYPES[code]
-    return ProblemKind(code=code, status=kind.status, title=kind.title, retryable=kind.retryable)
 
 
 def _database_problem(context: ServiceContainer) -> str | None:
