@@ -118,6 +118,25 @@ export function expandSH({ count, degree, labels, centroids }) {
   return shN;
 }
 
+/** Largest nesting of lists and objects, as in kissgs/io/files.py. */
+const MAX_DEPTH = 200;
+
+/**
+ * Parse JSON that is not nested too deep.
+ * @param {Uint8Array} json
+ * @returns {any}
+ */
+export function parseJson(json) {
+  const document = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
+  const isNested = (/** @type {any} */ value) => typeof value === "object" && value !== null;
+  let level = [document].filter(isNested);
+  for (let depth = 0; level.length; depth++) {
+    if (depth > MAX_DEPTH) throw new Error(`nested more than ${MAX_DEPTH} deep`);
+    level = level.flatMap((each) => Object.values(each).filter(isNested));
+  }
+  return document;
+}
+
 /**
  * Parse the metadata, an object.
  * @param {Uint8Array} json
@@ -125,7 +144,7 @@ export function expandSH({ count, degree, labels, centroids }) {
  */
 export function parseMeta(json) {
   try {
-    return JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
+    return parseJson(json);
   } catch (error) {
     throw new Error(`${META} is not readable JSON`, { cause: error });
   }

@@ -101,8 +101,8 @@ def compact(
     from kissgs.cli.console import progress_bar
     from kissgs.cli.signals import stoppable
     from kissgs.io.ply import write_ply
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.pipeline.pipeline import compact as run
-    from kissgs.pipeline.scene_files import ReadOptions
     from kissgs.training.checkpoint import delete_checkpoints
 
     settings = chosen(

@@ -44,8 +44,8 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
         KissgsError: as :func:`kissgs.compress`, or the files are not on storage that this machine shares.
     """
     from kissgs.cli.options import open_views
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.pipeline.pipeline import compress
-    from kissgs.pipeline.scene_files import ReadOptions
     from kissgs.settings import Settings
 
     scene, work = Path(arguments["scene"]), Path(arguments["work"])

@@ -44,7 +44,7 @@ def decompress(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Decode containers, and .sog, .spz, .splat, .ksplat, .glb and .gltf scenes, into .ply files."""
+    """Decode containers and scenes of other formats into .ply files."""
     from kissgs.pipeline.decompress import decompress as run
 
     def work(container: str, target: Path) -> dict[str, Any]:

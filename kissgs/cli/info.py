@@ -18,8 +18,8 @@ def info(
 ) -> None:
     """Describe scenes of any format and containers: Gaussians, SH degree, bytes per file, value ranges."""
     from kissgs.cli.tables import info_table
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.pipeline.inspect import describe
-    from kissgs.pipeline.scene_files import ReadOptions
 
     reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
 

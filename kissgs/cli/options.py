@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 import typer
 
 from kissgs.core.errors import UnsupportedError
-from kissgs.io.containers import ENDINGS, SCENE_ENDINGS
+from kissgs.formats import ENDINGS, SCENE_ENDINGS
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
-    from kissgs.io.containers import ContainerName
-    from kissgs.pipeline.scene_files import ReadOptions
+    from kissgs.formats import ContainerName
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.settings import Settings
 
 ScenesArgument = Annotated[
@@ -369,7 +369,7 @@ def reading_options(
     max_gaussians: int | None, level: int, raw_axes: bool, origin: str | None, antialiased: bool | None
 ) -> ReadOptions:
     """Return the options of reading scenes, with the value of ``--origin`` checked."""
-    from kissgs.pipeline.scene_files import ReadOptions
+    from kissgs.io.scene_format import ReadOptions
 
     return ReadOptions(
         max_gaussians=max_gaussians,

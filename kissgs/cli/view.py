@@ -27,7 +27,7 @@ from kissgs.cli.options import (
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 
 if TYPE_CHECKING:
-    from kissgs.pipeline.scene_files import ReadOptions
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.preview.page_scene import PageScene, StreamedFolder
 
 
@@ -67,7 +67,7 @@ def view(
     quiet: QuietOption = False,
 ) -> None:
     """Show a scene in the browser, from a server on this machine that Ctrl-C ends; -o writes a page instead."""
-    from kissgs.pipeline.scene_files import ReadOptions
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.preview.page_scene import fetch_viewer, page_files
 
     reading = ReadOptions(max_gaussians=max_gaussians, level=level or 0, raw_axes=raw_axes, antialiased=antialiased)

@@ -47,20 +47,9 @@ def is_packed(path: Path) -> bool:
 def write_container(
     files: Mapping[str, bytes], path: Path, *, overwrite: bool = False, names: Collection[str] = ()
 ) -> int:
-    """Write a container atomically: a zip if the name ends in ``.zip`` or ``.sog``, else a folder.
+    """Write a container atomically: a zip if the name ends in ``.zip`` or ``.sog``, else a folder; return its bytes.
 
-    Args:
-        files: the container's files.
-        path: the zip or the folder.
-        overwrite: replace what is there.
-        names: names that files of a folder to be replaced may have beside those of ``files``.
-
-    Returns:
-        Bytes written.
-
-    Raises:
-        OutputError: the path exists and ``overwrite`` is false, or the file system refuses. A folder is replaced only
-            if it holds a container and nothing else.
+    A folder is replaced only if it holds the files of a container, or those of ``names``, and nothing else.
     """
     check_destination(path, overwrite=overwrite, names={*files, *names})
     if is_packed(path):

@@ -17,6 +17,7 @@ from pydantic_core import PydanticCustomError
 
 from kissgs.core.origin import WORLD, Origin, recorded
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE, SH_REST_COUNTS
+from kissgs.io.containers import is_antialiased
 from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME
 
 TILE_ROWS, TILE_COLUMNS = 3, 5
@@ -121,7 +122,12 @@ class Layout(BaseModel):
     @property
     def antialiased(self) -> bool:
         """Whether the scene was trained with antialiasing."""
-        return self.model is not None and self.model.lower() == "antialiased"
+        return is_antialiased(self.model)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Phrases for what reading leaves out: nothing is."""
+        return ()
 
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
         """Return ``low`` and ``high`` of a field, one number per channel: float32 numbers, as float64."""

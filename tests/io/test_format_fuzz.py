@@ -16,9 +16,10 @@ import kissgs
 from kissgs.io.gltf import read_gltf
 from kissgs.io.ksplat import read_ksplat
 from kissgs.io.ply import read_ply
+from kissgs.io.scene_format import ReadOptions
 from kissgs.io.splat import read_splat
 from kissgs.io.spz import read_spz
-from kissgs.pipeline.scene_files import ReadOptions, read_scene
+from kissgs.pipeline.scene_files import read_scene
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.names import SCENE_NAME, YAML_NAME
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 import kissgs
 from kissgs import KissgsError, UnsupportedError, decompress
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.io.containers import MemorySource
+from kissgs.io.containers import MAX_METADATA_BYTES, MemorySource
 from kissgs.sogxt.metadata import CHANNELS
-from kissgs.sogxt.metadata_reader import MAX_METADATA_BYTES, read_layout
+from kissgs.sogxt.metadata_reader import read_layout
 
 JSON_ERRORS = [
     (lambda meta: meta.pop("means"), "meta.json lacks something that a SOG-XT container has: 'means'"),
