@@ -52,6 +52,13 @@ def parse_json(
     return document
 
 
+def whole_number(value: object, least: int, most: int) -> int | None:
+    """Return a whole number of JSON, which may be written 8.0, within bounds; None for anything else."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return value if isinstance(value, int) and not isinstance(value, bool) and least <= value <= most else None
+
+
 def _check_depth(document: object) -> None:
     level = [document]
     for _ in range(MAX_DEPTH + 1):

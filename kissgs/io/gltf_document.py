@@ -16,7 +16,7 @@ from kissgs.core.array_types import Float64, Shaped
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.io.containers import is_below
 from kissgs.io.conventions import Signs
-from kissgs.io.files import SceneFile, open_scene_file, parse_json
+from kissgs.io.files import SceneFile, open_scene_file, parse_json, whole_number
 
 GLB_MAGIC = b"glTF"
 
@@ -89,10 +89,8 @@ class Document:
 
     def whole(self, parent: dict[str, Any], key: str, default: int = 0) -> int:
         """Return a whole number that is not negative."""
-        found = parent.get(key, default)
-        if isinstance(found, float) and found.is_integer():
-            found = int(found)
-        if not isinstance(found, int) or isinstance(found, bool) or not 0 <= found < 1 << 53:
+        found = whole_number(parent.get(key, default), 0, (1 << 53) - 1)
+        if found is None:
             raise self.invalid(f"{key} is not a whole number")
         return found
 

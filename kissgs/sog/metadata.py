@@ -22,7 +22,7 @@ from kissgs.io.containers import (
     stated_text,
 )
 from kissgs.io.conventions import OPACITY_OF_BYTE
-from kissgs.io.files import listed, parse_json
+from kissgs.io.files import listed, parse_json, whole_number
 
 ENTRIES_PER_ROW = 64
 """Entries of the SH codebook in a row of its image."""
@@ -272,9 +272,7 @@ def _names(part: dict[str, Any], key: str, count: int) -> list[str]:
 
 
 def _whole(part: dict[str, Any], key: str, where: str, least: int, most: int) -> int:
-    value = part.get(key)
-    if isinstance(value, float) and value.is_integer():
-        value = int(value)
-    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+    value = whole_number(part.get(key), least, most)
+    if value is None:
         raise _MetadataError(f"{where}{key} is not a whole number from {least} to {most}; export the scene again")
     return value

@@ -12,7 +12,6 @@ from helpers.reference_ply import ENCODINGS, ply_bytes, random_columns
 from helpers.reference_splat import ksplat_bytes, splat_bytes
 from helpers.reference_spz import spz_bytes
 
-import kissgs
 from kissgs.io.gltf import read_gltf
 from kissgs.io.ksplat import read_ksplat
 from kissgs.io.ply import read_ply
@@ -20,8 +19,6 @@ from kissgs.io.scene_format import ReadOptions
 from kissgs.io.splat import read_splat
 from kissgs.io.spz import read_spz
 from kissgs.pipeline.scene_files import read_scene
-from kissgs.sogxt.container import zip_bytes
-from kissgs.sogxt.names import SCENE_NAME, YAML_NAME
 
 LIMIT = 100_000
 LIMITED = ReadOptions(max_gaussians=LIMIT)
@@ -76,27 +73,3 @@ def test_damaged_files_without_a_name():
     """Formats are recognised in damaged bytes, or the reader of .ply refuses them."""
     for _, data in FILES.values():
         check_all(data, lambda damaged: read_scene(damaged, LIMITED), seed=1)
-
-
-@pytest.fixture(scope="module")
-def container():
-    """Return the files of a SOG-XT container."""
-    return kissgs.compress(made_scene(20, 1), settings=kissgs.Settings.from_preset("fast")).files
-
-
-SOGXT_PLANES = ["active_mask", "means_bytes_1", "quaternions", "f_rest_centroids", "f_rest_labels"]
-
-
-@pytest.mark.parametrize("name", ["container_meta.yaml", "meta.json", *(f"{plane}.webp" for plane in SOGXT_PLANES)])
-def test_damaged_files_of_sogxt(container, name):
-    files = {key: data for key, data in container.items() if name != "meta.json" or key not in (YAML_NAME, SCENE_NAME)}
-
-    def read(damaged):
-        return read_scene({**files, name: damaged}, LIMITED, threads=1)
-
-    assert len(read(files[name])) == 18
-    check_all(files[name], read)
-
-
-def test_damaged_zip_of_sogxt(container):
-    check_all(zip_bytes(container), lambda damaged: read_scene(damaged, LIMITED, threads=1))

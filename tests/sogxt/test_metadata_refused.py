@@ -251,11 +251,12 @@ LEAVES = st.none() | st.booleans() | st.floats() | st.text(max_size=5) | st.inte
 @examples(60)
 @given(st.recursive(LEAVES, st.lists, max_leaves=8), st.data())
 def test_any_value_in_any_place_is_read_or_refused(value, data):
-    changed = document()
+    whole = {"document": document()}
+    changed = whole["document"]
     place, key = data.draw(
         st.sampled_from(
             [
-                *((part, key) for part in (changed, changed["meta"], changed["kissgs"]) for key in part),
+                *((part, key) for part in (whole, changed, changed["meta"], changed["kissgs"]) for key in part),
                 *((changed["ops"], i) for i in range(6)),
                 *((op, key) for op in changed["ops"] for key in op),
                 *((quantize_of(changed, field), key) for field in CHANNELS for key in ("min_values", "max_values")),
@@ -264,7 +265,7 @@ def test_any_value_in_any_place_is_read_or_refused(value, data):
     )
     place[key] = value
     try:
-        found = decompress(with_document(changed))
+        found = decompress(with_document(whole["document"]))
     except KissgsError:
         return
     assert all(np.isfinite(getattr(found, name)).all() for name in ATTRIBUTES)
