@@ -29,7 +29,8 @@ def describe(path: Path | bytes, level: int) -> Facts:
         present = files.names()
         missing = [name for name in PLANES if name not in present]
         if missing:
-            raise InvalidContainerError(f"{path} is incomplete: missing {', '.join(missing)}")
+            name = "the container" if isinstance(path, bytes) else path
+            raise InvalidContainerError(f"{name} is incomplete: missing {', '.join(missing)}")
         parts = {name: files.size(name) for name in FILES if name in present}
         count = layout.count if layout.count is not None else _count_mask(files, layout)
     origin = f"kissgs {made.version} from {made.source_count:,} Gaussians" if made else "unknown"
