@@ -12,7 +12,7 @@ from kissgs.core.progress import Progress
 from kissgs.core.splats import MAX_GAUSSIANS, Splats
 from kissgs.io.files import BinaryWriter
 
-Source = Path | bytes | Mapping[str, bytes]
+SceneSource = Path | bytes | Mapping[str, bytes]
 """A file or folder, the bytes of a file, or the files of a container in memory."""
 
 
@@ -92,7 +92,7 @@ def titled(name: str, *special: str | None) -> str:
 
 
 Read = Callable[[Any, ReadOptions, int, Progress], Splats]
-"""Read a :data:`Source`, with a number of threads (0: one per processor)."""
+"""Read a :data:`SceneSource`, with a number of threads (0: one per processor)."""
 
 Write = Callable[[BinaryWriter, Splats, bool, Progress], tuple[str, ...]]
 """Write a scene, with the axes of a ``.ply`` if true; return a phrase for each loss beyond the format's steps."""

@@ -64,14 +64,14 @@ def recognise(source: Path | bytes | Mapping[str, bytes], *, name: str | None = 
     if match == Match.SURE:
         return by_content
     ending = Path(name).suffix
-    by_ending = next((kind for kind, each in FORMATS.items() if ending in each.endings), "ply")
-    if FORMATS[by_ending].by_ending and head[:4] not in ZIP_MAGICS:
-        return by_ending
+    of_ending = next((kind for kind, each in FORMATS.items() if ending in each.endings), "ply")
+    if FORMATS[of_ending].by_ending and head[:4] not in ZIP_MAGICS:
+        return of_ending
     if is_container(source):
-        return _packed_format(source, "sog" if by_ending == "sog" else "sogxt")
-    if match == Match.LIKELY or (match == Match.POSSIBLE and by_ending == "ply"):
+        return _packed_format(source, "sog" if of_ending == "sog" else "sogxt")
+    if match == Match.LIKELY or (match == Match.POSSIBLE and of_ending == "ply"):
         return by_content
-    return by_ending
+    return of_ending
 
 
 def _by_content(head: bytes, size: int) -> tuple[Match, str]:

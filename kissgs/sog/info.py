@@ -12,7 +12,7 @@ from kissgs.core.progress import Progress
 from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import Splats
 from kissgs.io.containers import META_NAME, open_source, stored_size
-from kissgs.io.scene_format import Codec, Facts, ReadOptions, Source, titled
+from kissgs.io.scene_format import Codec, Facts, ReadOptions, SceneSource, titled
 from kissgs.sog.metadata import SogLayout, read_layout
 
 
@@ -57,7 +57,7 @@ def ranges_of(layouts: list[SogLayout]) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _read(source: Source, reading: ReadOptions, threads: int, progress: Progress) -> Splats:
+def _read(source: SceneSource, reading: ReadOptions, threads: int, progress: Progress) -> Splats:
     from kissgs.sog.decode import decode  # which the description does not need
 
     return decode(source, max_gaussians=reading.max_compressed, threads=threads, progress=progress)

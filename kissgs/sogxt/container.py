@@ -11,6 +11,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from kissgs.core.errors import OutputError
+from kissgs.formats import ENDINGS
 from kissgs.io.containers import open_source
 from kissgs.io.files import atomic_file, check_writable, move_into_place, path_state, reason_of, refuse_existing, umask
 from kissgs.sogxt.names import FILES
@@ -41,7 +42,7 @@ def stored_sizes(files: Mapping[str, bytes], *, packed: bool) -> tuple[int, dict
 
 def is_packed(path: Path) -> bool:
     """Whether a container of that name is a zip, not a folder."""
-    return path.suffix.lower() in (".zip", ".sog")
+    return path.suffix.lower() in ENDINGS
 
 
 def write_container(

@@ -11,9 +11,8 @@ from kissgs.core.origin import recorded
 from kissgs.core.progress import Progress
 from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import Splats
-from kissgs.io.containers import Source as Files
-from kissgs.io.containers import open_source
-from kissgs.io.scene_format import Codec, Facts, ReadOptions, Source, titled
+from kissgs.io.containers import Source, open_source
+from kissgs.io.scene_format import Codec, Facts, ReadOptions, SceneSource, titled
 from kissgs.sogxt.metadata import CHANNELS, Layout
 from kissgs.sogxt.metadata_reader import read_layout, read_provenance
 from kissgs.sogxt.names import FILES, PLANES
@@ -67,7 +66,7 @@ def ranges_of(layouts: list[Layout]) -> dict[str, tuple[float, float]]:
     return ranges
 
 
-def _count_mask(files: Files, layout: Layout) -> int:
+def _count_mask(files: Source, layout: Layout) -> int:
     from kissgs.io.webp import decode_plane
 
     side, name = layout.grid_side, "active_mask.webp"
@@ -75,7 +74,7 @@ def _count_mask(files: Files, layout: Layout) -> int:
     return int(np.count_nonzero(mask))
 
 
-def _read(source: Source, reading: ReadOptions, threads: int, progress: Progress) -> Splats:
+def _read(source: SceneSource, reading: ReadOptions, threads: int, progress: Progress) -> Splats:
     from kissgs.sogxt.decode import decode  # which the description does not need
 
     return decode(source, max_gaussians=reading.max_compressed, threads=threads, progress=progress)
