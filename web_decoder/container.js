@@ -118,33 +118,20 @@ export function expandSH({ count, degree, labels, centroids }) {
   return shN;
 }
 
-/** Largest nesting of lists and objects, as in kissgs/io/files.py. */
-const MAX_DEPTH = 200;
+/** @type {(value: any, most: number) => boolean} */
+const isDeeper = (value, most) =>
+  Object(value) === value && (most < 0 || Object.values(value).some((each) => isDeeper(each, most - 1)));
 
 /**
- * Parse JSON that is not nested too deep.
- * @param {Uint8Array} json
- * @returns {any}
- */
-export function parseJson(json) {
-  const document = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
-  const isNested = (/** @type {any} */ value) => typeof value === "object" && value !== null;
-  let level = [document].filter(isNested);
-  for (let depth = 0; level.length; depth++) {
-    if (depth > MAX_DEPTH) throw new Error(`nested more than ${MAX_DEPTH} deep`);
-    level = level.flatMap((each) => Object.values(each).filter(isNested));
-  }
-  return document;
-}
-
-/**
- * Parse the metadata, an object.
+ * Parse the metadata, an object, nested at most 200 deep.
  * @param {Uint8Array} json
  * @returns {any}
  */
 export function parseMeta(json) {
   try {
-    return parseJson(json);
+    const meta = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
+    if (isDeeper(meta, 200)) throw new Error("too deep");
+    return meta;
   } catch (error) {
     throw new Error(`${META} is not readable JSON`, { cause: error });
   }
