@@ -40,7 +40,7 @@ FILES = {
 
 @pytest.mark.parametrize("name", [name for name, (kind, _) in FILES.items() if kind != "ply"])
 def test_damaged_files(name):
-    """Those of .ply are in test_ply_fuzz.py."""
+    """Damaged .ply files are in test_ply_fuzz.py."""
     kind, data = FILES[name]
     check_all(data, lambda damaged: READERS[kind](damaged, max_gaussians=LIMIT))
 
