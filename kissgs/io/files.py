@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, Protocol, runtime_checkable
@@ -62,15 +62,10 @@ def whole_number(value: object, least: int, most: int) -> int | None:
 def _check_depth(document: object) -> None:
     level = [document]
     for _ in range(MAX_DEPTH + 1):
-        level = [value for each in level for value in _inside(each)]
+        nested = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
+        level = [value for values in nested for value in values]
     if any(isinstance(each, dict | list) for each in level):
         raise ValueError(f"nested more than {MAX_DEPTH} deep")
-
-
-def _inside(value: object) -> Iterable[object]:
-    if isinstance(value, dict):
-        return value.values()
-    return value if isinstance(value, list) else ()
 
 
 def _refuse_constant(name: str) -> NoReturn:
