@@ -5,19 +5,61 @@ from __future__ import annotations
 import json
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from pydantic import ByteSize
+from pydantic import BaseModel, ByteSize, Field
 
+from kissgs.core.splats import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE
 from kissgs.settings import PRESETS, CompactSettings, EncodeSettings, FinetuneSettings, Preset, Settings
 from kissgs.settings.compact import BUDGETS
 from kissgs.settings.stage import StageSettings
-from kissgs.sogxt.metadata import ContainerMeta
+from kissgs.sogxt.metadata import Limit, Provenance
 from service.core.problems import PROBLEM_TYPES
 from service.core.settings import ServiceSettings
 from service.http.app import create_app
 
 REFERENCE = Path(__file__).parent / "reference"
+
+
+class SimpleQuantize(BaseModel):
+    """Values of the smallest and the largest level in the field's image, per channel."""
+
+    min_values: Limit | list[Limit]
+    max_values: Limit | list[Limit]
+
+
+class Transform(BaseModel):
+    """One conversion step between levels and values."""
+
+    simple_quantize: SimpleQuantize
+
+
+class Op(BaseModel):
+    """Storage of one field."""
+
+    input_fields: list[str] = Field(min_length=1, max_length=1)
+    transforms: list[Transform] = Field(min_length=1)
+
+
+class Sides(BaseModel):
+    """Sizes of the images and the suffix of their files."""
+
+    grid_side: int = Field(ge=1, le=MAX_GRID_SIDE)
+    f_rest_centroids_side: int = Field(ge=1, le=MAX_CODEBOOK_SIDE)
+    image_codec: Literal["webp"]
+
+
+class ContainerMeta(BaseModel):
+    """``container_meta.yaml`` as kissgs writes it."""
+
+    meta: Sides
+    ops: list[Op]
+    model: Literal["antialiased"] | None = Field(
+        None, description="Variant of the renderer that the scene was trained with; missing for the classic one."
+    )
+    kissgs: Provenance | None = None
+    kissgs_crc32: int | None = Field(None, ge=0, lt=1 << 32, description="CRC-32 of all numbers that decoding needs.")
+
 
 SETTINGS = """# Settings
 

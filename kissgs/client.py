@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 from kissgs.core.errors import Cancelled, InvalidSceneError, KissgsError, RemoteError, UnsupportedError
 from kissgs.core.progress import Progress, silent
-from kissgs.io.containers import ContainerName, named_container
+from kissgs.formats import ContainerName, named_container
 from kissgs.io.files import atomic_file, reason_of, refuse_existing
 from kissgs.settings import Settings
 

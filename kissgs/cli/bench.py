@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from kissgs.cameras.views import Views
     from kissgs.evaluation.results import Evaluation
-    from kissgs.io.containers import ContainerName
+    from kissgs.formats import ContainerName
     from kissgs.pipeline.report import Report
     from kissgs.settings import Settings
 

@@ -84,7 +84,7 @@ def compress(
 ) -> None:
     """Compress each scene into a SOG-XT container, into SOG, or into a folder with levels of detail."""
     from kissgs.cli.options import CompressOptions
-    from kissgs.io.containers import ending_of, named_container, named_manifest
+    from kissgs.formats import ending_of, named_container, named_manifest
     from kissgs.pipeline.training_choice import decided
 
     named = None if output is None else Path(output)

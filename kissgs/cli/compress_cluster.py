@@ -36,8 +36,8 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
         "written", the path of the output; "report" for JSON; "table", the report as text for the terminal.
     """
     from kissgs.cli.options import open_views
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.pipeline.pipeline import compress
-    from kissgs.pipeline.scene_files import ReadOptions
     from kissgs.settings import Settings
 
     scene, work = Path(arguments["scene"]), Path(arguments["work"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -18,9 +18,7 @@ from kissgs.cli.options import (
     reads_scenes,
 )
 from kissgs.core.errors import InvalidSceneError, OutputError
-
-if TYPE_CHECKING:
-    from kissgs.pipeline.scene_files import OutputFormat
+from kissgs.formats import ENDINGS, OUTPUT_FORMATS, SCENE_ENDINGS, WRITTEN, alternatives, output_format
 
 
 @reads_scenes
@@ -29,13 +27,13 @@ def convert(
         list[str],
         typer.Argument(
             metavar="IN… OUT",
-            help="Scenes ('-' reads standard input), then the output: NAME.ply, .compressed.ply, .spz, .splat, .glb "
-            "or .spz.glb; with --to also a folder, or '-' for standard output.",
+            help=f"Scenes ('-' reads standard input), then the output: NAME{alternatives(WRITTEN)}; with --to also a "
+            "folder, or '-' for standard output.",
         ),
     ],
     to: Annotated[
         str | None,
-        typer.Option("--to", help="Format where OUT has no ending: ply, compressed.ply, spz, splat, glb or spz.glb."),
+        typer.Option("--to", help=f"Format where OUT has no ending: {alternatives(OUTPUT_FORMATS)}."),
     ] = None,
     origin: OriginOption = None,
     force: ForceOption = False,
@@ -43,7 +41,7 @@ def convert(
     *,
     common: SceneOptions,
 ) -> None:
-    """Convert scenes into .ply, .compressed.ply, .spz, .splat, .glb or .spz.glb; the ending of OUT decides."""
+    """Convert scenes into other formats; the ending of OUT decides."""
     from kissgs.core.origin import in_world
     from kissgs.core.splats import clean
     from kissgs.io.files import atomic_file, refuse_existing
@@ -78,11 +76,8 @@ def convert(
     for_each_input(inputs, output, f".{kind}", as_json, work, unreadable=InvalidSceneError)
 
 
-def _output_format(output: str, to: str | None) -> OutputFormat:
+def _output_format(output: str, to: str | None) -> str:
     """Return the format of the outputs: ``--to``, or what the ending of the output stands for."""
-    from kissgs.io.containers import ENDINGS, SCENE_ENDINGS
-    from kissgs.pipeline.scene_files import OUTPUT_FORMATS, output_format
-
     if to is None:
         if output == "-":
             raise OutputError(f"standard output has no ending; give --to: {', '.join(OUTPUT_FORMATS)}")

@@ -37,7 +37,7 @@ def decompress(
     *,
     common: SceneOptions,
 ) -> None:
-    """Decode containers, and .sog, .spz, .splat, .ksplat, .glb and .gltf scenes, into .ply files."""
+    """Decode containers and scenes of other formats into .ply files."""
     from kissgs.pipeline.decompress import decompress as run
 
     quiet = common.quiet or as_json

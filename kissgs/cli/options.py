@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args, get_t
 import typer
 
 from kissgs.core.errors import UnsupportedError
-from kissgs.io.containers import ENDINGS, SCENE_ENDINGS
+from kissgs.formats import ENDINGS, SCENE_ENDINGS
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
-    from kissgs.io.containers import ContainerName
-    from kissgs.pipeline.scene_files import ReadOptions
+    from kissgs.formats import ContainerName
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.settings import Settings
 
 
@@ -37,7 +37,7 @@ class SceneOptions:
 
     def reading(self, origin: str | None = None) -> ReadOptions:
         """Return the options of reading scenes; ``origin`` is the value of ``--origin``."""
-        from kissgs.pipeline.scene_files import ReadOptions
+        from kissgs.io.scene_format import ReadOptions
 
         return ReadOptions(
             max_gaussians=self.max_gaussians,

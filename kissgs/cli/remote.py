@@ -74,7 +74,7 @@ def compress(
     from kissgs.cli.tables import status_table
     from kissgs.client import Remote
     from kissgs.core.errors import UnsupportedError
-    from kissgs.io.containers import ending_of, named_container
+    from kissgs.formats import ending_of, named_container
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
@@ -142,7 +142,7 @@ def get(
     from kissgs.cli.tables import status_table
     from kissgs.client import Remote
     from kissgs.core.errors import OutputError
-    from kissgs.io.containers import ENDINGS, ending_of, named_container
+    from kissgs.formats import ENDINGS, ending_of, named_container
     from kissgs.io.files import refuse_existing
 
     if output is not None and output.suffix.lower() not in ENDINGS:

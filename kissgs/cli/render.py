@@ -178,7 +178,7 @@ def _suffix(file: str, output: str | None) -> str:
     """Return the ending of the output: .png unless ``output`` ends in .webp."""
     if file == "-":
         raise UnsupportedError("kissgs render reads a file, not standard input")
-    from kissgs.io.containers import names_folder
+    from kissgs.formats import names_folder
 
     if output in (None, "-") or names_folder(output):
         return ".png"

@@ -16,19 +16,11 @@ from kissgs.core.progress import Deadline, Progress, SearchNote, as_stage, ignor
 from kissgs.core.resources import StageTimer, peak_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import MAX_GAUSSIANS, Splats
-from kissgs.io.containers import ContainerName, named_container
+from kissgs.formats import ContainerName, named_container
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.report import Report
-from kissgs.pipeline.scene_files import (
-    DEFAULT_READ_OPTIONS,
-    AnyPath,
-    ReadOptions,
-    check_ply,
-    open_scene,
-    read_scene,
-    reading_notes,
-    save_ply,
-)
+from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
 from kissgs.pipeline.training_choice import decided, work_plan
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings

@@ -14,8 +14,9 @@ from kissgs.core.root_finding import StopRule, find_root
 from kissgs.core.splats import MAX_GAUSSIANS, Splats
 from kissgs.evaluation.results import ESTIMATED_DROP
 from kissgs.finetuning.result import FinetuneReport
+from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline.goal import Goal, Limit, Trial
-from kissgs.pipeline.scene_files import ReadOptions, read_scene
+from kissgs.pipeline.scene_files import read_scene
 from kissgs.planning.encoding_plan import Encoded
 from kissgs.planning.sh_codebook import COEFFICIENTS, codebook_side
 from kissgs.settings import EncodeSettings

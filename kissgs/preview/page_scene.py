@@ -16,21 +16,16 @@ from typing import Any
 from kissgs.core.errors import InvalidSceneError, KissgsError, UnsupportedError
 from kissgs.core.origin import WORLD
 from kissgs.core.progress import Progress, silent
-from kissgs.io.containers import CONTAINERS, Source, ending_of, open_source
+from kissgs.formats import CONTAINERS, FORMATS, ending_of
+from kissgs.io.containers import META_NAME, Source, open_source
 from kissgs.io.files import reason_of
 from kissgs.io.ply import write_ply
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.io.streamed import StreamedFormat
 from kissgs.pipeline.pipeline import compress
-from kissgs.pipeline.scene_files import (
-    DEFAULT_READ_OPTIONS,
-    STREAMED_FORMATS,
-    ReadOptions,
-    open_scene,
-    recognise,
-    scene_root,
-)
+from kissgs.pipeline.scene_files import open_scene, recognise, scene_root
 from kissgs.sog import streamed as streamed_sog
-from kissgs.sog.metadata import META_NAME, read_layout
+from kissgs.sog.metadata import read_layout
 from kissgs.sogxt import streamed as streamed_sogxt
 from kissgs.sogxt.container import zip_bytes
 
@@ -51,7 +46,7 @@ class StreamedFolder:
 
 def is_streamed(source: Path | bytes) -> bool:
     """Whether a scene is a streamed one, in a folder or a zip."""
-    return recognise(source) in STREAMED_FORMATS
+    return FORMATS[recognise(source)].manifest is not None
 
 
 def is_streamed_folder(source: Path) -> bool:
@@ -102,8 +97,7 @@ def _container_files(files: Source, name: str) -> list[str]:
         layout = read_layout(files, name)
     except KissgsError:
         return [name]
-    images = [*layout.files.values(), *([] if layout.rest is None else [layout.rest.centroids, layout.rest.labels])]
-    return [name, *(f"{parent}/{image}" if parent else image for image in images)]
+    return [name, *(f"{parent}/{image}" if parent else image for image in layout.images)]
 
 
 def fitting_level(source: Path | bytes, max_gaussians: int | None = None) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from kissgs.core.origin import WORLD
 from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, clean, concatenate, sampled_rows
-from kissgs.io.containers import ContainerName
+from kissgs.formats import ContainerName
 from kissgs.io.files import atomic_file
 from kissgs.pipeline.containers import MODELS, write_files
 from kissgs.pipeline.scene_files import reading_notes

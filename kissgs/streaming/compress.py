@@ -16,10 +16,11 @@ from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.origin import middle_of, with_origin, world_positions
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import BLOCK, Splats
-from kissgs.io.containers import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
+from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
 from kissgs.io.files import atomic_file, reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
-from kissgs.pipeline.scene_files import DEFAULT_READ_OPTIONS, AnyPath, ReadOptions, read_scene, recognise, stored_bytes
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
+from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, stored_bytes
 from kissgs.runners import Runner
 from kissgs.settings import Settings
 from kissgs.streaming import build

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.core.progress import Progress
-from kissgs.io.containers import MANIFESTS
+from kissgs.formats import MANIFESTS
 from kissgs.io.files import atomic_file, path_state, reason_of
 from kissgs.io.streamed import MAX_TREE_BYTES
 from kissgs.runners import Resources, Runner, WorkItem, error_of

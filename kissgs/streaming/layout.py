@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from kissgs.core.origin import Origin
-from kissgs.io.containers import MANIFESTS, ContainerName
+from kissgs.formats import MANIFESTS, ContainerName
+from kissgs.io.containers import META_NAME
 from kissgs.io.files import atomic_file
-from kissgs.sog.metadata import META_NAME
 
 CONTEXT = 280_000
 """Largest number of Gaussians of the level that stands for other chunks where sensitivity is measured."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import kissgs
+from kissgs.formats import UPLOADS
 
 Format = Literal["sogxt", "sog"]
 """Names of the library's containers."""
@@ -36,7 +37,7 @@ CONTAINER_FILES: dict[Format, ContainerFile] = {
     "sog": ContainerFile(".sog", "application/octet-stream"),
 }
 
-UPLOAD_FILES = ("scene.ply", "scene.sog", "scene.spz", "scene.splat", "scene.ksplat", "scene.glb")
+UPLOAD_FILES = tuple(f"scene{ending}" for ending in UPLOADS.values())
 """Names of a job's upload, of which it has one: the ending tells formats that are not recognised by their content."""
 
 

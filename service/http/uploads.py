@@ -20,6 +20,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect, Request
 
 import kissgs
+from kissgs.formats import DOUBLE_ENDINGS, UPLOADS, alternatives
 
 from ..core.problems import ProblemError, disk_full, invalid
 from ..core.settings import ServiceSettings
@@ -175,9 +176,6 @@ BLOCK_BYTES = 1 << 20
 LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")
 """Last line of a header, matched as a whole because a comment may end with ``end_header``."""
 
-UPLOAD_ENDINGS = {"ply": "ply", "sog": "sog", "spz": "spz", "splat": "splat", "ksplat": "ksplat", "gltf": "glb"}
-"""Formats of uploads, and their file endings: all that are one file."""
-
 HEAD_BYTES = 512
 """Bytes from which a format is recognised."""
 
@@ -207,7 +205,7 @@ class Received:
     @property
     def file_name(self) -> str:
         """Name of the upload in the folder of its job."""
-        return f"scene.{UPLOAD_ENDINGS[self.info.format]}"
+        return f"scene{UPLOADS[self.info.format]}"
 
 
 class Spool:
@@ -309,10 +307,10 @@ class Spool:
         name = f"upload{Path(self.name).suffix}"
         try:
             kind = kissgs.recognise(self._path, name=name)
-            if kind not in UPLOAD_ENDINGS:
+            if kind not in UPLOADS:
                 raise ProblemError(
                     "unsupported",
-                    "the upload is a zip file, but not a .sog; send a .ply, .sog, .spz, .splat, .ksplat or .glb",
+                    f"the upload is a zip file, but not a .sog; send a {alternatives(tuple(UPLOADS.values()))}",
                 )
             if kind == "gltf" and not self._is_glb():  # as large as the upload, and would be parsed in this process
                 raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")
@@ -416,8 +414,8 @@ def scene_name(given: str | None) -> str:
     """Return a scene name that is safe in listings and downloads: no path, no control characters, never empty."""
     name = re.split(r"[/\\]", unicodedata.normalize("NFC", given or ""))[-1]
     name = "".join(c for c in name if unicodedata.category(c)[0] != "C" and c not in '"<>|:*?')
-    endings = ("compressed.ply", "spz.glb", *UPLOAD_ENDINGS.values())
-    ending = next((f".{ending}" for ending in endings if name.lower().endswith(f".{ending}")), "")
+    endings = (*DOUBLE_ENDINGS, *UPLOADS.values())
+    ending = next((ending for ending in endings if name.lower().endswith(ending)), "")
     name = name[: len(name) - len(ending)]
     name = name.strip(" .")
     return name[:100] or "scene"

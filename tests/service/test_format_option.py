@@ -10,7 +10,7 @@ from helpers.service import FAST, SMALL, problem
 
 import kissgs
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.io.containers import CONTAINERS, ENDINGS
+from kissgs.formats import CONTAINERS, ENDINGS
 from service.core.files import CONTAINER_FILES, Format
 from service.core.schemas import JobOptions
 from service.http.submission import Submission

@@ -100,7 +100,7 @@ def test_damage_behind_the_headers_fails_the_job(service):
 
 def test_the_limits_name_the_formats(service):
     assert service.http.get("/v1/limits").json()["formats"] == [
-        "ply", "compressed.ply", "sog", "spz", "splat", "ksplat", "glb",
+        "ply", "sog", "spz", "splat", "ksplat", "glb", "compressed.ply", "spz.glb",
     ]  # fmt: skip
     with zipfile.ZipFile(io.BytesIO(FILES["a.sog"][1])) as archive:
         assert "meta.json" in archive.namelist()

@@ -10,7 +10,8 @@ from helpers.reference_sog import sog_files, zip_of
 from helpers.streamed_scenes import KINDS
 from PIL import Image
 
-from kissgs.pipeline.scene_files import ReadOptions, read_scene
+from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline.scene_files import read_scene
 from kissgs.sog.decode import decode
 
 LIMIT = 100_000

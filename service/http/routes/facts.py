@@ -10,6 +10,7 @@ from fastapi import APIRouter, Path, Response
 from sqlalchemy.exc import SQLAlchemyError
 
 import kissgs
+from kissgs.formats import DOUBLE_ENDINGS, UPLOADS
 
 from ...core.files import CONTAINER_FILES
 from ...core.metrics import CONTENT_TYPE
@@ -31,7 +32,7 @@ async def get_limits(context: Service) -> Limits:
     """Limits of uploads and jobs; requests beyond them are refused."""
     settings = context.settings
     return Limits(
-        formats=["ply", "compressed.ply", "sog", "spz", "splat", "ksplat", "glb"],
+        formats=[ending.removeprefix(".") for ending in (*UPLOADS.values(), *DOUBLE_ENDINGS)],
         containers=list(CONTAINER_FILES),
         max_upload_bytes=settings.max_upload_bytes,
         max_header_bytes=settings.max_header_bytes,
