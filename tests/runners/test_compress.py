@@ -173,13 +173,6 @@ def test_a_machine_without_the_shared_storage(scenes, tmp_path, change, expected
     assert expected in str(raised.value)
 
 
-def test_ray_is_not_installed(scenes, monkeypatch):
-    from kissgs.runners import ray_runner
-
-    monkeypatch.setattr(ray_runner, "find_spec", lambda name: None)
-    assert "pip install 'kissgs[ray]'" in failure("compress", scenes / "a.ply", "--ray")
-
-
 @pytest.mark.quick(0)
 def test_a_cluster_of_this_machine_is_started_where_there_is_none(scenes, tmp_path, monkeypatch):
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))  # where a cluster of this machine would be found
