@@ -22,7 +22,7 @@ from kissgs.cli.files import show, sibling
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.io.files import move_into_place, open_scene_file, reason_of
-from kissgs.runners import INTERNAL, Outcome, Resources, RunHandle, Runner, WorkItem, error_of, open_runner
+from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of
 from kissgs.sogxt.container import check_destination
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ class ClusterCompression:
             raise UnsupportedError("--ray needs files that all machines see, not standard input or output")
         with progress_bar(self.options.quiet) as bar:
             bar("cluster", 0.0)
-            runner = open_runner("ray", self.address)
+            runner = RayRunner(self.address)
         try:
             requested = self._request(runner, len(inputs))
             for name, target in inputs:
@@ -173,8 +173,8 @@ class ClusterCompression:
 
     def _request(self, runner: Runner, count: int) -> Resources:
         """Return the processors and GPUs of each of ``count`` scenes, which share all without ``--threads``."""
-        stats = runner.stats()
-        share = min(stats.smallest_cpus, stats.cpus // count)
+        processors = [node.cpus for node in runner.nodes]
+        share = min(*processors, sum(processors) // count) if processors else 0
         cpus = self.options.threads or max(1, int(share))
         requested = Resources(cpus, gpus=1 if self.options.device == "cuda" else 0)
         if refusal := runner.refusal(requested):
@@ -222,7 +222,7 @@ class ClusterCompression:
 
     def _with_memory(self, runner: Runner, requested: Resources, memory: int) -> Resources:
         """Return a request with memory, at most that of the largest node that has the rest of it."""
-        nodes = [node.total.memory for node in runner.stats().nodes if requested.fits(node.total)]
+        nodes = [node.memory for node in runner.nodes if requested.fits(node)]
         resources = Resources(requested.cpus, min(memory, max(nodes, default=0)), requested.gpus)
         if refusal := runner.refusal(resources):
             raise UnsupportedError(refusal)

@@ -48,10 +48,10 @@ def compress_streamed(options: CompressOptions, ray: str | None, scene: str, tar
 
         runner = None
         if ray is not None:
-            from kissgs.runners import open_runner
+            from kissgs.runners import RayRunner
 
             progress("cluster", 0.0)
-            runner = open_runner("ray", ray)
+            runner = RayRunner(ray)
             ending.callback(runner.close)
         report = run(
             scene,

@@ -73,7 +73,7 @@ def two(seed, coefficients=3):
     return scene, scene.means.astype(np.float64), covariance(scene), alphas, colors
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_moments_opacity_and_error_of_a_pair(seed):
     scene, means, full, alphas, colors = two(seed)
     spacing, pixels = np.full(2, 3.0), Pixels()
@@ -215,25 +215,18 @@ def test_covariances_become_rotations_and_scales_again(seed):
     np.testing.assert_allclose(again, covariance(scene), atol=tolerance)
 
 
-@pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize(("count", "left"), [(1, 1), (2, 1), (7, 3), (8, 7), (9, 1), (100, 33)])
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize(("count", "left"), [(0, 1), (1, 1), (2, 1), (8, 7), (9, 9), (100, 33)])
 def test_the_count_is_exact_and_gaussians_that_stay_are_untouched(degree, count, left):
     scene = cloud(count, degree=degree)
     merged, index = merge_gaussians(scene, left)
+    left = min(left, count)
     assert len(merged) == left
     assert (np.diff(index, prepend=-1) > 0).all()
     assert same(kissgs.clean(merged)[0], merged)
     alone = [n for n, origin in enumerate(index) if (merged.means[n] == scene.means[origin]).all()]
     assert same(merged.select(np.array(alone, int)), scene.select(index[alone]))
     assert len(alone) >= 2 * left - count
-
-
-@pytest.mark.parametrize("count", [0, 1, 9])
-def test_a_scene_with_few_gaussians_is_unchanged(count):
-    scene = cloud(count)
-    merged, index = merge_gaussians(scene, max(count, 1))
-    assert same(merged, scene)
-    assert index.tolist() == list(range(count))
 
 
 def test_the_result_depends_neither_on_threads_nor_on_the_order():
@@ -258,9 +251,8 @@ EXTREMES = {
 
 
 @pytest.mark.parametrize("name", EXTREMES)
-@pytest.mark.parametrize("seed", range(3))
-def test_extreme_values_give_a_clean_scene(name, seed):
-    scene, rng = cloud(60, degree=1), np.random.default_rng(seed)
+def test_extreme_values_give_a_clean_scene(name):
+    scene, rng = cloud(60, degree=1), np.random.default_rng(0)
     values = rng.choice(np.float32(EXTREMES[name]), size=getattr(scene, name).shape)
     scene = kissgs.clean(replace(scene, **{name: values}))[0]
     for left in (30, 7, 1):
@@ -304,9 +296,5 @@ def test_a_budget_is_met_by_merging_without_views():
     assert [(step.name, step.count) for step in result.report.steps] == [("input", 200), ("merge", 50)]
     assert (result.report.target_source, result.report.source) == ("nothing", "")
     assert all(getattr(result.splats, name).dtype == np.float32 for name in ATTRIBUTES)
-
-
-def test_merging_draws_no_cameras_that_nothing_uses():
-    compactor = Compactor.of(cloud(200, degree=1), CompactSettings(ratio=0.25, method="merge"), None)
-    assert compactor.supervision.train == compactor.supervision.score == ()
-    assert len(compactor(50).splats) == 50
+    supervision = Compactor.of(scene, CompactSettings(ratio=0.25, method="merge"), None).supervision
+    assert supervision.train == supervision.score == (), "it draws no cameras that nothing uses"
