@@ -110,11 +110,9 @@ def leaf_groups(
     Returns:
         Indices of the Gaussians, leaf after leaf, ascending within each; and the edges of the leaves in it.
     """
-    from kissgs.rendering.cpu.neighbours import split_into_leaves
+    from kissgs.rendering.cpu.neighbours import leaves_of
 
-    order, edges = np.arange(len(means), dtype=np.int32), np.empty(4 * len(means) // leaf + 2, np.int64)
-    leaves = split_into_leaves(np.ascontiguousarray(means.T), leaf, order, edges)
-    edges = edges[: leaves + 1]
+    order, edges = leaves_of(means, leaf)
     for first, last in itertools.pairwise(edges):
         order[first:last].sort()
     return order.astype(np.int64), edges
