@@ -15,7 +15,7 @@ SAMPLE_COUNT = 20_000
 
 def warmup() -> None:
     """Compile and cache all kernels, and measure the speed of this machine, by which --time chooses what to do."""
-    from kissgs.compaction import covariance_kernels, merging, nearest_kernels  # noqa: F401
+    from kissgs.compaction import covariance_kernels, merging  # noqa: F401
     from kissgs.core import numba_kernels
     from kissgs.finetuning import kernels as finetuning_kernels  # noqa: F401
     from kissgs.planning import form_kernels, kmeans_kernels, order_kernels, rdo_kernels, tour_kernels  # noqa: F401

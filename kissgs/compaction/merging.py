@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
-from kissgs.compaction import covariance_kernels, nearest_kernels
+from kissgs.compaction import covariance_kernels
 from kissgs.core.array_types import Bool, Float32, Float64, Int32, Int64
 from kissgs.core.numba_kernels import compiled
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import LOG_SCALE_LIMIT, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, Splats
-from kissgs.rendering.cpu.neighbours import split_into_leaves
+from kissgs.rendering.cpu.neighbours import SEARCH_LEAF, leaves_of, nearest_neighbours, unique_pairs
 from kissgs.rendering.cpu.tiles import each_part, even
 
 # Numba kernels of merging: moments, opacity and error of two Gaussians that become one.
@@ -261,9 +261,6 @@ def merge(
 NEIGHBOURS = 8
 """Number of nearest neighbours that a Gaussian may merge with."""
 
-LEAF = 16
-"""Largest number of Gaussians in a leaf of the search tree."""
-
 SPACING_RANK = 3
 """Neighbour, from 0, whose distance is the spacing of the Gaussians."""
 
@@ -332,7 +329,7 @@ class _Clusters:
 
     def __post_init__(self) -> None:
         splats, count = self.source, len(self.source)
-        self.origin, _, _ = self._leaves(splats.means)
+        self.origin, _ = leaves_of(splats.means, SEARCH_LEAF)
         self.means = splats.means[self.origin].astype(np.float64)
         self.covariances = np.empty((count, 6))
         quats, scales = splats.quats[self.origin], splats.scales[self.origin]
@@ -354,8 +351,9 @@ class _Clusters:
 
     def _merge(self, disappearing: int) -> None:
         """Merge the pairs that add the least error until this many Gaussians disappear, or fewer if pairs run out."""
-        near, spacing = self._neighbours()
         count, weights = len(self.means), np.empty(len(self.means))
+        neighbours = min(NEIGHBOURS, count - 1)
+        near, spacing = nearest_neighbours(self.means, neighbours, min(SPACING_RANK, neighbours - 1), self.pool)
         self._each(count, lambda a, b: opacity_areas(self.covariances, self.alphas, spacing, BLUR, a, b, weights))
         self.heaviest = np.where(self.merged, self.heaviest, weights)
         joined, added = self._cheapest_pairs(near, weights, spacing, disappearing)
@@ -377,7 +375,7 @@ class _Clusters:
     ) -> tuple[Int32[np.ndarray, "P 2"], Float64[np.ndarray, " P"]]:
         """Return at most ``count`` pairs of which no two share a Gaussian, and the error that each adds."""
         pairs = np.empty((near.size, 2), np.int32)
-        pairs = pairs[: nearest_kernels.unique_pairs(near, pairs)]
+        pairs = pairs[: unique_pairs(near, pairs)]
         added = np.empty(len(pairs))
         gaussians = self.means, self.covariances, self.alphas, self.colors, weights, spacing
         self._each(
@@ -406,26 +404,6 @@ class _Clusters:
             some = rows[a : a + BLOCK]
             self.colors[a : a + len(some)] = self.colors[some]
         self.colors = self.colors[: len(rows)]
-
-    def _neighbours(self) -> tuple[Int32[np.ndarray, "M K"], Float64[np.ndarray, " M"]]:
-        """Return the nearest neighbours of each Gaussian, and its squared spacing."""
-        count = len(self.means)
-        order, edges, leaves = self._leaves(self.means)
-        boxes = np.empty((2 << (leaves - 1).bit_length(), 2, 3))
-        nearest_kernels.fill_boxes(self.means, order, edges, leaves, boxes)
-        near, spacing = np.empty((count, min(NEIGHBOURS, count - 1)), np.int32), np.empty(count)
-        rank = min(SPACING_RANK, near.shape[1] - 1)
-        self._each(
-            leaves, lambda a, b: nearest_kernels.nearest(self.means, order, edges, boxes, a, b, rank, near, spacing)
-        )
-        return near, spacing
-
-    @staticmethod
-    def _leaves(means: np.ndarray) -> tuple[Int32[np.ndarray, " M"], Int64[np.ndarray, " edges"], int]:
-        """Return the indices of the Gaussians in the order of a k-d tree, and the edges and number of its leaves."""
-        order, edges = np.arange(len(means), dtype=np.int32), np.empty(4 * len(means) // LEAF + 2, np.int64)
-        leaves = split_into_leaves(np.ascontiguousarray(means.T.astype(np.float32)), LEAF, order, edges)
-        return order, edges, leaves
 
     def _each(self, count: int, kernel: Callable[[int, int], None]) -> None:
         """Call a kernel with the first and last row of each part, in threads."""

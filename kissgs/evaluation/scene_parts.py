@@ -259,8 +259,8 @@ def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     ones, zeros = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     ones[:, :, 0] = 1  # so the gradient with respect to a red value is the sum of weights
     v_slots, slots, _ = differentiate_footprints(frame, ones, zeros, pool)
-    weights = np.zeros(len(frame.splats), np.float64)
-    blending.sum_errors(np.ascontiguousarray(v_slots[:, 6]), slots.rows, slots.first, frame.footprints.visible, weights)
+    weights = np.zeros(len(frame.footprints.visible), np.float64)
+    blending.sum_errors(np.ascontiguousarray(v_slots[:, 6]), slots, frame.footprints.visible, weights)
     return weights
 
 

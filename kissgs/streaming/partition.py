@@ -89,12 +89,10 @@ def chunk_depth(count: int, chunk: int) -> int:
 def leaf_groups(
     means: Float32[np.ndarray, "n 3"], leaf: int
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " e"]]:
-    """Split a chunk into leaves of at most ``leaf`` Gaussians of equal counts."""
-    from kissgs.rendering.cpu.neighbours import split_into_leaves
+    """Split a chunk into leaves of at most ``leaf`` Gaussians: indices, ascending within each leaf, and its edges."""
+    from kissgs.rendering.cpu.neighbours import leaves_of
 
-    order, edges = np.arange(len(means), dtype=np.int32), np.empty(4 * len(means) // leaf + 2, np.int64)
-    leaves = split_into_leaves(np.ascontiguousarray(means.T), leaf, order, edges)
-    edges = edges[: leaves + 1]
+    order, edges = leaves_of(means, leaf)
     for first, last in itertools.pairwise(edges):
         order[first:last].sort()
     return order.astype(np.int64), edges

@@ -11,14 +11,15 @@ from hypothesis import strategies as st
 
 import kissgs
 from kissgs import CompactSettings
-from kissgs.compaction import covariance_kernels, nearest_kernels
+from kissgs.compaction import covariance_kernels
 from kissgs.compaction import merging as merge_kernels
 from kissgs.compaction.budget import Compactor, compact_scene
-from kissgs.compaction.merging import BLUR, CONTRAST, LEAF, NEIGHBOURS, SPACING_RANK, merge_gaussians
+from kissgs.compaction.merging import BLUR, CONTRAST, merge_gaussians
 from kissgs.compaction.scoring import highest_indices
+from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN
 from kissgs.rendering.camera import look_at
-from kissgs.rendering.cpu.neighbours import split_into_leaves
+from kissgs.rendering.cpu.neighbours import nearest_neighbours, unique_pairs
 from kissgs.rendering.rasterizer import render
 
 AXES = ((1, 2), (0, 2), (0, 1))
@@ -175,26 +176,17 @@ def test_two_gaussians_at_one_place_cover_as_both_together():
 def test_nearest_neighbours(count):
     rng = np.random.default_rng(count)
     means = rng.normal(size=(count, 3)) * [1, 1e3, 1e-3]
-    near, spacing = neighbours(means)
+    known = min(8, count - 1)
+    with Workers(2) as pool:
+        near, spacing = nearest_neighbours(means, known, min(3, known - 1), pool)
     distances = ((means[:, None] - means) ** 2).sum(axis=2)
     np.fill_diagonal(distances, np.inf)
     assert (near == np.argsort(distances, axis=1)[:, : near.shape[1]]).all()
-    np.testing.assert_allclose(spacing, np.sort(distances, axis=1)[:, min(SPACING_RANK, near.shape[1] - 1)])
+    np.testing.assert_allclose(spacing, np.sort(distances, axis=1)[:, min(3, known - 1)])
     pairs = np.empty((near.size, 2), np.int32)
-    pairs = pairs[: nearest_kernels.unique_pairs(near, pairs)]
+    pairs = pairs[: unique_pairs(near, pairs)]
     listed = sorted(map(tuple, pairs.tolist()))
     assert listed == sorted({(min(i, j), max(i, j)) for i, row in enumerate(near.tolist()) for j in row})
-
-
-def neighbours(means):
-    count = len(means)
-    order, edges = np.arange(count, dtype=np.int32), np.empty(4 * count // LEAF + 2, np.int64)
-    leaves = split_into_leaves(np.ascontiguousarray(means.T.astype(np.float32)), LEAF, order, edges)
-    boxes = np.empty((2 << (leaves - 1).bit_length(), 2, 3))
-    nearest_kernels.fill_boxes(means, order, edges, leaves, boxes)
-    near, spacing = np.empty((count, min(NEIGHBOURS, count - 1)), np.int32), np.empty(count)
-    nearest_kernels.nearest(means, order, edges, boxes, 0, leaves, min(SPACING_RANK, near.shape[1] - 1), near, spacing)
-    return near, spacing
 
 
 @given(st.integers(0, 10**6))
