@@ -358,7 +358,7 @@ class Worker:
 
     def _task(self, job: Job, upload: str, work: Path) -> dict[str, Any]:
         """Return the task of a start, whose result goes to ``work`` in the job's folder."""
-        options = JobOptions.model_validate(job.options)
+        options = JobOptions.stored(job.options)
         checkpoints = self.storage.checkpoints(job.id) if options.resumable else []
         return {
             "function": COMPRESS,
