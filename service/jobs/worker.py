@@ -367,9 +367,7 @@ class Worker:
             "source": upload,
             "work": work.name,
             "checkpoint": CHECKPOINT if options.resumable else None,
-            "settings": {
-                name: value for name, value in job.options.items() if name not in ("format", "evaluate", "origin")
-            },
+            "settings": options.model_dump(mode="json", exclude={"format", "evaluate", "origin"}),
             "format": options.format,
             "container": container_file(job.options).name,
             "evaluate": options.evaluate,

@@ -7,6 +7,7 @@ import shutil
 import pytest
 from helpers.data_folders import add_a_job, database, listing, opened, service
 
+import kissgs
 from service.core.models import State
 from service.core.settings import SettingsError
 from service.jobs.status import Queue, job_status
@@ -51,8 +52,11 @@ def test_options_that_an_older_version_accepted_are_kept(tmp_path):
         job_id = add_a_job(context)
     database(tmp_path / "data", f"UPDATE jobs SET options = '{json.dumps(options)}'")
     with service(tmp_path / "data") as context:
-        found = job_status(context.store.get(job_id), Queue(context.store, 1)).options
-    assert (found.encode.seed, found.encode.sh_step, found.compact.seed) == (3, 1.0, 0)
+        job = context.store.get(job_id)
+        found = job_status(job, Queue(context.store, 1)).options
+        task = context.worker._task(job, str(context.storage.upload(job_id)), tmp_path)
+    for settings in (found, kissgs.Settings.model_validate(task["settings"])):
+        assert (settings.encode.seed, settings.encode.sh_step, settings.compact.seed) == (3, 1.0, 0)
 
 
 # A database that is older than the folder ----------------------------------------------------------------------------
