@@ -79,8 +79,11 @@ def _load_called(kernel: Any) -> None:  # noqa: ANN401
     """
     for name in kernel.py_func.__code__.co_names:
         called = kernel.py_func.__globals__.get(name)
-        if called is not kernel and any(called is other for other in kernels):
-            called.load()
+        if any(called is other for other in kernels):
+            if called is not kernel:
+                called.load()
+        elif hasattr(called, "py_func"):  # compiled into each of its callers
+            _load_called(called)
 
 
 @contextlib.contextmanager
