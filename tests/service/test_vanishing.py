@@ -112,7 +112,7 @@ def test_damage_in_any_page_is_detected(tmp_path, damage):
     while store.monitor.health_problem() is None:
         assert time.monotonic() < end
         time.sleep(0.05)
-    assert "damaged" in store.monitor.health_problem() or "malformed" in store.health_problem()
+    assert "damaged" in store.monitor.health_problem() or "malformed" in store.monitor.health_problem()
 
 
 def test_a_removed_data_folder(start):
