@@ -166,14 +166,13 @@ def test_the_page_has_every_row():
 
 
 def test_every_promise_of_the_page_names_a_test_that_exists():
-    """The last cell of each row of the other tables: `file::test`, several with commas."""
-    text = PAGE.read_text(encoding="utf-8")
-    rows = [line for line in text.partition("<!-- end -->")[2].splitlines() if line.startswith("|")]
-    rows = [row for row in rows if not row.endswith("| test |") and not re.match(r"\|[-|]+\|$", row)]
-    assert len(rows) > 20
-    for row in rows:
-        named = re.findall(r"`(\w+)::(\w+)`", row.rsplit(" | ", 1)[1])
-        assert named, row
+    """The parentheses at the end of each line of the lists: `file::test`, several with commas."""
+    lists = PAGE.read_text(encoding="utf-8").partition("<!-- end -->")[2]
+    promises = re.findall(r"^- .+(?:\n  .+)*", lists, re.MULTILINE)
+    assert len(promises) > 20
+    for promise in promises:
+        named = re.findall(r"`(\w+)::(\w+)`", promise.rpartition("(")[2])
+        assert named, promise
         for module, function in named:
             files = [file.read_text(encoding="utf-8") for file in (ROOT / "tests").glob(f"**/{module}.py")]
             assert sum(f"def {function}(" in text for text in files) == 1, f"{module}::{function}"

@@ -1,4 +1,4 @@
-"""Agreement with readers and writers that others wrote (docs/reference/formats.md has the table of all such tests).
+"""Agreement with readers and writers that others wrote (docs/reference/formats.md lists all such tests).
 
 Oracles: splat-transform (``.ply``, ``.compressed.ply``, SOG), the library of ``.spz``, GaussianSplats3D (``.ksplat``,
 ``.splat``), three.js, Cesium and Khronos' validator (``.glb``). Scenes have degrees 0 to 3 and the ends of every

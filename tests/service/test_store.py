@@ -174,10 +174,10 @@ def test_queries(store):
     store.move(jobs[0].number, State.SUCCEEDED, expires_at=5.0, result={"a": 1})
     assert len(store.rates("fast", False)) == 1
     assert store.due(ENDED, 6.0) == [(jobs[0].number, jobs[0].id)]
-    assert (store.reclaimable(), store.reclaimable_bytes()) == ([], 0)
+    assert (store.oldest_reclaimable(), store.reclaimable_bytes()) == (None, 0)
     store.update(jobs[0].number, reclaimable_bytes=2_000_000_000)
     store.update(jobs[1].number, reclaimable_bytes=5)  # a queued job needs its upload
-    assert (store.reclaimable(), store.reclaimable_bytes()) == ([(jobs[0].number, jobs[0].id)], 2_000_000_000)
+    assert (store.oldest_reclaimable().id, store.reclaimable_bytes()) == (jobs[0].id, 2_000_000_000)
     store.forget(jobs[0].number)
     assert store.get(jobs[0].id) is None
     assert store.events(jobs[0].number) == []
@@ -191,7 +191,7 @@ def test_jobs_survive_reopening(tmp_path):
     second = Store(tmp_path / "jobs.sqlite", lambda: 6.0)
     (found,) = second.in_state(State.QUEUED)
     assert (found.number, found.name, found.options["encode"]) == (number, "Schloß \u4e2d", {"seed": 2**31 - 1})
-    assert second.latest_time() == 5.0
+    assert second.meta_value("time") == 5.0
     assert found.upload_bytes == 5_000_000_000
     second.close()
 

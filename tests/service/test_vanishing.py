@@ -106,13 +106,13 @@ def test_damage_in_any_page_is_detected(tmp_path, damage):
     store = Store(tmp_path / "jobs.sqlite", time.time)
     execute(tmp_path, *[f"INSERT INTO meta VALUES ('{number:032}', 1.0)" for number in range(3000)])
     execute(tmp_path, "PRAGMA wal_checkpoint(TRUNCATE)")
-    assert store.health_problem() is None
+    assert store.monitor.health_problem() is None
     damage(tmp_path)
     end = time.monotonic() + 300
-    while store.health_problem() is None:
+    while store.monitor.health_problem() is None:
         assert time.monotonic() < end
         time.sleep(0.05)
-    assert "damaged" in store.health_problem() or "malformed" in store.health_problem()
+    assert "damaged" in store.monitor.health_problem() or "malformed" in store.monitor.health_problem()
 
 
 def test_a_removed_data_folder(start):
@@ -269,7 +269,7 @@ def test_a_read_only_database(tmp_path, monkeypatch):
 
     monkeypatch.setattr(database, "_open", read_only)
     store = Store(tmp_path / "jobs.sqlite", time.time)
-    assert "readonly" in store.health_problem()
+    assert "readonly" in store.monitor.health_problem()
     store.close()
 
 
@@ -310,7 +310,7 @@ def test_checks_are_fast(tmp_path):
     spent = []
     for _ in range(100):
         begun = time.perf_counter()
-        assert store.health_problem() is None
+        assert store.monitor.health_problem() is None
         spent.append(time.perf_counter() - begun)
     assert sorted(spent)[50] < 0.02
     store.close()

@@ -10,7 +10,7 @@ from helpers.service import FAST, SMALL, problem, read_response
 
 from service.core.problems import ProblemError
 from service.core.settings import ServiceSettings
-from service.http.uploads import MAX_PREAMBLE_BYTES, PartBegin, PartData, Spool, parts, scene_name
+from service.http.uploads import MAX_PREAMBLE_BYTES, PartBegin, Spool, parts, scene_name
 from service.jobs.admission import Admission
 
 HEAD = SMALL.index(b"end_header\n") + 11
@@ -108,8 +108,8 @@ def parsed(*packets, content_type=BOUNDARY):
             match event:
                 case PartBegin(name, _):
                     fields[name] = b""
-                case PartData(data):
-                    fields[name] += data
+                case bytes():
+                    fields[name] += event
         return fields
 
     return asyncio.run(collect())
