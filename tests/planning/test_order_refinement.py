@@ -107,7 +107,7 @@ def test_gaussians_at_one_position_keep_their_order():
 
 @pytest.mark.parametrize("with_sensitivity", [False, True])
 def test_the_scene_is_the_same_in_fewer_bytes(with_sensitivity):
-    splats = kissgs.clean(kissgs.sample_scene(4000, sh_degree=1))[0]
+    splats = kissgs.clean(kissgs.sample_scene(2000, sh_degree=1))[0]
     sensitivity = random_sensitivity(splats) if with_sensitivity else None
     decoded, sizes = [], []
     for order in ("hilbert", "refined"):

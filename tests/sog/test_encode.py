@@ -52,9 +52,7 @@ def assert_round_trip(splats, result):
     assert fits.any(axis=0).all()
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("count", [65, 1, 7])
-@pytest.mark.quick(4)
+@pytest.mark.parametrize(("count", "preset"), [(65, "balanced"), (1, "fast"), (7, "small"), (65, "paper")])
 def test_round_trip_is_within_the_reported_errors(count, preset):
     scene = random_scene(count, count % 4, seed=count)
     result = encoded(scene, preset)
@@ -79,7 +77,7 @@ def test_splat_transform_reads_extreme_scenes(count, degree, preset, tmp_path):
     assert_alike(kissgs.load(tmp_path / "scene.sog"), clean(theirs)[0], rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("preset", ["balanced", "fast", "paper"])
+@pytest.mark.parametrize("preset", ["fast", "balanced"])
 @pytest.mark.quick(1)
 def test_threads_do_not_change_a_byte(preset):
     scene = sample_scene(400, sh_degree=2, seed=1)

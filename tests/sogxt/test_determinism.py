@@ -66,7 +66,7 @@ def test_another_seed_gives_other_bytes_and_the_same_positions(scene):
     assert not changed & {f"{name}.webp" for name in PLANES if not name.startswith("f_rest")}
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", ["fast", "balanced", "paper"])
 def test_the_input_is_not_modified(preset):
     splats = random_scene(200, 2, seed=3)
     before = {name: getattr(splats, name).copy() for name in ATTRIBUTES}
@@ -77,7 +77,7 @@ def test_the_input_is_not_modified(preset):
 
 
 def test_decoding_does_not_modify_the_files_and_owns_its_arrays():
-    files = compress(random_scene(100, 3)).files
+    files = compress(random_scene(100, 3), settings=Settings.from_preset("fast")).files
     before = dict(files)
     first, second = decompress(files), decompress(files)
     assert files == before
