@@ -146,9 +146,9 @@ def faint(count):
     return replace(scene, opacities=np.full(count, -5.3, np.float32), scales=scene.scales - np.float32(2))
 
 
-@pytest.mark.parametrize(("superfluous", "many"), [(0, False), (600, True)])
+@pytest.mark.parametrize(("superfluous", "many"), [(0, False), (1500, True)])
 def test_many_gaussians_that_were_dropped_are_noted_in_the_report(superfluous, many):
-    scene = kissgs.sample_scene(800, seed=1)
+    scene = kissgs.sample_scene(2000, seed=1)
     if superfluous:
         more = faint(superfluous)
         scene = kissgs.Splats(

@@ -85,8 +85,8 @@ def every_predictor_of_noise():
     writers = []
     for mode in range(16):
         tile = 0xFF0000FF | mode << 8
-        for size in ((40, 19), (1, 9), (2, 9), (9, 1), (17, 33)):
-            writers.append(with_tiles(PREDICTOR, 4, *size, lambda _, tile=tile: tile))
+        sizes = (40, 19), (1, 9), (2, 9), (9, 1), (17, 33)
+        writers += [with_tiles(PREDICTOR, 4, *size, lambda _, tile=tile: tile) for size in sizes]
         writers.append(with_tiles(PREDICTOR, 3, 30, 30, lambda i, mode=mode: (0xF0 | mode) << 8 | i))
     return writers
 
