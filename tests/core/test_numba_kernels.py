@@ -36,7 +36,7 @@ kissgs.compact(scene, settings=merged)
 
 
 def test_no_kernel_is_compiled_while_a_scene_is_compressed():
-    """Regression: one without a signature was compiled by every process, not only by the first, which fills the cache."""
+    """Regression: one without a signature was compiled by every process, not only by the first with an empty cache."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     command = [sys.executable, "-c", PROGRAM]
     for _ in range(2):
