@@ -44,18 +44,9 @@ def tinted(w, h, rng):
     return np.stack([green * 0.7 + rng.integers(0, 3, (h, w)), green, 255 - green * 0.4], axis=2)
 
 
-def grey(w, h, rng):
-    return np.repeat(rng.integers(0, 256, (h, w, 1)), 3, axis=2)
-
-
 def single(w, h, rng):
     """Return an image of one channel."""
     return rng.integers(0, 40, (h, w, 1))
-
-
-def checker(w, h, rng):
-    y, x = grid(w, h)
-    return ((x // 3 + y // 2) % 2)[:, :, None] * np.array([255, 10, 90])
 
 
 def pattern(w, h, rng):
@@ -77,24 +68,8 @@ def transparent(w, h, rng):
     return image
 
 
-def transparent_black(w, h, rng):
-    image = photograph(w, h, rng)
-    alpha = np.where(np.add(*grid(w, h)) % 7 < 3, 0, 255)[:, :, None]
-    return np.concatenate([image * (alpha > 0), alpha], axis=2)
-
-
 def alpha_noise(w, h, rng):
     return rng.integers(0, 256, (h, w, 4))
-
-
-def rotations(w, h, rng):
-    """Return four correlated channels of few levels, like a plane of quaternions."""
-    return np.clip(rng.normal(40, 12, (h, w, 4)) + 8 * np.sin(np.add(*grid(w, h)) / 9)[:, :, None], 0, 255)
-
-
-def labels(w, h, rng):
-    """Return two channels of few levels, like a plane of codebook labels."""
-    return np.concatenate([rng.integers(0, 40, (h, w, 2)), np.zeros((h, w, 1))], axis=2)
 
 
 def quarters(w, h, rng):
@@ -126,9 +101,8 @@ def palette_alpha(w, h, rng):
 
 
 CONTENTS = [
-    *(noise, gradient, photograph, tinted, grey, single, checker, pattern, few_colours, transparent),
-    *(transparent_black, alpha_noise, rotations, labels, quarters, steep, palette_alpha),
-    *map(palette, (1, 2, 3, 4, 5, 16, 17, 256, 257)),
+    *(noise, gradient, photograph, tinted, single, pattern, few_colours, transparent, alpha_noise, quarters, steep),
+    *(palette_alpha, *map(palette, (1, 2, 3, 5, 16, 17, 256, 257))),
 ]
 
 
