@@ -97,18 +97,6 @@ def test_real_scenes(shared_data, name, preset):
     assert ours.sh_degree == splats.sh_degree
 
 
-def test_containers_in_all_their_forms_decode_alike(tmp_path):
-    compressed = compress(random_scene(70, 1), settings=Settings.from_preset("fast"))
-    files = compressed.files
-    compressed.save(tmp_path / "folder")
-    compressed.save(tmp_path / "file.zip")
-    wanted = decompress(files)
-    for source in (compressed.to_zip(), tmp_path / "folder", str(tmp_path / "file.zip")):
-        found = decompress(source)
-        assert all((getattr(found, name) == getattr(wanted, name)).all() for name in ATTRIBUTES)
-    assert reference_decoder.as_files(compressed.to_zip()) == files
-
-
 def test_threads_do_not_change_what_is_decoded():
     files = encoded(random_scene(500, 3), "fast")
     one, many = decompress(files, threads=1), decompress(files, threads=3)
