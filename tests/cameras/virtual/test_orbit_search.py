@@ -85,6 +85,7 @@ def test_the_orbit_of_a_room_stays_inside():
         assert render(room, camera)[1].mean() > 0.9
 
 
+@pytest.mark.quick(0)
 def test_only_the_photographed_side_is_shown(shared_data, monkeypatch):
     """Behind the fox is a wall, before which the path turns back."""
     monkeypatch.setattr(orbit_search, "COARSE_STEPS", 12)

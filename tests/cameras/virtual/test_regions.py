@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.whole_scenes import SCENES, joined, moved, two
+from helpers.whole_scenes import SCENES, joined, moved
 
 from kissgs import Camera, Splats, clean, sample_scene
 from kissgs.cameras.virtual.regions import scene_views
 from kissgs.cameras.virtual.samples import random_poses
+
+
+def two(distance: float, scale: float = 1.0) -> Splats:
+    return joined(sample_scene(2000), moved(sample_scene(2000, seed=1), by=(distance, 0, 0), scale=scale))
 
 
 def count_near(cameras: list[Camera], position: tuple[float, float, float], radius: float) -> int:
