@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.fewer_cameras import try_fewer
 from helpers.whole_scenes import SCENES, joined, moved
 
 from kissgs import Camera, Splats, clean, sample_scene
 from kissgs.cameras.virtual.regions import scene_views
 from kissgs.cameras.virtual.samples import random_poses
+
+
+@pytest.fixture(autouse=True)
+def fewer(monkeypatch: pytest.MonkeyPatch):
+    try_fewer(monkeypatch)
 
 
 def two(distance: float, scale: float = 1.0) -> Splats:
