@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 from helpers.preview_browser import colours, psnr
-from helpers.service import SLOW, scene_bytes
+from helpers.service import scene_bytes
 from PIL import Image
 
 import kissgs
@@ -340,23 +340,18 @@ def test_without_positions_nothing_is_drawn(preview, service, job, file):
     assert tab.page.locator("#planes .thumb").count() == (0 if file.startswith("active") else 8)
 
 
-def test_unknown_job(preview, service):
-    tab = preview().open(service, "0" * 32)
+def test_jobs_without_a_result(start, preview):
+    service = start()
+    job = service.hold()
+    tab = preview().open(service, job["id"])
+    assert "running" in tab.error_message("no container")
+    service.cancel(job)
+    tab.open(service, job["id"])
+    assert "cancelled" in tab.error_message("no container")
+    tab.open(service, "0" * 32)
     tab.error_message("does not have this")
     assert tab.page.locator("#empty").is_visible()
     tab.expect_errors("^404 ", "Failed to load resource.*404")
-
-
-def test_jobs_without_a_result(start, preview):
-    service = start()
-    job = service.submit(scene_bytes(20_000, 3), SLOW)
-    service.running(job)
-    tab = preview().open(service, job["id"])
-    assert "running" in tab.error_message("no container")
-    service.http.post(job["links"]["cancel"])
-    service.ended(job)
-    tab.open(service, job["id"])
-    assert "cancelled" in tab.error_message("no container")
 
 
 @pytest.mark.quick(0)
