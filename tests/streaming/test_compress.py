@@ -173,7 +173,7 @@ def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(target, tmp_path,
 
 
 def test_work_is_continued_with_the_same_settings_for_the_same_container_alone(scene, tmp_path, monkeypatch):
-    """Work that goes on needs no room for what is done: files that are written from then on take the place of others."""
+    """Work that goes on needs no room for what is done: new files take the place of others."""
     target = tmp_path / "city" / "lod-meta.json"
 
     def stop(stage, fraction, note=""):
