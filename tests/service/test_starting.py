@@ -44,7 +44,7 @@ def test_a_start_after_the_jobs_were_moved_away(jobs_folder):
         finish_a_job(context)
     with service(jobs_folder) as context:
         assert len(context.store.ids()) == 1
-    assert len(list((jobs_folder / "old").iterdir())) == 40
+    assert len(list((jobs_folder / "old").iterdir())) == 12
 
 
 def test_no_jobs_and_a_new_database(tmp_path):
