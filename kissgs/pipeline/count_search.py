@@ -21,8 +21,8 @@ from kissgs.pipeline.trained_search import KEEP, OVERHEAD_BYTES
 
 if TYPE_CHECKING:
     from kissgs.compaction.budget import Compactor
+    from kissgs.compaction.popspa import PathPoint
     from kissgs.compaction.result import Compacted
-    from kissgs.compaction.training_path import PathPoint
     from kissgs.pipeline.encoding import Encoding
 
 

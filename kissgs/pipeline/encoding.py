@@ -26,11 +26,9 @@ from kissgs.pipeline.containers import DECODERS, MODELS, write_files
 from kissgs.pipeline.goal import Trial
 from kissgs.pipeline.rate_control import Container, Encoder, RateControl
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
-from kissgs.planning.order_refinement import refine_order
-from kissgs.planning.planner import plan_encoding
+from kissgs.planning.planner import plan_encoding, refine_order
 from kissgs.planning.rate_distortion import ColorRefit
-from kissgs.rendering.gsplat_backend import need_cuda
-from kissgs.rendering.rasterizer import Device
+from kissgs.rendering.rasterizer import Device, need_cuda
 from kissgs.settings import EncodeSettings, Settings
 
 if TYPE_CHECKING:
@@ -297,7 +295,7 @@ class Encoding:
 
     def _rd_planner(self) -> Planner:
         """Measure the sensitivity once; return a planner that uses it for every plan."""
-        from kissgs.cameras.virtual.regions import default_view_count, sensitivity_cameras
+        from kissgs.cameras.virtual.samples import default_view_count, sensitivity_cameras
 
         splats, views, settings = self.splats, self.views, self.settings.encode
         sensitivity, common = self.sensitivity, (self.threads, self.progress)

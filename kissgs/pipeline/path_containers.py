@@ -33,8 +33,8 @@ from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
     from kissgs.compaction.budget import Compactor
+    from kissgs.compaction.popspa import PathPoint, TrainingPath
     from kissgs.compaction.result import Compacted
-    from kissgs.compaction.training_path import PathPoint, TrainingPath
     from kissgs.pipeline.encoding import Encoding
 
 

@@ -19,8 +19,7 @@ from kissgs.pipeline.goal import Goal, Limit, Trial
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.planning.encoding_plan import Encoded
 from kissgs.planning.sh_codebook import COEFFICIENTS, codebook_side
-from kissgs.settings import EncodeSettings
-from kissgs.settings.encode import GOALS
+from kissgs.settings import GOALS, EncodeSettings
 from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from kissgs.pipeline.search_time import SearchPlan, SearchTime
 
 if TYPE_CHECKING:
     from kissgs.compaction.budget import Compactor
+    from kissgs.compaction.popspa import PathPoint, TrainingPath
     from kissgs.compaction.result import Compacted
-    from kissgs.compaction.training_path import PathPoint, TrainingPath
     from kissgs.finetuning.tune import Tuner
     from kissgs.pipeline.encoding import Encoding
 
