@@ -256,8 +256,7 @@ def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]
     from kissgs._version import __version__
     from kissgs.runners import file_transfer
     from kissgs.runners.contract import Outcome, WorkItem
-    from kissgs.runners.process import ItemProcess
-    from kissgs.runners.temporary_folder import temporary_folder
+    from kissgs.runners.process import ItemProcess, temporary_folder
 
     node = ray.util.get_node_ip_address()
     if __version__ != version:

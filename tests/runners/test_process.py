@@ -23,6 +23,10 @@ from kissgs.runners.process import ItemProcess, json_lines
         (-signal.SIGABRT, 0.1, "OpenBLAS error: Memory allocation still failed after 10 retries", "memory-limit"),
         (-signal.SIGABRT, 0.1, "terminate called after throwing an instance of 'std::bad_alloc'", "memory-limit"),
         (-signal.SIGABRT, 0.1, "numpy._core._exceptions._ArrayMemoryError: Unable to allocate", "memory-limit"),
+        (1, 0.6, "RuntimeError: can't start new thread", "memory-limit"),
+        (1, 0.6, "SystemError: error return without exception set", "memory-limit"),
+        (1, 0.6, "ImportError: libx.so: failed to map segment from shared object", "memory-limit"),
+        (1, 0.4, "RuntimeError: can't start new thread", "internal"),
         (-signal.SIGSEGV, 0.7, "Segmentation fault", "crashed"),
         (-signal.SIGSEGV, 0.9, "", "memory-limit"),
         (-signal.SIGKILL, 0.9, "", "crashed"),  # killed from outside: by the system or by a person
