@@ -142,13 +142,12 @@ def evaluate(
     common: SceneOptions,
 ) -> None:
     """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""
-    from kissgs.cli.files import progress_bar
     from kissgs.core.positions import with_origin
     from kissgs.evaluation.evaluate import evaluate as measure
     from kissgs.evaluation.html import ReportScene, html_report
     from kissgs.evaluation.results import Split
     from kissgs.io.files import atomic_file, refuse_existing
-    from kissgs.pipeline.scene_files import load, stored_bytes
+    from kissgs.pipeline.scene_files import has_levels, load, stored_bytes
 
     quiet, threads = common.quiet or as_json, common.threads
     used_split = cast(Split, choice("--split", split, Split))
@@ -157,14 +156,17 @@ def evaluate(
         refuse_existing(html, overwrite=force)
     capture = open_views(views, scale=scale, images=images)
     with progress_bar(quiet) as progress:
-        reading = asdict(common.reading())
+        paths, reading = (reference, candidate), asdict(common.reading())
+        plain = [] if not any(map(has_levels, paths)) else [path for path in paths if not has_levels(path)]
         sides = [
             ReportScene(
                 name=path.name,
-                splats=load(path, threads=threads, progress=progress, **reading),
+                splats=load(
+                    path, threads=threads, progress=progress, **reading | ({"level": 0} if path in plain else {})
+                ),
                 bytes=stored_bytes(path),
             )
-            for path in (reference, candidate)
+            for path in paths
         ]
         sides[1] = replace(sides[1], splats=with_origin(sides[1].splats, sides[0].splats.origin))
         scenes = sides[0].splats, sides[1].splats
@@ -271,7 +273,6 @@ def bench(
 
     Each is compressed, decompressed and evaluated in a process of its own.
     """
-    from kissgs.cli.files import progress_bar
     from kissgs.settings import Preset
 
     if not presets and not times:
