@@ -58,9 +58,9 @@ def load_kernels(arguments, progress):
     import resource
 
     from kissgs.core.numba_kernels import kernels
-    from kissgs.rendering.cpu import sensitivity as coverage
+    from kissgs.rendering.cpu import sensitivity
 
-    assert coverage
+    assert sensitivity
     used = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
     ballast = bytearray(resource.getrlimit(resource.RLIMIT_DATA)[0] - used - arguments["left"])
     kernels[0].load()

@@ -12,7 +12,7 @@ from helpers.streamed_scenes import FAST, TARGETS, files_of, small_sizes
 import kissgs
 from kissgs import Settings
 from kissgs.streaming import compress as time_left
-from kissgs.streaming import levels as environment
+from kissgs.streaming import levels
 from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.levels import FEWEST, MOST, Environment
 
@@ -20,7 +20,7 @@ from kissgs.streaming.levels import FEWEST, MOST, Environment
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     small_sizes(monkeypatch, chunk=800, leaf=150, coarsest=500)
-    monkeypatch.setattr(environment, "FEWEST", 100)
+    monkeypatch.setattr(levels, "FEWEST", 100)
 
 
 def directions(count, seed=0):
@@ -96,7 +96,7 @@ def test_every_level_has_the_whole_sky(scene, tmp_path, name, preset):
     settings = Settings.from_preset(preset)
     report = compress_streamed(scene, tmp_path / name, settings=settings)
     document, expected = json.loads((tmp_path / name).read_bytes()), sky_of(kissgs.load(scene))
-    assert document["environment"] == ("environment/meta.json" if name.endswith("lod-meta.json") else "environment.zip")
+    assert document["environment"] == ("environment/meta.json" if name.endswith("lod-meta.json") else "levels.zip")
     alone = kissgs.load((tmp_path / name).parent / document["environment"])
     assert len(alone) == report.environment_count > 0.95 * len(expected)
     assert report.environment_bytes > 0

@@ -15,7 +15,6 @@ from kissgs.core.numba_kernels import compiled
 from kissgs.core.resources import Workers
 from kissgs.rendering import constants
 from kissgs.rendering.cpu import projection as projection_kernels
-from kissgs.rendering.cpu import projection as shading
 from kissgs.rendering.cpu.records import (
     FOOTPRINTS,
     SLOTS,
@@ -247,7 +246,7 @@ def find_footprints(gaussians: Gaussians, projection: Projection, pool: Workers)
 
     def part(first: int, last: int) -> Part:
         end = first + projection_kernels.project(gaussians, projection, first, last, found)
-        shading.shade(gaussians, projection, first, end, found)
+        projection_kernels.shade(gaussians, projection, first, end, found)
         return first, end
 
     return found, each_part(part, even(count, pool), pool)
