@@ -96,7 +96,7 @@ def test_every_level_has_the_whole_sky(scene, tmp_path, name, preset):
     settings = Settings.from_preset(preset)
     report = compress_streamed(scene, tmp_path / name, settings=settings)
     document, expected = json.loads((tmp_path / name).read_bytes()), sky_of(kissgs.load(scene))
-    assert document["environment"] == ("environment/meta.json" if name.endswith("lod-meta.json") else "levels.zip")
+    assert document["environment"] == ("environment/meta.json" if name.endswith("lod-meta.json") else "environment.zip")
     alone = kissgs.load((tmp_path / name).parent / document["environment"])
     assert len(alone) == report.environment_count > 0.95 * len(expected)
     assert report.environment_bytes > 0
