@@ -7,6 +7,7 @@ it from numba's per-user cache. Constants are literals inside the functions, as 
 from __future__ import annotations
 
 import contextlib
+import pickle
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar, cast
@@ -15,12 +16,13 @@ from numba import njit
 from numba.core.event import Event, Listener, install_listener
 from numba.core.typing.templates import Signature
 
-from kissgs.core.errors import KissgsError
-
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 kernels: list[Any] = []
 """All kernels of the modules that are imported; the method ``load`` of each compiles it without a call."""
+
+UNREADABLE = (ImportError, AttributeError, EOFError, LookupError, TypeError, ValueError, pickle.UnpicklingError)
+"""Errors of reading a cache that is damaged, or that another version left and that names modules which are gone."""
 
 _compiling = threading.RLock()
 _uncached: list[str] = []
@@ -54,10 +56,9 @@ def _defer(kernel: Any, signature: str | Signature) -> None:  # noqa: ANN401
                 _load_called(kernel)
                 try:
                     kernel.compile(signature)
-                except (MemoryError, KissgsError):
-                    raise
-                except Exception:  # noqa: BLE001  its cache may be damaged, or name modules that are gone
-                    kernel._cache.flush()
+                except UNREADABLE:
+                    with contextlib.suppress(OSError):
+                        kernel._cache.flush()
                     kernel.compile(signature)
                 kernel.disable_compile()
             return next(iter(kernel.overloads.values()))

@@ -113,14 +113,8 @@ OUT_OF_MEMORY = re.compile(
 )
 """Messages of Python, C++, LLVM, OpenBLAS and the C library when an allocation fails; any of them may be the first."""
 
-PERHAPS_OUT_OF_MEMORY = re.compile("failed to map|can't start new thread|error return without exception set")
-"""Messages that a lack of memory may have caused, and other reasons."""
-
 NEAR_LIMIT = 0.8
-"""Share of the memory limit above which a crash without any message is attributed to the limit."""
-
-FAR_FROM_LIMIT = 0.5
-"""Share of the memory limit below which a crash with a message that may have other reasons is not."""
+"""Share of the memory limit above which a crash without such a message is attributed to the limit."""
 
 SAMPLE_SECONDS = 0.1
 """Seconds between looks at a process's time and memory."""
@@ -260,8 +254,7 @@ class ItemProcess:
         errors.seek(max(0, errors.seek(0, os.SEEK_END) - LOG_BYTES))
         text = errors.read().decode(errors="replace")
         limit = self._item.memory_limit
-        least = FAR_FROM_LIMIT if PERHAPS_OUT_OF_MEMORY.search(text) else NEAR_LIMIT
-        near_limit = limit is not None and self._peak_data >= least * limit and status != -signal.SIGKILL
+        near_limit = limit is not None and self._peak_data >= NEAR_LIMIT * limit and status != -signal.SIGKILL
         if final is not None or near_limit or OUT_OF_MEMORY.search(text):
             of = "" if limit is None else f" than its limit of {limit / 1e9:.2g} GB"
             return Outcome("error", code=MEMORY_LIMIT, message=f"the work needs more memory{of}", log=text)

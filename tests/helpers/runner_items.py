@@ -53,6 +53,11 @@ def allocate(arguments, progress):
     return {"bytes": len(bytearray(arguments["bytes"]))}
 
 
+def fail_with(arguments, progress):
+    ballast = bytearray(arguments["bytes"])
+    raise RuntimeError(arguments["message"], len(ballast))
+
+
 def load_kernels(arguments, progress):
     """Load a kernel, and what numba loads for the first one, when only so many bytes are left."""
     import resource
