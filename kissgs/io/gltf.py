@@ -31,7 +31,7 @@ from kissgs.io.gltf_document import (
     write_glb,
     write_spz_glb,
 )
-from kissgs.io.scene_format import Codec, Facts, Match, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
 from kissgs.io.spz import largest_spz, read_spz, read_spz_info
 
 INSTANCING, VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
@@ -94,8 +94,10 @@ def describe(source: Path | bytes, level: int = 0) -> Facts:
     )
 
 
-def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
-    """Read a scene without cleaning it. Primitives of a lower SH degree get zeros for the coefficients above it.
+def read_gltf(
+    source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
+) -> Splats:
+    """Read a scene; primitives of a lower SH degree get zeros for the coefficients above it.
 
     What the scene has beyond Gaussians is named in ``notes``; so are hidden nodes, which are left out too. Buffers in
     other files must be below the folder of the scene.
@@ -105,7 +107,7 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
         left_out: dict[str, None] = {}
         found, notes = list(_primitives(document, left_out)), dict[str, None]()
         count = sum(primitive.count for primitive in found)
-        refuse_more_than(max_gaussians, count, document.name)
+        refuse_more_than(reading.max_compressed, count, document.name)
         progress("read", 0.0)
         splats = empty_splats(count, SH_REST_COUNTS[max(primitive.degree for primitive in found)])
         start, placed = 0, np.empty((count, 3))
@@ -341,7 +343,7 @@ def _read_attributes(document: Document, primitive: _Primitive, out: Splats) -> 
 
 def _read_spz(document: Document, view: int, out: Splats) -> tuple[str, ...]:
     """Read a ``.spz`` inside the file into ``out``, in glTF's axes (x left, y up, z forward); return its notes."""
-    stored = read_spz(bytes(document.view(view, most=largest_spz(len(out)))), max_gaussians=len(out))
+    stored = read_spz(bytes(document.view(view, most=largest_spz(len(out)))), ReadOptions(max_gaussians=len(out)))
     mirror(stored, TO_PLY)
     for name in ATTRIBUTES:
         if name != "shN":
@@ -383,12 +385,7 @@ def _turn_to_ply(splats: Splats) -> None:
 FORMAT = Codec(
     sniff=_sniff,
     info=describe,
-    read=lambda source, reading, threads, progress: read_gltf(
-        source, max_gaussians=reading.max_compressed, progress=progress
-    ),
-    write={
-        ".glb": lambda file, splats, raw_axes, progress: write_glb(file, splats, progress=progress),
-        ".spz.glb": lambda file, splats, raw_axes, progress: write_spz_glb(file, splats, progress=progress),
-    },
+    read=read_gltf,
+    write={".glb": write_glb, ".spz.glb": write_spz_glb},
     records_origin=True,
 )

@@ -37,7 +37,7 @@ from kissgs.io.ply_rows import (
     rows,
     sh_degree,
 )
-from kissgs.io.scene_format import Codec, Facts, Match, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
 
 # PlayCanvas' compressed ``.ply``: Gaussians quantised to 16 bytes within chunks of 256, SH coefficients to one byte.
 #
@@ -184,8 +184,10 @@ def _require(ply: PlyFile, element: Element, names: tuple[str, ...], code: str) 
             )
 
 
-def write_compressed(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
-    """Write a clean scene in Morton order, so that the 256 Gaussians of a chunk are close to one another."""
+def write_compressed(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a scene in Morton order, so that the 256 Gaussians of a chunk are close to one another."""
     n, k = len(splats), splats.shN.shape[1]
     order = morton_order(splats.means)
     chunks = np.empty((-(-n // _CHUNK), 18), "<f4")
@@ -316,7 +318,9 @@ def read_ply_info(source: Path | bytes, *, size: int | None = None) -> PlyInfo:
         return _check(ply)
 
 
-def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
+def read_ply(
+    source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
+) -> Splats:
     """Read a scene without cleaning it: NaN, infinities and quaternions of any length are kept.
 
     Reads binary and ascii files, with properties in any order and of any type, and PlayCanvas' compressed ``.ply``.
@@ -327,7 +331,7 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
     """
     with open_ply(source) as ply:
         info = _check(ply)
-        refuse_more_than(max_gaussians, info.count, ply.name)
+        refuse_more_than(reading.max_gaussians, info.count, ply.name)
         progress("read", 0.0)
         read = read_compressed if info.compressed else _read_columns
         splats = read(ply, info.sh_degree, progress)
@@ -358,7 +362,9 @@ def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Sp
                 progress("read", done / info.count)
 
 
-def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
+def write_ply(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
     Positions are those of the world: float64 (``property double``) where float32 cannot hold them. An antialiased scene
@@ -566,11 +572,6 @@ def _describe(path: Path | bytes, level: int) -> Facts:
 FORMAT = Codec(
     sniff=_sniff,
     info=_describe,
-    read=lambda source, reading, threads, progress: read_ply(
-        source, max_gaussians=reading.max_gaussians, progress=progress
-    ),
-    write={
-        ".ply": lambda file, splats, raw_axes, progress: write_ply(file, splats, progress=progress),
-        ".compressed.ply": lambda file, splats, raw_axes, progress: write_compressed(file, splats, progress=progress),
-    },
+    read=read_ply,
+    write={".ply": write_ply, ".compressed.ply": write_compressed},
 )

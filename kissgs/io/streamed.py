@@ -13,7 +13,6 @@ import posixpath
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.positions import Origin, read_origin, recorded
@@ -34,34 +33,16 @@ MAX_LEVELS = 64
 """Largest number of levels; each has a fraction of the Gaussians of the one before."""
 
 
-@runtime_checkable
-class Layout(Protocol):
-    """Metadata of a container, read and checked."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Container:
+    """Container among the files of a streamed scene, whose metadata is read and checked."""
 
-    @property
-    def sh_degree(self) -> int:
-        """Degree of the SH coefficients, 0 to 3."""
-
-    @property
-    def antialiased(self) -> bool:
-        """Whether the scene was trained with antialiasing."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Phrases for what reading the container leaves out, one phrase each."""
-
-
-Ranges = dict[str, tuple[float, float]]
-
-L = TypeVar("L", bound=Layout)
-
-
-@dataclass(frozen=True, slots=True)
-class Container(Generic[L]):
-    """Container among the files of a streamed scene."""
-
-    layout: L
     count: int
+    sh_degree: int
+    antialiased: bool
+    notes: tuple[str, ...] = ()  # phrases for what reading leaves out
+    ranges: Callable[[], dict[str, tuple[float, float]]]
+    """Returns the values of the lowest and the highest level of each attribute."""
     stored: Callable[[], tuple[str, int]]
     """Returns the name of the container and the bytes of all its files."""
     decode: Callable[[Splats, Workers], None]
@@ -87,11 +68,11 @@ class Manifest:
 
 
 @dataclass(frozen=True, slots=True)
-class Part(Generic[L]):
+class Part:
     """Container of which a level needs the row ranges ``rows``, offset and count; ``name`` is that of its file."""
 
     name: str
-    container: Container[L]
+    container: Container
     rows: tuple[tuple[int, int], ...]
 
     @property
@@ -115,7 +96,7 @@ class Part(Generic[L]):
 
 
 @dataclass(frozen=True, slots=True)
-class StreamedFormat(Generic[L]):
+class StreamedFormat:
     """Format of streamed scenes."""
 
     title: str
@@ -123,10 +104,8 @@ class StreamedFormat(Generic[L]):
     """File name of the manifest."""
     containers: str | None
     """Value that the manifest's key "format" must have where it has one; None if any value is valid."""
-    opened: Callable[[Source, str], Container[L]]
+    opened: Callable[[Source, str], Container]
     """Reads and checks the metadata of the container of a file."""
-    ranges: Callable[[list[L]], Ranges]
-    """Returns the values of the lowest and the highest level of each attribute, over all containers."""
 
     @property
     def codec(self) -> Codec:
@@ -143,11 +122,9 @@ class StreamedFormat(Generic[L]):
         with self.open(path) as files:
             manifest = self.read_manifest(files)
             parts = list(self.parts(files, manifest, level))
-            sizes = {
-                self.manifest: stored_size(files, self.manifest),
-                **dict(part.container.stored() for part in parts),
-            }
-        antialiased = bool(parts) and all(part.container.layout.antialiased for part in parts)
+            containers = [part.container for part in parts]
+            sizes = {self.manifest: stored_size(files, self.manifest), **dict(each.stored() for each in containers)}
+        antialiased = bool(parts) and all(each.antialiased for each in containers)
         levels = [manifest.count(one) for one in range(manifest.levels)]
         environment = parts[-1].count if manifest.environment is not None else 0
         beside = f"; in the environment, which belongs to every level: {environment:,}" if environment else ""
@@ -155,10 +132,10 @@ class StreamedFormat(Generic[L]):
         return Facts(
             title=titled(self.title, described, "antialiased" if antialiased else ""),
             count=sum(part.count for part in parts),
-            sh_degree=max((part.container.layout.sh_degree for part in parts), default=0),
+            sh_degree=max((each.sh_degree for each in containers), default=0),
             parts=sizes,
-            ranges=self.ranges([part.container.layout for part in parts]),
-            notes=tuple(dict.fromkeys(note for part in parts for note in part.container.layout.notes)),
+            ranges=_widest([each.ranges() for each in containers]),
+            notes=_all_notes(parts),
             details={
                 **recorded(manifest.origin),
                 "level": level,
@@ -209,18 +186,15 @@ class StreamedFormat(Generic[L]):
             parts = list(self.parts(files, manifest, level))
             count = sum(part.count for part in parts)
             refuse_more_than(max_gaussians, count, f"level {level}")
-            splats = empty_splats(
-                count, max((SH_REST_COUNTS[part.container.layout.sh_degree] for part in parts), default=0)
-            )
+            splats = empty_splats(count, SH_REST_COUNTS[max((part.container.sh_degree for part in parts), default=0)])
             start = 0
             for part in parts:
                 refuse_more_than(max_gaussians, part.container.count, f"the file {part.name}")
                 progress("decode", start / max(count, 1))
                 start = part.decode(splats, start, pool)
             progress("decode", 1.0)
-            notes = dict.fromkeys(note for part in parts for note in part.container.layout.notes)
-            splats = replace(splats, origin=manifest.origin, notes=tuple(notes))
-            return marked(splats, [part.container.layout.antialiased for part in parts])
+            splats = replace(splats, origin=manifest.origin, notes=_all_notes(parts))
+            return marked(splats, [part.container.antialiased for part in parts])
 
     def read_manifest(self, files: Source) -> Manifest:
         """Read and check the manifest."""
@@ -256,7 +230,7 @@ class StreamedFormat(Generic[L]):
                     raise _invalid(name, f"two leaves share rows of {names[file]}")
         return Manifest(levels, tuple(names), tuple(map(tuple, rows)), environment, read_origin(document, name))
 
-    def parts(self, files: Source, manifest: Manifest, level: int) -> Iterator[Part[L]]:
+    def parts(self, files: Source, manifest: Manifest, level: int) -> Iterator[Part]:
         """Yield the containers of a level, then the environment; their metadata is read and checked."""
         last = manifest.levels - 1
         if not 0 <= level <= last:
@@ -279,12 +253,20 @@ class StreamedFormat(Generic[L]):
             yield Part(manifest.environment, container, ((0, container.count),))
 
 
-def _leaf_rows(
-    name: str,
-    tree: Any,  # noqa: ANN401  any JSON
-    levels: int,
-    files: int,
-) -> Iterator[tuple[int, tuple[int, int, int]]]:
+def _all_notes(parts: list[Part]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(note for part in parts for note in part.container.notes))
+
+
+def _widest(ranges: list[dict[str, tuple[float, float]]]) -> dict[str, tuple[float, float]]:
+    """Return the range of each attribute over all containers that have it."""
+    found: dict[str, tuple[float, float]] = {}
+    for name, (low, high) in (item for each in ranges for item in each.items()):
+        lowest, highest = found.get(name, (low, high))
+        found[name] = min(low, lowest), max(high, highest)
+    return found
+
+
+def _leaf_rows(name: str, tree: object, levels: int, files: int) -> Iterator[tuple[int, tuple[int, int, int]]]:
     """Yield level, file, offset and count of every leaf and level that has Gaussians."""
     waiting = [tree]
     while waiting:

@@ -6,20 +6,27 @@ from kissgs.formats import LOD_NAME
 from kissgs.io.containers import META_NAME, Source, stored_size
 from kissgs.io.streamed import Container, StreamedFormat
 from kissgs.sog.decode import decode_files
-from kissgs.sog.info import ranges_of
-from kissgs.sog.metadata import SogLayout, read_layout
+from kissgs.sog.metadata import read_layout
 
 
-def _opened(files: Source, name: str) -> Container[SogLayout]:
+def _opened(files: Source, name: str) -> Container:
     """Read the container of a metadata file."""
     layout, folder = read_layout(files, name), name[: name.rfind("/") + 1]
 
     def stored() -> tuple[str, int]:
         return folder or META_NAME, sum(stored_size(files, folder + each) for each in (META_NAME, *layout.images))
 
-    return Container(layout, layout.count, stored, lambda out, pool: decode_files(files, layout, out, pool, folder))
+    return Container(
+        count=layout.count,
+        sh_degree=layout.sh_degree,
+        antialiased=layout.antialiased,
+        notes=layout.notes,
+        ranges=layout.value_ranges,
+        stored=stored,
+        decode=lambda out, pool: decode_files(files, layout, out, pool, folder),
+    )
 
 
-STREAMED = StreamedFormat("streamed SOG scene", LOD_NAME, None, _opened, ranges_of)
+STREAMED = StreamedFormat("streamed SOG scene", LOD_NAME, None, _opened)
 
 FORMAT = STREAMED.codec

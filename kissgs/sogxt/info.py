@@ -7,15 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.errors import InvalidContainerError
-from kissgs.core.positions import recorded, signed_exp
+from kissgs.core.positions import recorded
 from kissgs.core.progress import Progress
 from kissgs.core.splats import Splats
 from kissgs.io.containers import Source, open_source
 from kissgs.io.scene_format import Codec, Facts, ReadOptions, SceneSource, titled
 from kissgs.sogxt.container import FILES, PLANES
-from kissgs.sogxt.metadata import CHANNELS, Layout, read_layout, read_provenance
+from kissgs.sogxt.metadata import Layout, read_layout, read_provenance
 
-NAMES = {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
 MAX_PLANE_BYTES = 1 << 30
 
 
@@ -37,7 +36,7 @@ def describe(path: Path | bytes, level: int) -> Facts:
         count=count,
         sh_degree=layout.sh_degree,
         parts=parts,
-        ranges=ranges_of([layout]),
+        ranges=layout.value_ranges(),
         changed=made.changed if made else {},
         details={
             **recorded(layout.origin),
@@ -50,18 +49,6 @@ def describe(path: Path | bytes, level: int) -> Facts:
         },
         lines=(f"grid {grid} x {grid}, codebook {codebook} x {codebook}; encoder: {origin}",),
     )
-
-
-def ranges_of(layouts: list[Layout]) -> dict[str, tuple[float, float]]:
-    """Return the values of the lowest and the highest level of every attribute, over all containers."""
-    ranges = {}
-    for field in CHANNELS:
-        having = [layout for layout in layouts if field != "f_rest_centroids" or layout.sh_degree > 0]
-        if having:
-            ends = np.concatenate([end for layout in having for end in layout.limits(field)])
-            ends = signed_exp(ends) if field == "means" else ends
-            ranges[NAMES.get(field, field)] = float(ends.min()), float(ends.max())
-    return ranges
 
 
 def _count_mask(files: Source, layout: Layout) -> int:

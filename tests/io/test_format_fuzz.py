@@ -43,13 +43,13 @@ FILES = {
 def test_damaged_files(name):
     """Headers of .ply files that are damaged line by line are in test_ply_fuzz.py."""
     kind, data = FILES[name]
-    check_all(data, lambda damaged: READERS[kind](damaged, max_gaussians=LIMIT))
+    check_all(data, lambda damaged: READERS[kind](damaged, LIMITED))
 
 
 def test_damage_inside_gzip():
     """Flipped bits in gzip end at its checksum; here the damage is in what it holds."""
     plain = gzip.decompress(spz_bytes(SCENE, 3, extensions=EXTENSION))
-    check_all(plain, lambda damaged: read_spz(gzip.compress(damaged, 1), max_gaussians=LIMIT))
+    check_all(plain, lambda damaged: read_spz(gzip.compress(damaged, 1), LIMITED))
 
 
 def test_headers_of_ksplat():
@@ -59,7 +59,7 @@ def test_headers_of_ksplat():
 
     def read(damaged):
         head = damaged[:48].ljust(4096, b"\0") + damaged[48:96].ljust(1024, b"\0")
-        return read_ksplat(head + damaged[96:], max_gaussians=LIMIT)
+        return read_ksplat(head + damaged[96:], LIMITED)
 
     check_all(main + section + body, read)
 

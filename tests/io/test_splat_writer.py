@@ -8,7 +8,7 @@ from helpers.format_scenes import made_scene
 from helpers.reference_splat import SH_C0, splat_bytes
 
 from kissgs.core.splats import ATTRIBUTES, clean
-from kissgs.io import splat
+from kissgs.io import conventions
 from kissgs.io.splat import ROW, read_splat, write_splat
 
 
@@ -22,7 +22,7 @@ def written(splats):
 @pytest.mark.parametrize(("count", "degree"), [(0, 0), (1, 0), (65, 1), (600, 3)])
 def test_rows_are_those_of_the_reference(count, degree, monkeypatch):
     """Compared as a set: floats differ in their last bit, bytes where a half is rounded."""
-    monkeypatch.setattr(splat, "_BLOCK", 100)
+    monkeypatch.setattr(conventions, "ROWS", 100)
     scene = clean(made_scene(count, degree))[0]
     found = np.frombuffer(written(scene)[0], ROW)
     wanted = np.frombuffer(splat_bytes(scene), ROW)
