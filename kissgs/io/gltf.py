@@ -179,13 +179,16 @@ def _check_required(document: Document) -> None:
     if not version.startswith("2.") or least != "2.0":
         wanted = least if version.startswith("2.") else version
         raise UnsupportedError(f"{document.name} is glTF of version {wanted[:20]!r}; export it as glTF 2.0")
-    for name in _names(document, "extensionsRequired"):
-        if name in _COMPRESSIONS:
-            raise UnsupportedError(f"{document.name} is compressed by {name!r}; export it without or with .spz")
+    _refuse_compressions(document, [name for name in _names(document, "extensionsRequired") if name in _COMPRESSIONS])
     for name in _extensions(document, "extensionsRequired"):
         raise UnsupportedError(
             f"{document.name} requires the extension {name[:60]!r}, which is not read; export it without"
         )
+
+
+def _refuse_compressions(document: Document, names: list[str]) -> None:
+    for name in names:
+        raise UnsupportedError(f"{document.name} is compressed by {name[:60]!r}; export it without or with .spz")
 
 
 def _extensions(document: Document, key: str) -> list[str]:
@@ -279,6 +282,7 @@ def _primitive(
     if len(attributes) > _MAX_ATTRIBUTES:
         raise document.invalid(f"a primitive has {len(attributes):,} attributes")
     compressions = document.child(splatting, "extensions")
+    unread = [str(name) for name in document.child(primitive, "extensions") if name in _COMPRESSIONS]
     for name in compressions:
         if name in SPZ_EXTENSIONS:
             view = document.whole(document.child(compressions, name), "bufferView", -1)
@@ -286,10 +290,8 @@ def _primitive(
             if "POSITION" in attributes and document.count(attributes["POSITION"]) != header.count:
                 raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
             return _Primitive(attributes, matrix, header.count, header.sh_degree, view, header.antialiased)
-        raise UnsupportedError(f"{document.name} is compressed by {str(name)[:60]!r}; export it without or with .spz")
-    for name in document.child(primitive, "extensions"):
-        if name in _COMPRESSIONS:
-            raise UnsupportedError(f"{document.name} is compressed by {name!r}; export it without or with .spz")
+        unread.insert(0, str(name))
+    _refuse_compressions(document, unread)
     if "POSITION" not in attributes:
         raise document.invalid("a primitive has no POSITION")
     return _Primitive(attributes, matrix, document.count(attributes["POSITION"]), _degree(document, attributes), None)

@@ -10,7 +10,7 @@ import contextlib
 import itertools
 import os
 import posixpath
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,10 +18,10 @@ from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.positions import Origin, read_origin, recorded
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
-from kissgs.core.splats import ATTRIBUTES, MAX_GAUSSIANS, SH_REST_COUNTS, Splats, empty_splats
+from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.containers import Source, is_file_name, open_source, stored_size
 from kissgs.io.files import marked, parse_json, refuse_more_than
-from kissgs.io.scene_format import Codec, Facts, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions, SceneSource, titled
 
 MAX_TREE_BYTES = 1 << 25
 """Largest size of a manifest, bytes; one of a thousand leaves and five levels takes 330 kB."""
@@ -110,12 +110,7 @@ class StreamedFormat:
     @property
     def codec(self) -> Codec:
         """Code of the format."""
-        return Codec(
-            info=self.describe,
-            read=lambda source, reading, threads, progress: self.decode(
-                source, level=reading.level, max_gaussians=reading.max_compressed, threads=threads, progress=progress
-            ),
-        )
+        return Codec(info=self.describe, read=self.decode)
 
     def describe(self, path: Path | bytes, level: int) -> Facts:
         """Return the facts of one level and the environment; no image is decoded."""
@@ -148,7 +143,7 @@ class StreamedFormat:
         )
 
     @contextlib.contextmanager
-    def open(self, source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
+    def open(self, source: SceneSource) -> Iterator[Source]:
         """Open a streamed scene for reading; errors about its files name the scene."""
         with open_source(source, self.manifest) as files:
             try:
@@ -170,10 +165,8 @@ class StreamedFormat:
 
     def decode(
         self,
-        source: Path | bytes | Mapping[str, bytes],
-        *,
-        level: int = 0,
-        max_gaussians: int = MAX_GAUSSIANS,
+        source: SceneSource,
+        reading: ReadOptions = DEFAULT_READ_OPTIONS,
         threads: int = 0,
         progress: Progress = silent,
     ) -> Splats:
@@ -183,13 +176,13 @@ class StreamedFormat:
         """
         with self.open(source) as files, Workers(threads) as pool:
             manifest = self.read_manifest(files)
-            parts = list(self.parts(files, manifest, level))
+            parts = list(self.parts(files, manifest, reading.level))
             count = sum(part.count for part in parts)
-            refuse_more_than(max_gaussians, count, f"level {level}")
+            refuse_more_than(reading.max_compressed, count, f"level {reading.level}")
             splats = empty_splats(count, SH_REST_COUNTS[max((part.container.sh_degree for part in parts), default=0)])
             start = 0
             for part in parts:
-                refuse_more_than(max_gaussians, part.container.count, f"the file {part.name}")
+                refuse_more_than(reading.max_compressed, part.container.count, f"the file {part.name}")
                 progress("decode", start / max(count, 1))
                 start = part.decode(splats, start, pool)
             progress("decode", 1.0)

@@ -46,10 +46,9 @@ from kissgs.streaming.layout import (
 from kissgs.streaming.levels import (
     Environment,
     append_rows,
-    chunk_depth,
     chunk_levels,
     from_rows,
-    level_count,
+    halvings,
     read_rows,
     row_bytes,
     sync,
@@ -223,7 +222,7 @@ def partition(
     sample = sampled_rows(map(visible_rows, counted()), count)
     environment = Environment.of(sample[:, :3], visible_count)
     sample = sample[~environment.contains(sample[:, :3])]
-    cuts = Cuts.of(sample[:, :3], chunk_depth(count, CHUNK))
+    cuts = Cuts.of(sample[:, :3], halvings(count, CHUNK))
     if container == "sog":  # which has a range of each axis
         cuts = cuts_without_coarse(sample, cuts, count)
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in range(cuts.chunks))):
@@ -247,7 +246,7 @@ def partition(
             append_rows(chunk_file(work, int(chunk)), some)
             counts[chunk] += len(some)
     total = int(counts.sum())
-    levels = level_count(total, COARSEST)
+    levels = 1 + halvings(total, COARSEST)
     layout = Layout(
         container=container,
         source_count=count,

@@ -19,8 +19,8 @@ from kissgs.streaming.levels import FEWEST, MOST, Environment
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    small_sizes(monkeypatch, chunk=800, leaf=150, coarsest=500)
-    monkeypatch.setattr(levels, "FEWEST", 100)
+    small_sizes(monkeypatch, chunk=400, leaf=120, coarsest=250)
+    monkeypatch.setattr(levels, "FEWEST", 50)
 
 
 def directions(count, seed=0):
@@ -78,9 +78,9 @@ def test_degenerate_scenes_have_no_environment():
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A sample scene, whose sky is 12 % of it; and the distance of its sky."""
+    """A sample scene, whose sky is 12 % of it."""
     path = tmp_path_factory.mktemp("sky") / "scene.ply"
-    kissgs.save(kissgs.sample_scene(3000, sh_degree=1, seed=3), path)
+    kissgs.save(kissgs.sample_scene(1500, sh_degree=1, seed=3), path)
     return path
 
 
@@ -171,7 +171,7 @@ def test_images_never_go_back_and_have_the_time_left(scene, tmp_path, monkeypatc
 
 def test_an_environment_that_nobody_sees_is_left_out(tmp_path):
     """Nothing of a sky reaches the output if every renderer skips its opacity."""
-    original = kissgs.sample_scene(3000, sh_degree=0, seed=3)
+    original = kissgs.sample_scene(1500, sh_degree=0, seed=3)
     away = np.linalg.norm(original.means - np.median(original.means, axis=0), axis=1)
     original.opacities[away > 8 * np.median(away)] = -9.0
     kissgs.save(original, tmp_path / "scene.ply")

@@ -1,7 +1,8 @@
-"""Facts of a SOG-XT container from its metadata, for ``kissgs info``."""
+"""Scenes of SOG-XT in the table of formats: single containers, and streamed ones of ``levels.json`` and zips."""
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,20 @@ import numpy as np
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.positions import recorded
 from kissgs.core.progress import Progress
+from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.io.containers import Source, open_source
+from kissgs.formats import LEVELS_NAME
+from kissgs.io.containers import Source, ZipSource, open_source, stored_size
 from kissgs.io.scene_format import Codec, Facts, ReadOptions, SceneSource, titled
+from kissgs.io.streamed import Container, StreamedFormat
+from kissgs.sogxt import container
 from kissgs.sogxt.container import FILES, PLANES
 from kissgs.sogxt.metadata import Layout, read_layout, read_provenance
 
 MAX_PLANE_BYTES = 1 << 30
+
+MAX_FILE_BYTES = 1 << 28
+"""Largest size of a zip in a streamed scene, bytes; one of 400,000 Gaussians takes about 5 MB."""
 
 
 def describe(path: Path | bytes, level: int) -> Facts:
@@ -66,3 +74,30 @@ def _read(source: SceneSource, reading: ReadOptions, threads: int, progress: Pro
 
 
 FORMAT = Codec(info=describe, read=_read)
+
+
+def _opened(files: Source, name: str) -> Container:
+    """Read the metadata of a zip, whose bytes are not kept until its images are decoded."""
+
+    def opened() -> Source:
+        return ZipSource(io.BytesIO(files.read(name, MAX_FILE_BYTES)), name)
+
+    def decode(out: Splats, pool: Workers) -> None:
+        from kissgs.sogxt.decode import decode_files
+
+        decode_files(opened(), layout, out, pool)
+
+    layout = read_layout(opened())
+    if layout.count is None:
+        raise InvalidContainerError(f"{name} does not state its number of Gaussians; compress the scene again")
+    return Container(
+        count=layout.count,
+        sh_degree=layout.sh_degree,
+        antialiased=layout.antialiased,
+        ranges=layout.value_ranges,
+        stored=lambda: (name, stored_size(files, name)),
+        decode=decode,
+    )
+
+
+STREAMED = StreamedFormat("streamed SOG-XT scene", LEVELS_NAME, container.FORMAT, _opened)
