@@ -36,6 +36,8 @@ SH_LIMIT = 1e6
 """Bounds of absolute values that cleaning leaves unchanged; beyond, renderers' float32 squares overflow."""
 
 
+ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
 BLOCK = 1 << 16
 """Gaussians that are checked at a time."""
 
@@ -81,15 +83,8 @@ class Splats:
             raise InvalidSceneError(
                 f"shN has shape {self.shN.shape}; it must be (N, K, 3) with K one of {SH_REST_COUNTS}"
             )
-        expected = {
-            "means": (n, 3),
-            "quats": (n, 4),
-            "scales": (n, 3),
-            "opacities": (n,),
-            "sh0": (n, 3),
-            "shN": (n, k, 3),
-        }
-        for name, shape in expected.items():
+        shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 3), (n, k, 3))
+        for name, shape in zip(ATTRIBUTES, shapes, strict=True):
             array = getattr(self, name)
             if array.shape != shape or array.dtype != np.float32:
                 raise InvalidSceneError(
@@ -144,8 +139,6 @@ def empty_splats(count: int, coefficients: int) -> Splats:
     )
 
 
-ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
 CLEANED_TEXTS = {
     "non_finite": "removed: a value is NaN or infinite",
     "far_away": "removed: a coordinate is beyond 1e15",
@@ -161,24 +154,16 @@ CLEANED_TEXTS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cleaned:
-    """Number of Gaussians that :func:`clean` changed, by reason; the first two were removed, the others repaired."""
+    """Number of Gaussians that :func:`clean` changed, by reason (:data:`CLEANED_TEXTS`)."""
 
-    non_finite: int = 0
-    """Removed: NaN anywhere, or an infinite position, rotation or colour."""
+    non_finite: int = 0  # NaN anywhere, or an infinite position, rotation or colour
     far_away: int = 0
-    """Removed: a position beyond ±1e15."""
     infinite_opacities: int = 0
-    """Opacity logit ±inf, set to that of opacity 1e-6 or 1 - 1e-6."""
-    saturated_opacities: int = 0
-    """Finite opacity logit beyond those of opacity 1e-6 and 1 - 1e-6, clamped; no 8-bit image changes."""
+    saturated_opacities: int = 0  # no 8-bit image changes
     zero_quats: int = 0
-    """Quaternion of zero length, replaced by the identity."""
-    unnormalised_quats: int = 0
-    """Quaternion whose length differed from 1 by more than 1e-3, normalised."""
-    clamped_scales: int = 0
-    """Log-scale beyond ±30 (also ±inf, the logarithm of 0), clamped."""
+    unnormalised_quats: int = 0  # by more than 1e-3
+    clamped_scales: int = 0  # also ±inf, the logarithm of 0
     clamped_sh: int = 0
-    """SH coefficient beyond ±1e6, clamped."""
 
     @property
     def removed(self) -> int:

@@ -218,7 +218,7 @@ def _make(
     run("images", [item(file=file.name) for file in layout.all_files()])
     report("images", 1.0)
     build.make_manifest(work, layout)
-    return _report(work, layout, len(layout.filled))
+    return _report(work, layout)
 
 
 def _check_settings(settings: Settings) -> None:
@@ -309,15 +309,14 @@ def _announce(work: Path, needed: int, progress: Progress) -> None:
     progress("scratch", 1.0, f"{work} takes up to {megabytes(needed)} until the work is done")
 
 
-def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
+def _report(work: Path, layout: Layout) -> StreamedReport:
     out = work / OUT
     document = json.loads((out / layout.manifest).read_bytes())
     sizes = [0] * layout.levels
     for file in layout.files():
         path = out / layout.path(file.name)
-        sizes[file.level] += (
-            stored_bytes(path) if path.exists() else 0
-        )  # files without a visible Gaussian are not written
+        if path.exists():  # files without a visible Gaussian are not written
+            sizes[file.level] += stored_bytes(path)
     environment = out / layout.path(ENVIRONMENT)
     environment_count, environment_bytes = 0, 0
     if environment.exists():
@@ -330,7 +329,7 @@ def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
         level_bytes=tuple(sizes),
         environment_count=environment_count,
         environment_bytes=environment_bytes,
-        chunks=chunks,
+        chunks=len(layout.filled),
         note="; ".join(filter(None, [*layout.notes, build.coarse_note(work, layout)])),
         total_bytes=sum(sizes) + environment_bytes + (out / layout.manifest).stat().st_size,
     )

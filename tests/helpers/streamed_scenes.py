@@ -55,6 +55,10 @@ TARGETS = ("city/lod-meta.json", "city.sogxt/levels.json")
 """Manifests to write, one of each kind."""
 
 
+class Stop(Exception):
+    """Raised by a test's progress callback to interrupt the work."""
+
+
 def tree_leaves(node):
     """Return the leaves of a manifest's tree."""
     return [node] if "lods" in node else [leaf for child in node["children"] for leaf in tree_leaves(child)]

@@ -102,7 +102,7 @@ def mutated_header(draw):
 @examples(300)
 @given(mutated_header())
 def test_mutated_headers_of_ply(data):
-    """What can be read agrees with its header, and can be written and read again."""
+    """A scene that can be read agrees with its header, and can be written and read again."""
 
     def read():
         splats = read_ply(data)

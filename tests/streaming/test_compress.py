@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from helpers.format_scenes import assert_alike
 from helpers.splat_transform import convert, needs_splat_transform
-from helpers.streamed_scenes import FAST, TARGETS, files_of, saved_sample, small_sizes, tree_leaves
+from helpers.streamed_scenes import FAST, TARGETS, Stop, files_of, saved_sample, small_sizes, tree_leaves
 
 import kissgs
 from kissgs import Settings
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.splats import concatenate
 from kissgs.io.streamed import MAX_TREE_BYTES
+from kissgs.streaming import levels
 from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.levels import bounds
 
@@ -140,16 +141,14 @@ def test_rows_of_a_leaf_are_those_of_its_part_of_space(scene, written, tmp_path,
         assert (overlap.min(axis=1) < 0.05 * np.minimum(sides[one], sides[other])).all()
 
 
-class Stop(Exception):
-    pass
-
-
 @pytest.mark.quick(1)
 def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(target, tmp_path, monkeypatch):
     kissgs.save(kissgs.sample_scene(500, sh_degree=0, seed=3), tmp_path / "scene.ply")
     small_sizes(monkeypatch, chunk=250, leaf=150, coarsest=200)
+    monkeypatch.setattr(levels, "FEWEST", 20)  # the sky becomes an environment
     compress_streamed(tmp_path / "scene.ply", tmp_path / "whole" / target.name, settings=FAST)
     expected = files_of(tmp_path / "whole")
+    assert any(name.startswith("environment") for name in expected)
     events = 0
     while True:
         left = [events]

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.splat_transform import convert, needs_splat_transform
-from helpers.streamed_scenes import FAST, TARGETS, files_of, small_sizes
+from helpers.streamed_scenes import FAST, TARGETS, Stop, small_sizes
 
 import kissgs
 from kissgs import Settings
@@ -110,34 +110,6 @@ def test_every_level_has_the_whole_sky(scene, tmp_path, name, preset):
     assert report.total_bytes == total
     lost = report.source_count - report.counts[0] - report.environment_count
     assert lost == report.changed["invisible"] + report.changed["pruned_by_rd"]
-
-
-class Stop(Exception):
-    pass
-
-
-@pytest.mark.quick(0)
-@pytest.mark.parametrize("name", TARGETS)
-def test_interrupted_work_ends_with_the_same_bytes_and_is_replaced_as_a_whole(scene, tmp_path, name):
-    for folder in ("whole", "parts"):
-        (tmp_path / folder).mkdir()
-    compress_streamed(scene, tmp_path / "whole" / name, settings=FAST)
-    target = tmp_path / "parts" / name
-    for stage in ("merge", "images", "images"):
-        seen = 0
-
-        def stop(now, fraction, note="", stage=stage):
-            nonlocal seen
-            seen += now == stage
-            if seen > 1:
-                raise Stop
-
-        with pytest.raises(Stop):
-            compress_streamed(scene, target, settings=FAST, progress=stop)
-    compress_streamed(scene, target, settings=FAST)
-    assert files_of(target.parent) == files_of((tmp_path / "whole" / name).parent)
-    compress_streamed(scene, target, settings=Settings.research("fast", sh0_step=0.1), overwrite=True)
-    assert not list(target.parent.parent.glob("*.partial"))
 
 
 @pytest.mark.quick(1)
