@@ -338,17 +338,16 @@ def read_ply(
         return replace(splats, antialiased=info.antialiased, notes=(*_notes(ply.header), *splats.notes))
 
 
-def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Splats]:
+def read_ply_blocks(source: Path) -> Iterator[Splats]:
     """Yield a scene as :func:`read_ply` reads it, some 65,536 Gaussians at a time.
 
-    PlayCanvas' compressed ``.ply`` comes as one block. Arguments and errors are those of :func:`read_ply`; errors of
+    PlayCanvas' compressed ``.ply`` comes as one block. Errors are those of :func:`read_ply`; those of
     the body are raised when its block is reached.
     """
     with open_ply(source) as ply:
         info = _check(ply)
-        progress("read", 0.0)
         if info.compressed:
-            yield replace(read_compressed(ply, info.sh_degree, progress), notes=_notes(ply.header))
+            yield replace(read_compressed(ply, info.sh_degree, silent), notes=_notes(ply.header))
             return
         columns, waiting, done = _Columns(ply.header.elements["vertex"], info.encoding, info.sh_degree), [], 0
         origin = columns.origin(rows(ply, columns.vertex)) if columns.wide else WORLD
@@ -359,7 +358,6 @@ def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Sp
                 notes = dict.fromkeys([*_notes(ply.header), *(note for each in waiting for note in each.notes)])
                 yield replace(concatenate(waiting), antialiased=info.antialiased, notes=tuple(notes))
                 waiting = []
-                progress("read", done / info.count)
 
 
 def write_ply(
@@ -477,7 +475,7 @@ def _read_columns(ply: PlyFile, degree: int, progress: Progress) -> Splats:
     for block in rows(ply, columns.vertex):
         columns.copy(block, splats.select(slice(start, start + len(block))))
         if columns.wide:
-            positions.append(_float64(block, _POSITION))
+            positions.append(_positions(block))
         start += len(block)
         progress("read", start / count)
     return from_world(splats, np.concatenate(positions)) if positions else splats
@@ -498,7 +496,7 @@ class _Columns:
         """Return the origin of a scene whose positions may have more digits than float32."""
         if not self.vertex.count:
             return WORLD
-        each = (np.column_stack([_float64(block, _POSITION), self.splats(block, WORLD).scales]) for block in blocks)
+        each = (np.column_stack([_positions(block), self.splats(block, WORLD).scales]) for block in blocks)
         some = sampled_rows(each, self.vertex.count)
         return origin_for(some[:, :3], some[:, 3:6].astype(np.float32))
 
@@ -506,7 +504,7 @@ class _Columns:
         """Return the Gaussians of some rows, relative to ``origin``."""
         splats = empty_splats(len(block), self._k)
         self.copy(block, splats)
-        return from_world(splats, _float64(block, _POSITION), origin) if self.wide else splats
+        return from_world(splats, _positions(block), origin) if self.wide else splats
 
     def copy(self, block: np.ndarray, out: Splats) -> None:
         """Copy rows to the arrays of ``out``, of the same length."""
@@ -547,8 +545,8 @@ def _apply_filters(filters: Shaped[np.ndarray, " N"], out: Splats) -> None:
 
 
 @np.errstate(invalid="ignore")  # signalling NaN
-def _float64(block: np.ndarray, names: tuple[str, ...]) -> Float64[np.ndarray, "B C"]:
-    return np.stack([block[name].astype(np.float64) for name in names], axis=1)
+def _positions(block: np.ndarray) -> Float64[np.ndarray, "B 3"]:
+    return np.stack([block[axis].astype(np.float64) for axis in _POSITION], axis=1)
 
 
 def _colour_to_sh(colour: Float32[np.ndarray, "N 3"]) -> None:

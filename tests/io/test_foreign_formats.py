@@ -61,10 +61,10 @@ def ply_of(scene, path):
     return path
 
 
-def written(writer, scene, path, **options):
+def written(writer, scene, path):
     """Write the cleaned scene, and return the path."""
     with path.open("wb") as file:
-        writer(file, clean(scene)[0], **options)
+        writer(file, clean(scene)[0])
     return path
 
 

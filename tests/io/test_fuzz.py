@@ -26,6 +26,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from kissgs import Settings, compress, decompress
+from kissgs.core.progress import silent
 from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.formats import FORMATS
 from kissgs.io.ply import read_ply, read_ply_info, write_ply
@@ -55,7 +56,7 @@ FILES = {
 @pytest.mark.parametrize("name", FILES)
 def test_damaged_files(name):
     kind, data = FILES[name]
-    check_all(data, lambda damaged: FORMATS[kind].codec.read(damaged, LIMITED, 1, lambda *event: None))
+    check_all(data, lambda damaged: FORMATS[kind].codec.read(damaged, LIMITED, 1, silent))
 
 
 def test_damage_inside_gzip():
@@ -70,7 +71,7 @@ def test_headers_of_ksplat():
 
     def read(damaged):
         head = damaged[:48].ljust(4096, b"\0") + damaged[48:96].ljust(1024, b"\0")
-        return FORMATS["ksplat"].codec.read(head + damaged[96:], LIMITED, 1, lambda *event: None)
+        return FORMATS["ksplat"].codec.read(head + damaged[96:], LIMITED, 1, silent)
 
     check_all(data[:48] + data[4096 : 4096 + 48] + data[4096 + 1024 :], read)
 
