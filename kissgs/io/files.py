@@ -59,6 +59,11 @@ def whole_number(value: object, least: int, most: int) -> int | None:
     return value if isinstance(value, int) and not isinstance(value, bool) and least <= value <= most else None
 
 
+def is_number(value: object, limit: float) -> bool:
+    """Whether a value of JSON is a number, not true or false, that is nearer to zero than ``limit``."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < limit
+
+
 def _check_depth(document: object) -> None:
     level = [document]
     for _ in range(MAX_DEPTH + 1):

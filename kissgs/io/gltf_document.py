@@ -23,7 +23,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.io.containers import is_below
 from kissgs.io.conventions import Signs, colors_of, note_mark, opacities_of, sh_signs, steps, to_bytes
-from kissgs.io.files import BinaryWriter, SceneFile, open_scene_file, parse_json, whole_number
+from kissgs.io.files import BinaryWriter, SceneFile, is_number, open_scene_file, parse_json, whole_number
 from kissgs.io.spz import decode_positions, encode_positions, fractional_bits_for, write_spz
 
 # glTF files as documents: GLB and JSON, their buffers, and accessors as arrays, checked before memory is taken.
@@ -236,10 +236,7 @@ def _vector(
     document: Document, node: dict[str, Any], key: str, count: int, default: tuple[int, ...] | None
 ) -> Float64[np.ndarray, " count"]:
     values = node.get(key, default)
-    valid = isinstance(values, list | tuple) and len(values) == count
-    if not valid or not all(
-        isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e30 for v in values or ()
-    ):
+    if not isinstance(values, list | tuple) or len(values) != count or not all(is_number(v, 1e30) for v in values):
         raise document.invalid(f"a node's {key} is not {count} numbers")
     return np.array(values, dtype=np.float64)
 

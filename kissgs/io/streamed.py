@@ -20,7 +20,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.containers import Source, is_file_name, open_source, stored_size
-from kissgs.io.files import marked, parse_json, refuse_more_than
+from kissgs.io.files import marked, parse_json, refuse_more_than, whole_number
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions, SceneSource, titled
 
 MAX_TREE_BYTES = 1 << 25
@@ -28,6 +28,9 @@ MAX_TREE_BYTES = 1 << 25
 
 MAX_TREE_VALUES = 1 << 22
 """Largest number of values in a manifest; one of a thousand leaves and five levels has 30,000."""
+
+MAX_ROWS = 1 << 40
+"""Largest number of a row that a manifest may name."""
 
 MAX_LEVELS = 64
 """Largest number of levels; each has a fraction of the Gaussians of the one before."""
@@ -198,8 +201,8 @@ class StreamedFormat:
         for key, known in (("version", 1), ("format", self.containers)):
             if known is not None and (found := document.get(key, known)) != known:
                 raise UnsupportedError(f"{name} is of {key} {str(found)[:40]!r}; {key} {known} is read")
-        levels, names = document.get("lodLevels"), document.get("filenames")
-        if not isinstance(levels, int) or isinstance(levels, bool) or not 1 <= levels <= MAX_LEVELS:
+        levels, names = whole_number(document.get("lodLevels"), 1, MAX_LEVELS), document.get("filenames")
+        if levels is None:
             raise _invalid(name, f"lodLevels is not a whole number from 1 to {MAX_LEVELS}")
         if not isinstance(names, list):
             raise _invalid(name, "it lacks the list 'filenames'")
@@ -272,8 +275,9 @@ def _leaf_rows(name: str, tree: object, levels: int, files: int) -> Iterator[tup
                 level = int(key) if key.isascii() and key.isdigit() and len(key) < 4 else levels
                 if level >= levels or not isinstance(lod, dict):
                     raise _invalid(name, f"a leaf has a level that is not 0 to {levels - 1}")
-                file, offset, count = (_whole(lod.get(part)) for part in ("file", "offset", "count"))
-                if file is None or offset is None or count is None or file >= files:
+                file = whole_number(lod.get("file"), 0, files - 1)
+                offset, count = (whole_number(lod.get(part), 0, MAX_ROWS) for part in ("offset", "count"))
+                if file is None or offset is None or count is None:
                     raise _invalid(name, "a leaf does not name a file, an offset and a count")
                 if count:
                     yield level, (file, offset, count)
@@ -281,10 +285,6 @@ def _leaf_rows(name: str, tree: object, levels: int, files: int) -> Iterator[tup
             waiting.extend(children)
         elif lods is not None or children is not None:
             raise _invalid(name, "its tree has a node whose levels or children are of the wrong kind")
-
-
-def _whole(value: object) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 40 else None
 
 
 def _invalid(name: str, problem: str) -> InvalidContainerError:

@@ -22,7 +22,7 @@ from kissgs.io.containers import (
     stated_text,
 )
 from kissgs.io.conventions import OPACITY_OF_BYTE
-from kissgs.io.files import listed, parse_json, whole_number
+from kissgs.io.files import is_number, listed, parse_json, whole_number
 
 ENTRIES_PER_ROW = 64
 """Entries of the SH codebook in a row of its image."""
@@ -32,6 +32,9 @@ FIRST_TAG = 252
 
 MAX_SH_ENTRIES = 1 << 16
 """Largest number of entries of the SH codebook: labels have two bytes."""
+
+MAX_FLOAT32 = 3e38
+"""Bound of numbers, which float32 must hold."""
 
 _LEVELS = 256
 
@@ -206,14 +209,9 @@ def _means(document: dict[str, Any]) -> dict[str, Float64[np.ndarray, " 3"]]:
 def _numbers(part: dict[str, Any], key: str, where: str, count: int) -> Float64[np.ndarray, " count"]:
     values = part.get(key)
     values = values if isinstance(values, list) else [values]
-    if len(values) != count or not all(map(_is_number, values)):
+    if len(values) != count or not all(is_number(value, MAX_FLOAT32) for value in values):
         raise _MetadataError(f"{where}{key} is not a list of {count} finite numbers; export the scene again")
     return np.array(values, dtype=np.float64)
-
-
-def _is_number(value: object) -> bool:
-    """Whether a value is a number that float32 can hold."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 3e38
 
 
 def _even_table(document: dict[str, Any], key: str, channels: int) -> Float32[np.ndarray, "channels 256"]:
@@ -232,7 +230,7 @@ def _codebook(document: dict[str, Any], key: str, channels: int) -> Float32[np.n
     values = _part(document, key).get("codebook")
     if not isinstance(values, list) or not 1 <= len(values) <= _LEVELS:
         raise _MetadataError(f"{key}.codebook is not a list of up to {_LEVELS} numbers; export the scene again")
-    if not all(value is None or _is_number(value) for value in values):
+    if not all(value is None or is_number(value, MAX_FLOAT32) for value in values):
         raise _MetadataError(f"{key}.codebook has something else than finite numbers; export the scene again")
     table = np.full(_LEVELS, np.nan)
     table[: len(values)] = [math.nan if value is None else value for value in values]
