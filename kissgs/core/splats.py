@@ -128,14 +128,17 @@ def sampled_rows(blocks: Iterable[Float[np.ndarray, "n C"]], count: int) -> Floa
 
 
 def empty_splats(count: int, coefficients: int) -> Splats:
-    """Return a scene of uninitialised arrays; ``coefficients`` is K, the number of SH coefficients in ``shN``."""
+    """Return a scene whose arrays are to be filled, with K ``coefficients`` in ``shN``.
+
+    These are zero, so that a part of lower SH degree fills only its own.
+    """
     return Splats(
         means=np.empty((count, 3), np.float32),
         quats=np.empty((count, 4), np.float32),
         scales=np.empty((count, 3), np.float32),
         opacities=np.empty(count, np.float32),
         sh0=np.empty((count, 3), np.float32),
-        shN=np.empty((count, coefficients, 3), np.float32),
+        shN=np.zeros((count, coefficients, 3), np.float32),
     )
 
 

@@ -340,7 +340,6 @@ def _read_attributes(document: Document, primitive: _Primitive, out: Splats) -> 
         bands = [f"SH_DEGREE_{band}_COEF_{i}" for band in range(1, primitive.degree + 1) for i in range(2 * band + 1)]
         for i, name in enumerate(bands):
             out.shN[:, i] = column(name, 3)
-        out.shN[:, len(bands) :] = 0
 
 
 def _read_spz(document: Document, view: int, out: Splats) -> tuple[str, ...]:
@@ -350,9 +349,7 @@ def _read_spz(document: Document, view: int, out: Splats) -> tuple[str, ...]:
     for name in ATTRIBUTES:
         if name != "shN":
             getattr(out, name)[:] = getattr(stored, name)
-    coefficients = stored.shN.shape[1]
-    out.shN[:, :coefficients] = stored.shN
-    out.shN[:, coefficients:] = 0
+    out.shN[:, : stored.shN.shape[1]] = stored.shN
     return stored.notes
 
 

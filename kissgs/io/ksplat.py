@@ -218,7 +218,6 @@ def _decode_rest(
     rows: Shaped[np.ndarray, " B"], order: Int[np.ndarray, " D"], headers: _Headers, out: Float32[np.ndarray, "B K 3"]
 ) -> None:
     width = len(order) // 3
-    out[:, width:] = 0
     if not width:
         return
     values = rows["rest"][:, order].astype(np.float32)

@@ -49,7 +49,7 @@ class Container:
     stored: Callable[[], tuple[str, int]]
     """Returns the name of the container and the bytes of all its files."""
     decode: Callable[[Splats, Workers], None]
-    """Decodes all Gaussians into a scene, whose SH coefficients above the container's degree become zero."""
+    """Decodes all Gaussians into a scene, whose SH coefficients above the container's degree are zero."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,7 @@ def decode(
 def decode_files(files: Source, layout: Layout, out: Splats, pool: Workers) -> None:
     """Decode a container whose metadata states the number of Gaussians into ``out``, which has as many.
 
-    ``out`` may have more SH coefficients than the container; they become zero.
+    SH coefficients of ``out`` above the container's degree are left as they are.
     """
     planes = _Planes(files, layout, len(out))
     planes.load(pool)
@@ -65,7 +65,7 @@ class _Planes:
     means: UInt16[np.ndarray, "cells 3"]
     means_table: Float32[np.ndarray, " levels"]
     labels: UInt8[np.ndarray, "cells 2"]
-    codebook: Float32[np.ndarray, "entries D"]
+    codebook: Float32[np.ndarray, "entries K 3"]
 
     def __init__(self, files: Source, layout: Layout, max_gaussians: int) -> None:
         self.files, self.layout, self.max_gaussians = files, layout, max_gaussians
@@ -128,7 +128,7 @@ class _Planes:
         low, high = (limit.reshape(3, 15).T.reshape(45) for limit in self.layout.limits("f_rest_centroids"))
         entries = np.empty((side * side, 45), dtype=np.float32)
         _Lookup(tiles, low, high)(tiles, entries)
-        self.codebook = np.ascontiguousarray(entries[:, : 3 * self.coefficients])
+        self.codebook = np.ascontiguousarray(entries.reshape(-1, 15, 3)[:, : self.coefficients])
 
     def grid_plane(self, name: str, channels: int) -> UInt8[np.ndarray, "cells C"]:
         """Return an image of the grid's size, as one row per cell."""
@@ -147,7 +147,7 @@ class _Planes:
     def look_up(self, pool: Workers, out: Splats | None = None) -> Splats:
         """Convert levels to values, some thousand Gaussians at a time, so that temporaries stay in the cache.
 
-        They are written to ``out`` if it is given, whose SH coefficients above the container's become zero.
+        They are written to ``out`` if it is given.
         """
         mask = self.mask[:, 0] > 0
         count = int(np.count_nonzero(mask))
@@ -160,9 +160,7 @@ class _Planes:
         splats = empty_splats(count, self.coefficients) if out is None else out
         outputs = (splats.quats, splats.scales, splats.sh0, splats.opacities[:, None])
         plain = [(*self.plain[field], out) for field, out in zip(CHANNELS_OF_PLAIN, outputs, strict=True)]
-        shN = splats.shN.reshape(count, 3 * splats.shN.shape[1])
-        more = shN.shape[1] - self.codebook.shape[1]
-        codebook = np.pad(self.codebook, ((0, 0), (0, more))) if more else self.codebook
+        shN = splats.shN[:, : self.coefficients]
 
         def work(first: int) -> None:
             rows = slice(first, min(first + CHUNK, count))
@@ -172,7 +170,7 @@ class _Planes:
                 lookup(levels[source], out[rows])
             if shN.shape[1]:
                 entries = _entry(self.labels[source], self.layout.codebook_side)
-                np.take(codebook, entries, axis=0, out=shN[rows], mode="clip")
+                np.take(self.codebook, entries, axis=0, out=shN[rows], mode="clip")
 
         pool.map(work, range(0, count, CHUNK))
         return splats
