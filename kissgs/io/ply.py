@@ -284,8 +284,6 @@ _IN_TIME = re.compile(
 )
 """Properties that move or change Gaussians in time, of SpacetimeGaussians, 4DGS, 4D-Rotor and FreeTimeGS."""
 
-_WRITE_ROWS = 4096
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlyInfo:
@@ -375,13 +373,13 @@ def write_ply(
     header = ["ply", "format binary_little_endian 1.0", *[MIP_COMMENT] * splats.antialiased, f"element vertex {n}"]
     header += [f"property {'double' if name in wide else 'float'} {name}" for name in names]
     file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
-    for start in range(0, n, _WRITE_ROWS):
-        part = splats.select(slice(start, start + _WRITE_ROWS))
+    for step in steps(n):
+        part = splats.select(step)
         rest = part.shN.transpose(0, 2, 1).reshape(len(part), 3 * k)  # all of R, then G, then B
         normals, opacities = np.zeros_like(part.means), part.opacities[:, None]
         table = np.concatenate([part.means, normals, part.sh0, rest, opacities, part.scales, part.quats], axis=1)
         file.write((_with_doubles(part, table) if wide else table.astype("<f4", copy=False)).data)
-        progress("write", min(1.0, (start + _WRITE_ROWS) / n))
+        progress("write", step.stop / n)
     return ()
 
 

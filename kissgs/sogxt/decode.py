@@ -20,11 +20,9 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import MAX_GAUSSIANS, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.containers import Source, open_source
+from kissgs.io.conventions import ROWS, steps
 from kissgs.io.images import decode_plane
 from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout, read_layout
-
-CHUNK = 1 << 14
-"""Gaussians per task."""
 
 CHANNELS_OF_PLAIN = {"quaternions": 4, "scales": 3, "f_dc": 3, "opacities": 1}
 """Number of channels of the attributes that are one image of 8-bit levels each."""
@@ -162,8 +160,7 @@ class _Planes:
         plain = [(*self.plain[field], out) for field, out in zip(CHANNELS_OF_PLAIN, outputs, strict=True)]
         shN = splats.shN[:, : self.coefficients]
 
-        def work(first: int) -> None:
-            rows = slice(first, min(first + CHUNK, count))
+        def work(rows: slice) -> None:
             source = rows if cells is None else cells[rows]
             np.take(self.means_table, self.means[source], out=splats.means[rows], mode="clip")
             for levels, lookup, out in plain:
@@ -172,7 +169,7 @@ class _Planes:
                 entries = _entry(self.labels[source], self.layout.codebook_side)
                 np.take(self.codebook, entries, axis=0, out=shN[rows], mode="clip")
 
-        pool.map(work, range(0, count, CHUNK))
+        pool.map(work, steps(count))
         return splats
 
 
@@ -187,13 +184,13 @@ class _Lookup:
     def __init__(self, image: UInt8[np.ndarray, "..."], low: np.ndarray, high: np.ndarray) -> None:
         table = _table(image, low, high).astype(np.float32)
         self._table = table.reshape(-1)
-        # One row of offsets per Gaussian of a chunk: NumPy adds equal shapes faster than it broadcasts short rows.
-        self._offsets = np.tile(np.arange(len(table), dtype=np.uint16) * table.shape[1], (CHUNK, 1))
+        # One row of offsets per Gaussian of a step: NumPy adds equal shapes faster than it broadcasts short rows.
+        self._offsets = np.tile(np.arange(len(table), dtype=np.uint16) * table.shape[1], (ROWS, 1))
 
     def __call__(self, levels: UInt8[np.ndarray, "N C"], out: Float32[np.ndarray, "N C"]) -> None:
-        for first in range(0, len(levels), CHUNK):
-            some = levels[first : first + CHUNK]
-            np.take(self._table, some + self._offsets[: len(some)], out=out[first : first + CHUNK], mode="clip")
+        for part in steps(len(levels)):
+            some = levels[part]
+            np.take(self._table, some + self._offsets[: len(some)], out=out[part], mode="clip")
 
 
 def _table(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> Float64[np.ndarray, "C levels"]:
