@@ -14,7 +14,8 @@ from helpers.memory import takes_less_than
 
 from kissgs import Settings, compress, decompress
 from kissgs.core.errors import InvalidContainerError, OutputError
-from kissgs.io.containers import MAX_ZIP_ENTRIES, open_source
+from kissgs.io import containers
+from kissgs.io.containers import MAX_ZIP_ENTRIES, DirectorySource, is_below, open_source, zip_names
 from kissgs.sogxt.container import check_destination, write_container, zip_bytes
 
 FILES = {"container_meta.yaml": b"meta", "meta.json": b"{}", "a.webp": bytes(range(256)) * 4, "empty.webp": b""}
@@ -276,3 +277,44 @@ def test_a_whole_container_survives_repacking():
     compressed = compress(random_scene(50, 1), settings=Settings.from_preset("fast"))
     repacked = archive([(f"my scene/{name}", data) for name, data in compressed.files.items()], zipfile.ZIP_DEFLATED)
     assert (decompress(repacked).means == decompress(compressed.files).means).all()
+
+
+@pytest.mark.parametrize("name", ["a", "a/b.webp", "a b/c", "..a/b", "a/..b", "a\\b"])
+def test_paths_below_a_folder(name):
+    assert is_below(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["", "/a", "..", "../a", "a/../b", "a\\..\\b", "\\a", "C:/a", "C:\\a", "https://a", "a\0"]
+)
+def test_paths_outside_a_folder(name, tmp_path):
+    assert not is_below(name)
+    with pytest.raises(InvalidContainerError, match="has no file"):
+        DirectorySource(tmp_path).read(name, 1000)
+
+
+def test_files_by_name_or_by_path_from_a_root():
+    data = archive([(name, b"x") for name in ("top/index", "top/a/one", "top/b/two", "elsewhere/three")])
+    with open_source(data) as files:
+        assert files.names() == {"index", "one", "two", "three"}
+        assert files.read("any/one", 10) == b"x"
+    with open_source(data, "index") as files:
+        assert files.names() == {"index", "a/one", "b/two"}
+        assert files.read("a/one", 10) == b"x"
+        with pytest.raises(InvalidContainerError, match="has no file 'one'"):
+            files.read("one", 10)
+    for names, count in ((["a/index", "b/index"], 2), (["a"], 0)):
+        with pytest.raises(InvalidContainerError, match=f"holds {count} files named 'index'; one is needed"):
+            open_source(archive([(name, b"x") for name in names]), "index").__enter__()
+
+
+def test_lists_of_entries_that_are_too_large_or_of_zip64(monkeypatch):
+    data = archive([(f"{i:04}", b"x") for i in range(200)])
+    assert len(zip_names(io.BytesIO(data))) == 200
+    monkeypatch.setattr(containers, "MAX_DIRECTORY_BYTES", 5000)
+    assert zip_names(io.BytesIO(data)) == []
+    assert refusal(data) == "the input has a list of entries above 5000 bytes; pack it again"
+    data = archive([("a", b"x")])
+    end = data.rindex(b"PK\5\6")
+    zip64 = data[:end] + b"PK\6\7".ljust(20, b"\0") + data[end:]
+    assert refusal(zip64) == "the input is a zip64 file; pack it as an ordinary zip"
