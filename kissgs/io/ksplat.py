@@ -16,7 +16,7 @@ from kissgs.core.array_types import Float32, Float64, Int, Int64, Shaped
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
-from kissgs.io.conventions import OPACITY_OF_BYTE, ROWS, SH0_OF_BYTE, log_scales, steps
+from kissgs.io.conventions import OPACITY_OF_BYTE, SH0_OF_BYTE, log_scales
 from kissgs.io.files import SceneFile, open_scene_file, refuse_more_than
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
 
@@ -172,10 +172,7 @@ def _read_section(opened: SceneFile, headers: _Headers, section: _Section, out: 
     """Decode the records of a section, some thousand at a time, into ``out``."""
     ends, centres = _read_buckets(opened, section) if headers.level and section.count else (None, None)
     order = _rest_order(section.degree)
-    block = np.empty(min(ROWS, section.count), section.dtype)
-    for step in steps(section.count):
-        rows = block[: step.stop - step.start]
-        opened.read_into(section.offset + step.start * section.dtype.itemsize, rows)
+    for step, rows in opened.rows(section.offset, section.dtype, section.count):
         part = out.select(step)
         if ends is None or centres is None:
             part.means[:] = rows["means"]

@@ -16,7 +16,6 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, empty_splats
 from kissgs.io.conventions import (
     OPACITY_OF_BYTE,
-    ROWS,
     SH0_OF_BYTE,
     byte_quats,
     colors_of,
@@ -43,10 +42,7 @@ def read_splat(
         refuse_more_than(reading.max_gaussians, count, opened.name)
         progress("read", 0.0)
         splats = empty_splats(count, 0)
-        block = np.empty(min(ROWS, count), ROW)
-        for part in steps(count):
-            rows = block[: part.stop - part.start]
-            opened.read_into(part.start * ROW.itemsize, rows)
+        for part, rows in opened.rows(0, ROW, count):
             _decode(rows, splats.select(part))
             progress("read", part.stop / count)
         return splats
