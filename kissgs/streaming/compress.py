@@ -18,7 +18,7 @@ from kissgs.core.positions import middle_of, with_origin, world_positions
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import BLOCK, Splats
 from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
-from kissgs.io.files import atomic_file, reason_of
+from kissgs.io.files import reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_level, stored_bytes
@@ -48,6 +48,7 @@ from kissgs.streaming.layout import (
     keep_layout,
     read_layout,
     work_folder,
+    write_json,
 )
 
 # ``with_time_left``: progress events of the work items of a streamed scene, with an estimate of the time left.
@@ -183,8 +184,7 @@ def compress_streamed(
         if (found := read_json(work / REPORT)) is None:
             layout = _partition(work, source, container, settings, reading, threads, progress)
             found = asdict(_make(work, layout, settings, runner, threads, progress))
-            with atomic_file(work / REPORT) as done:
-                done.write(json.dumps(found).encode())
+            write_json(work / REPORT, found)
         finish(work, manifest, source, overwrite=overwrite)
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
 
