@@ -179,7 +179,9 @@ def _check_required(document: Document) -> None:
     if not version.startswith("2.") or least != "2.0":
         wanted = least if version.startswith("2.") else version
         raise UnsupportedError(f"{document.name} is glTF of version {wanted[:20]!r}; export it as glTF 2.0")
-    _refuse_compressions(document, [name for name in _names(document, "extensionsRequired") if name in _COMPRESSIONS])
+    _refuse_compressions(
+        document, [name for name in document.entries("extensionsRequired", document.root, str) if name in _COMPRESSIONS]
+    )
     for name in _extensions(document, "extensionsRequired"):
         raise UnsupportedError(
             f"{document.name} requires the extension {name[:60]!r}, which is not read; export it without"
@@ -193,14 +195,11 @@ def _refuse_compressions(document: Document, names: list[str]) -> None:
 
 def _extensions(document: Document, key: str) -> list[str]:
     """Return the extensions in a list of the file that may matter to Gaussians and are not read."""
-    return [name for name in _names(document, key) if name not in _READ and not _OF_SURFACES.fullmatch(name)]
-
-
-def _names(document: Document, key: str) -> list[str]:
-    found = document.root.get(key, [])
-    if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
-        raise document.invalid(f"{key} is not a list of names")
-    return found
+    return [
+        name
+        for name in document.entries(key, document.root, str)
+        if name not in _READ and not _OF_SURFACES.fullmatch(name)
+    ]
 
 
 def _instances(
@@ -212,7 +211,7 @@ def _instances(
         yield from ((mesh, np.eye(4)) for mesh in document.items("meshes"))
         return
     scene = document.item("scenes", document.root.get("scene", 0))
-    waiting = [(index, np.eye(4)) for index in _indices(document, scene, "nodes")]
+    waiting = [(index, np.eye(4)) for index in document.entries("nodes", scene)]
     for visited in range(_MAX_INSTANCES):
         if not waiting:
             return
@@ -230,7 +229,7 @@ def _instances(
         if "mesh" in node:
             mesh = document.item("meshes", node["mesh"])
             yield from ((mesh, place) for place in placed)
-        waiting += [(child, matrix) for child in _indices(document, node, "children")]
+        waiting += [(child, matrix) for child in document.entries("children", node)]
         if len(waiting) > _MAX_INSTANCES - visited:
             break
     raise document.invalid(f"its nodes form a circle or are more than {_MAX_INSTANCES:,}")
@@ -258,13 +257,6 @@ def _placements(document: Document, instancing: dict[str, Any]) -> Iterator[Floa
         columns["rotation"] /= lengths
     for row in range(count):
         yield node_matrix(document, {name: values[row].tolist() for name, values in columns.items()})
-
-
-def _indices(document: Document, parent: dict[str, Any], key: str) -> list[Any]:
-    found = parent.get(key, [])
-    if not isinstance(found, list):
-        raise document.invalid(f"{key} is not a list")
-    return found
 
 
 def _primitive(

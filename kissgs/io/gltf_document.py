@@ -49,6 +49,7 @@ _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126
 _MAX_STRIDE = 252
 """Largest distance of rows, given by the format."""
 
+_LISTS = {dict: " of objects", str: " of names", object: ""}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
@@ -76,11 +77,16 @@ class Document:
         """Return a list of objects, empty if the document has none."""
         if parent is None and key in self._lists:  # checked before; nodes and accessors are asked for one by one
             return self._lists[key]
-        found = (self.root if parent is None else parent).get(key, [])
-        if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-            raise self.invalid(f"{key} is not a list of objects")
+        found = self.entries(key, self.root if parent is None else parent, dict)
         if parent is None:
             self._lists[key] = found
+        return found
+
+    def entries(self, key: str, parent: dict[str, Any], kind: type = object) -> list[Any]:
+        """Return a list of objects (dict), names (str) or anything, empty if there is none."""
+        found = parent.get(key, [])
+        if not isinstance(found, list) or not all(isinstance(item, kind) for item in found):
+            raise self.invalid(f"{key} is not a list{_LISTS[kind]}")
         return found
 
     def item(self, key: str, index: object) -> dict[str, Any]:
