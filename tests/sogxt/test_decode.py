@@ -107,10 +107,12 @@ def test_any_mask_level_above_zero_is_active(value):
 
 def test_images_with_a_superfluous_alpha_channel():
     """The paper's decoder fails on them; the colour is as plain as ever."""
+    images = {}
     for name in ("means_bytes_0", "means_bytes_1", "scales", "f_dc", "f_rest_labels", "f_rest_centroids"):
         image = image_of(name)
-        files = foreign(**{name: np.concatenate([image, np.full((*image.shape[:2], 1), 200)], axis=2)})
-        assert all((getattr(decompress(files), key) == getattr(decompress(FILES), key)).all() for key in ATTRIBUTES)
+        images[name] = np.concatenate([image, np.full((*image.shape[:2], 1), 200)], axis=2)
+    found, wanted = decompress(foreign(**images)), decompress(FILES)
+    assert all((getattr(found, key) == getattr(wanted, key)).all() for key in ATTRIBUTES)
 
 
 def test_labels_between_the_codebook_side_and_its_end_reach_into_the_next_row():
