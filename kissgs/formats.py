@@ -24,7 +24,7 @@ class Format:
     """Format of scenes."""
 
     module: str
-    """Module that has the :class:`~kissgs.io.scene_format.Codec` as ``FORMAT``."""
+    """Module that has the :class:`~kissgs.io.scene_format.Codec` as ``FORMAT``, of streamed scenes in ``STREAMED``."""
     endings: tuple[str, ...] = ()
     """Endings of files that are read, the usual one first; they decide where the content is not recognised."""
     written: tuple[str, ...] = ()
@@ -39,17 +39,18 @@ class Format:
     @property
     def codec(self) -> Codec:
         """Code of the format."""
-        return cast("Codec", importlib.import_module(self.module).FORMAT)
+        module = importlib.import_module(self.module)
+        return cast("Codec", module.STREAMED.codec if self.manifest else module.FORMAT)
 
 
 LOD_NAME, LEVELS_NAME = "lod-meta.json", "levels.json"
 
 FORMATS = {
     "ply": Format(module="kissgs.io.ply", endings=(".ply",), written=(".ply", ".compressed.ply")),
-    "sogxt": Format(module="kissgs.sogxt.info", written=(".zip",), is_container=True),
-    "sog": Format(module="kissgs.sog.info", endings=(".sog",), written=(".sog",), is_container=True),
-    "streamed-sog": Format(module="kissgs.sog.streamed", manifest=LOD_NAME, is_container=True),
-    "streamed-sogxt": Format(module="kissgs.sogxt.streamed", manifest=LEVELS_NAME, is_container=True),
+    "sogxt": Format(module="kissgs.sogxt.scenes", written=(".zip",), is_container=True),
+    "sog": Format(module="kissgs.sog.scenes", endings=(".sog",), written=(".sog",), is_container=True),
+    "streamed-sog": Format(module="kissgs.sog.scenes", manifest=LOD_NAME, is_container=True),
+    "streamed-sogxt": Format(module="kissgs.sogxt.scenes", manifest=LEVELS_NAME, is_container=True),
     "spz": Format(module="kissgs.io.spz", endings=(".spz",), written=(".spz",)),
     "splat": Format(module="kissgs.io.splat", endings=(".splat",), written=(".splat",), by_ending=True),
     "ksplat": Format(module="kissgs.io.ksplat", endings=(".ksplat",), by_ending=True),

@@ -36,6 +36,8 @@ SH_LIMIT = 1e6
 """Bounds of absolute values that cleaning leaves unchanged; beyond, renderers' float32 squares overflow."""
 
 
+ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
 BLOCK = 1 << 16
 """Gaussians that are checked at a time."""
 
@@ -81,15 +83,8 @@ class Splats:
             raise InvalidSceneError(
                 f"shN has shape {self.shN.shape}; it must be (N, K, 3) with K one of {SH_REST_COUNTS}"
             )
-        expected = {
-            "means": (n, 3),
-            "quats": (n, 4),
-            "scales": (n, 3),
-            "opacities": (n,),
-            "sh0": (n, 3),
-            "shN": (n, k, 3),
-        }
-        for name, shape in expected.items():
+        shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 3), (n, k, 3))
+        for name, shape in zip(ATTRIBUTES, shapes, strict=True):
             array = getattr(self, name)
             if array.shape != shape or array.dtype != np.float32:
                 raise InvalidSceneError(
@@ -133,18 +128,19 @@ def sampled_rows(blocks: Iterable[Float[np.ndarray, "n C"]], count: int) -> Floa
 
 
 def empty_splats(count: int, coefficients: int) -> Splats:
-    """Return a scene of uninitialised arrays; ``coefficients`` is K, the number of SH coefficients in ``shN``."""
+    """Return a scene whose arrays are to be filled, with K ``coefficients`` in ``shN``.
+
+    These are zero, so that a part of lower SH degree fills only its own.
+    """
     return Splats(
         means=np.empty((count, 3), np.float32),
         quats=np.empty((count, 4), np.float32),
         scales=np.empty((count, 3), np.float32),
         opacities=np.empty(count, np.float32),
         sh0=np.empty((count, 3), np.float32),
-        shN=np.empty((count, coefficients, 3), np.float32),
+        shN=np.zeros((count, coefficients, 3), np.float32),
     )
 
-
-ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 CLEANED_TEXTS = {
     "non_finite": "removed: a value is NaN or infinite",
@@ -161,24 +157,16 @@ CLEANED_TEXTS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cleaned:
-    """Number of Gaussians that :func:`clean` changed, by reason; the first two were removed, the others repaired."""
+    """Number of Gaussians that :func:`clean` changed, by reason (:data:`CLEANED_TEXTS`)."""
 
-    non_finite: int = 0
-    """Removed: NaN anywhere, or an infinite position, rotation or colour."""
+    non_finite: int = 0  # NaN anywhere, or an infinite position, rotation or colour
     far_away: int = 0
-    """Removed: a position beyond ±1e15."""
     infinite_opacities: int = 0
-    """Opacity logit ±inf, set to that of opacity 1e-6 or 1 - 1e-6."""
-    saturated_opacities: int = 0
-    """Finite opacity logit beyond those of opacity 1e-6 and 1 - 1e-6, clamped; no 8-bit image changes."""
+    saturated_opacities: int = 0  # no 8-bit image changes
     zero_quats: int = 0
-    """Quaternion of zero length, replaced by the identity."""
-    unnormalised_quats: int = 0
-    """Quaternion whose length differed from 1 by more than 1e-3, normalised."""
-    clamped_scales: int = 0
-    """Log-scale beyond ±30 (also ±inf, the logarithm of 0), clamped."""
+    unnormalised_quats: int = 0  # by more than 1e-3
+    clamped_scales: int = 0  # also ±inf, the logarithm of 0
     clamped_sh: int = 0
-    """SH coefficient beyond ±1e6, clamped."""
 
     @property
     def removed(self) -> int:

@@ -14,8 +14,6 @@ from typing import Literal, NamedTuple, Protocol, runtime_checkable
 from kissgs.core.errors import InvalidContainerError
 from kissgs.io.files import reason_of
 
-# The files of a container: in a folder, a zip or memory. Names and sizes are checked before reading.
-
 MAX_ZIP_ENTRIES = 1000
 """Largest number of entries: a container has 12 files, to which users may add notes and previews."""
 
@@ -74,7 +72,9 @@ class MemorySource:
 
     def read(self, name: str, limit: int) -> bytes:
         """See :class:`Source`."""
-        _check(name, name in self._files, len(self._files.get(name, b"")), limit)
+        if name not in self._files:
+            raise _missing(name)
+        _refuse_larger(name, self.size(name), limit)
         return self._files[name]
 
 
@@ -99,8 +99,9 @@ class DirectorySource:
     def read(self, name: str, limit: int) -> bytes:
         """See :class:`Source`."""
         try:
-            present = is_below(name) and (self._folder / name).is_file()
-            _check(name, present, self.size(name) if present else 0, limit)
+            if not is_below(name) or not (self._folder / name).is_file():
+                raise _missing(name)
+            _refuse_larger(name, self.size(name), limit)
             return (self._folder / name).read_bytes()
         except (OSError, ValueError) as error:
             raise InvalidContainerError(f"cannot read {self._folder / name}: {reason_of(error)}") from error
@@ -145,9 +146,10 @@ class ZipSource:
 
     def read(self, name: str, limit: int) -> bytes:
         """See :class:`Source`."""
-        key = self._key(name)
-        _check(name, key in self._entries, self._entries[key].size if key in self._entries else 0, limit)
-        entry = self._entries[key]
+        entry = self._entries.get(self._key(name))
+        if entry is None:
+            raise _missing(name)
+        _refuse_larger(name, entry.size, limit)
         if entry.method not in (_STORED, _DEFLATED):
             raise InvalidContainerError(f"{name} has zip compression method {entry.method}; store or deflate it")
         try:
@@ -300,11 +302,13 @@ def open_source(source: Path | bytes | Mapping[str, bytes], root: str | None = N
             yield ZipSource(file, str(source), root)
 
 
-def _check(name: str, present: bool, size: int, limit: int) -> None:
-    if not present:
-        raise InvalidContainerError(f"the container has no file {name!r}; export or download it again")
+def _refuse_larger(name: str, size: int, limit: int) -> None:
     if size > limit:
         raise InvalidContainerError(f"{name} has {size} bytes; the limit for this file is {limit}")
+
+
+def _missing(name: str) -> InvalidContainerError:
+    return InvalidContainerError(f"the container has no file {name!r}; export or download it again")
 
 
 def stored_size(files: Source, name: str) -> int:
@@ -312,7 +316,7 @@ def stored_size(files: Source, name: str) -> int:
     try:
         return files.size(name)
     except (KeyError, OSError, ValueError) as error:
-        raise InvalidContainerError(f"the container has no file {name!r}; export or download it again") from error
+        raise _missing(name) from error
 
 
 def stated_text(value: object) -> str | None:

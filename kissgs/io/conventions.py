@@ -10,7 +10,7 @@ from kissgs.core.splats import OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_C0, Spla
 
 # Values and 8-bit codes of other formats -> the stored (pre-activation) parameters of a scene.
 
-_ROWS = 1 << 14
+ROWS = 1 << 14
 """Gaussians per step, so that temporaries stay in the processor's cache."""
 
 _SLOTS = np.array([[0, 1, 2, 3], [1, 0, 2, 3], [1, 2, 0, 3], [1, 2, 3, 0]])
@@ -43,8 +43,8 @@ def look_up(
     table: Float32[np.ndarray, " levels"], codes: Shaped[np.ndarray, "..."], out: Float32[np.ndarray, "..."]
 ) -> None:
     """Write the value of every code to ``out``; codes must be below the table's length."""
-    for start in range(0, len(codes), _ROWS):
-        np.take(table, codes[start : start + _ROWS], out=out[start : start + _ROWS], mode="clip")
+    for part in steps(len(codes)):
+        np.take(table, codes[part], out=out[part], mode="clip")
 
 
 def insert_largest(small: Float64[np.ndarray, "B 3"], index: Int[np.ndarray, " B"]) -> Float64[np.ndarray, "B 4"]:
@@ -64,7 +64,7 @@ def byte_quats(codes: UInt8[np.ndarray, "B 4"]) -> Float64[np.ndarray, "B 4"]:
 
 def steps(count: int) -> list[slice]:
     """Return slices of some thousand rows that cover ``count`` rows."""
-    return [slice(start, min(start + _ROWS, count)) for start in range(0, count, _ROWS)]
+    return [slice(start, min(start + ROWS, count)) for start in range(0, count, ROWS)]
 
 
 # Stored (pre-activation) parameters of a scene -> values and codes of other formats.
@@ -154,8 +154,7 @@ def sh_signs(signs: Signs, coefficients: int) -> Float32[np.ndarray, " K"]:
 @np.errstate(all="ignore")
 def move(splats: Splats, rotation: Float64[np.ndarray, "3 3"], scale: float, shift: Float64[np.ndarray, " 3"]) -> None:
     """Scale a scene about the origin, rotate and then shift it, in place."""
-    for start in range(0, len(splats), 1 << 16):
-        part = slice(start, start + (1 << 16))
+    for part in steps(len(splats)):
         splats.means[part] = scale * splats.means[part].astype(np.float64) @ rotation.T + shift
         splats.quats[part] = _product(_quaternion(rotation), splats.quats[part].astype(np.float64))
     np.add(splats.scales, np.float32(np.log(scale)), out=splats.scales)
@@ -169,8 +168,7 @@ def _rotate_sh(splats: Splats, rotation: Float64[np.ndarray, "3 3"]) -> None:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     before, after = (sh_basis(d, splats.sh_degree)[:, 1:] for d in (directions @ rotation, directions))
     turn = np.linalg.lstsq(after, before, rcond=None)[0]
-    for start in range(0, len(splats), 1 << 14):
-        part = slice(start, start + (1 << 14))
+    for part in steps(len(splats)):
         splats.shN[part] = np.einsum("kj,njc->nkc", turn, splats.shN[part].astype(np.float64))
 
 

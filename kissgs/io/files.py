@@ -15,9 +15,10 @@ from typing import Any, BinaryIO, NoReturn, Protocol, runtime_checkable
 
 import numpy as np
 
-from kissgs.core.array_types import UInt8
+from kissgs.core.array_types import Shaped
 from kissgs.core.errors import InvalidContainerError, InvalidSceneError, KissgsError, OutputError, UnsupportedError
 from kissgs.core.splats import Splats
+from kissgs.io.conventions import steps
 
 # JSON of files from elsewhere.
 
@@ -57,6 +58,11 @@ def whole_number(value: object, least: int, most: int) -> int | None:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     return value if isinstance(value, int) and not isinstance(value, bool) and least <= value <= most else None
+
+
+def is_number(value: object, limit: float) -> bool:
+    """Whether a value of JSON is a number, not true or false, that is nearer to zero than ``limit``."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < limit
 
 
 def _check_depth(document: object) -> None:
@@ -187,12 +193,16 @@ class SceneFile:
             raise self.cut_short(offset + count)
         return data
 
-    def read_into(self, offset: int, array: np.ndarray) -> None:
-        """Fill ``array``, which is contiguous, with the bytes at ``offset``."""
-        target: UInt8[np.ndarray, " bytes"] = array.view(np.uint8).reshape(-1)
+    def rows(self, offset: int, dtype: np.dtype, count: int) -> Iterator[tuple[slice, Shaped[np.ndarray, " B"]]]:
+        """Yield ``count`` records at ``offset``, some thousand at a time, and which they are; they are overwritten."""
+        parts = steps(count)
+        block = np.empty(parts[0].stop if parts else 0, dtype)
         self.file.seek(offset)
-        if self.file.readinto(target.data) < target.size:
-            raise self.cut_short(offset + target.size)
+        for part in parts:
+            rows = block[: part.stop - part.start]
+            if self.file.readinto(rows.view(np.uint8).data) < rows.nbytes:
+                raise self.cut_short(offset + part.stop * dtype.itemsize)
+            yield part, rows
 
     def cut_short(self, needed: int) -> InvalidSceneError:
         """Return the error of a file that should have ``needed`` bytes or more."""

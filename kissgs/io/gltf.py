@@ -31,7 +31,7 @@ from kissgs.io.gltf_document import (
     write_glb,
     write_spz_glb,
 )
-from kissgs.io.scene_format import Codec, Facts, Match, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
 from kissgs.io.spz import largest_spz, read_spz, read_spz_info
 
 INSTANCING, VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
@@ -94,8 +94,10 @@ def describe(source: Path | bytes, level: int = 0) -> Facts:
     )
 
 
-def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
-    """Read a scene without cleaning it. Primitives of a lower SH degree get zeros for the coefficients above it.
+def read_gltf(
+    source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
+) -> Splats:
+    """Read a scene; primitives of a lower SH degree get zeros for the coefficients above it.
 
     What the scene has beyond Gaussians is named in ``notes``; so are hidden nodes, which are left out too. Buffers in
     other files must be below the folder of the scene.
@@ -105,7 +107,7 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
         left_out: dict[str, None] = {}
         found, notes = list(_primitives(document, left_out)), dict[str, None]()
         count = sum(primitive.count for primitive in found)
-        refuse_more_than(max_gaussians, count, document.name)
+        refuse_more_than(reading.max_compressed, count, document.name)
         progress("read", 0.0)
         splats = empty_splats(count, SH_REST_COUNTS[max(primitive.degree for primitive in found)])
         start, placed = 0, np.empty((count, 3))
@@ -177,25 +179,27 @@ def _check_required(document: Document) -> None:
     if not version.startswith("2.") or least != "2.0":
         wanted = least if version.startswith("2.") else version
         raise UnsupportedError(f"{document.name} is glTF of version {wanted[:20]!r}; export it as glTF 2.0")
-    for name in _names(document, "extensionsRequired"):
-        if name in _COMPRESSIONS:
-            raise UnsupportedError(f"{document.name} is compressed by {name!r}; export it without or with .spz")
+    _refuse_compressions(
+        document, [name for name in document.entries("extensionsRequired", document.root, str) if name in _COMPRESSIONS]
+    )
     for name in _extensions(document, "extensionsRequired"):
         raise UnsupportedError(
             f"{document.name} requires the extension {name[:60]!r}, which is not read; export it without"
         )
 
 
+def _refuse_compressions(document: Document, names: list[str]) -> None:
+    for name in names:
+        raise UnsupportedError(f"{document.name} is compressed by {name[:60]!r}; export it without or with .spz")
+
+
 def _extensions(document: Document, key: str) -> list[str]:
     """Return the extensions in a list of the file that may matter to Gaussians and are not read."""
-    return [name for name in _names(document, key) if name not in _READ and not _OF_SURFACES.fullmatch(name)]
-
-
-def _names(document: Document, key: str) -> list[str]:
-    found = document.root.get(key, [])
-    if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
-        raise document.invalid(f"{key} is not a list of names")
-    return found
+    return [
+        name
+        for name in document.entries(key, document.root, str)
+        if name not in _READ and not _OF_SURFACES.fullmatch(name)
+    ]
 
 
 def _instances(
@@ -207,7 +211,7 @@ def _instances(
         yield from ((mesh, np.eye(4)) for mesh in document.items("meshes"))
         return
     scene = document.item("scenes", document.root.get("scene", 0))
-    waiting = [(index, np.eye(4)) for index in _indices(document, scene, "nodes")]
+    waiting = [(index, np.eye(4)) for index in document.entries("nodes", scene)]
     for visited in range(_MAX_INSTANCES):
         if not waiting:
             return
@@ -225,7 +229,7 @@ def _instances(
         if "mesh" in node:
             mesh = document.item("meshes", node["mesh"])
             yield from ((mesh, place) for place in placed)
-        waiting += [(child, matrix) for child in _indices(document, node, "children")]
+        waiting += [(child, matrix) for child in document.entries("children", node)]
         if len(waiting) > _MAX_INSTANCES - visited:
             break
     raise document.invalid(f"its nodes form a circle or are more than {_MAX_INSTANCES:,}")
@@ -255,13 +259,6 @@ def _placements(document: Document, instancing: dict[str, Any]) -> Iterator[Floa
         yield node_matrix(document, {name: values[row].tolist() for name, values in columns.items()})
 
 
-def _indices(document: Document, parent: dict[str, Any], key: str) -> list[Any]:
-    found = parent.get(key, [])
-    if not isinstance(found, list):
-        raise document.invalid(f"{key} is not a list")
-    return found
-
-
 def _primitive(
     document: Document, primitive: dict[str, Any], splatting: dict[str, Any], matrix: Float64[np.ndarray, "4 4"]
 ) -> _Primitive:
@@ -277,6 +274,7 @@ def _primitive(
     if len(attributes) > _MAX_ATTRIBUTES:
         raise document.invalid(f"a primitive has {len(attributes):,} attributes")
     compressions = document.child(splatting, "extensions")
+    unread = [str(name) for name in document.child(primitive, "extensions") if name in _COMPRESSIONS]
     for name in compressions:
         if name in SPZ_EXTENSIONS:
             view = document.whole(document.child(compressions, name), "bufferView", -1)
@@ -284,10 +282,8 @@ def _primitive(
             if "POSITION" in attributes and document.count(attributes["POSITION"]) != header.count:
                 raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
             return _Primitive(attributes, matrix, header.count, header.sh_degree, view, header.antialiased)
-        raise UnsupportedError(f"{document.name} is compressed by {str(name)[:60]!r}; export it without or with .spz")
-    for name in document.child(primitive, "extensions"):
-        if name in _COMPRESSIONS:
-            raise UnsupportedError(f"{document.name} is compressed by {name!r}; export it without or with .spz")
+        unread.insert(0, str(name))
+    _refuse_compressions(document, unread)
     if "POSITION" not in attributes:
         raise document.invalid("a primitive has no POSITION")
     return _Primitive(attributes, matrix, document.count(attributes["POSITION"]), _degree(document, attributes), None)
@@ -336,19 +332,16 @@ def _read_attributes(document: Document, primitive: _Primitive, out: Splats) -> 
         bands = [f"SH_DEGREE_{band}_COEF_{i}" for band in range(1, primitive.degree + 1) for i in range(2 * band + 1)]
         for i, name in enumerate(bands):
             out.shN[:, i] = column(name, 3)
-        out.shN[:, len(bands) :] = 0
 
 
 def _read_spz(document: Document, view: int, out: Splats) -> tuple[str, ...]:
     """Read a ``.spz`` inside the file into ``out``, in glTF's axes (x left, y up, z forward); return its notes."""
-    stored = read_spz(bytes(document.view(view, most=largest_spz(len(out)))), max_gaussians=len(out))
+    stored = read_spz(bytes(document.view(view, most=largest_spz(len(out)))), ReadOptions(max_gaussians=len(out)))
     mirror(stored, TO_PLY)
     for name in ATTRIBUTES:
         if name != "shN":
             getattr(out, name)[:] = getattr(stored, name)
-    coefficients = stored.shN.shape[1]
-    out.shN[:, :coefficients] = stored.shN
-    out.shN[:, coefficients:] = 0
+    out.shN[:, : stored.shN.shape[1]] = stored.shN
     return stored.notes
 
 
@@ -383,12 +376,7 @@ def _turn_to_ply(splats: Splats) -> None:
 FORMAT = Codec(
     sniff=_sniff,
     info=describe,
-    read=lambda source, reading, threads, progress: read_gltf(
-        source, max_gaussians=reading.max_compressed, progress=progress
-    ),
-    write={
-        ".glb": lambda file, splats, raw_axes, progress: write_glb(file, splats, progress=progress),
-        ".spz.glb": lambda file, splats, raw_axes, progress: write_spz_glb(file, splats, progress=progress),
-    },
+    read=read_gltf,
+    write={".glb": write_glb, ".spz.glb": write_spz_glb},
     records_origin=True,
 )

@@ -11,20 +11,19 @@ import unicodedata
 import urllib.parse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Shaped
+from kissgs.core.array_types import Float32, Float64, Shaped, UInt8
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.positions import WORLD, Origin
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.io.containers import is_below
 from kissgs.io.conventions import Signs, colors_of, note_mark, opacities_of, sh_signs, steps, to_bytes
-from kissgs.io.files import BinaryWriter, SceneFile, open_scene_file, parse_json, whole_number
+from kissgs.io.files import BinaryWriter, SceneFile, is_number, open_scene_file, parse_json, whole_number
 from kissgs.io.spz import decode_positions, encode_positions, fractional_bits_for, write_spz
 
 # glTF files as documents: GLB and JSON, their buffers, and accessors as arrays, checked before memory is taken.
@@ -50,6 +49,7 @@ _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126
 _MAX_STRIDE = 252
 """Largest distance of rows, given by the format."""
 
+_LISTS = {dict: " of objects", str: " of names", object: ""}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
@@ -77,11 +77,16 @@ class Document:
         """Return a list of objects, empty if the document has none."""
         if parent is None and key in self._lists:  # checked before; nodes and accessors are asked for one by one
             return self._lists[key]
-        found = (self.root if parent is None else parent).get(key, [])
-        if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-            raise self.invalid(f"{key} is not a list of objects")
+        found = self.entries(key, self.root if parent is None else parent, dict)
         if parent is None:
             self._lists[key] = found
+        return found
+
+    def entries(self, key: str, parent: dict[str, Any], kind: type = object) -> list[Any]:
+        """Return a list of objects (dict), names (str) or anything, empty if there is none."""
+        found = parent.get(key, [])
+        if not isinstance(found, list) or not all(isinstance(item, kind) for item in found):
+            raise self.invalid(f"{key} is not a list{_LISTS[kind]}")
         return found
 
     def item(self, key: str, index: object) -> dict[str, Any]:
@@ -237,10 +242,7 @@ def _vector(
     document: Document, node: dict[str, Any], key: str, count: int, default: tuple[int, ...] | None
 ) -> Float64[np.ndarray, " count"]:
     values = node.get(key, default)
-    valid = isinstance(values, list | tuple) and len(values) == count
-    if not valid or not all(
-        isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e30 for v in values or ()
-    ):
+    if not isinstance(values, list | tuple) or len(values) != count or not all(is_number(v, 1e30) for v in values):
         raise document.invalid(f"a node's {key} is not {count} numbers")
     return np.array(values, dtype=np.float64)
 
@@ -273,9 +275,11 @@ class _Attribute:
         return self.width if self.is_byte else 4 * self.width
 
 
-def write_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
-    """Write a clean scene in glTF's axes (x left, y up, z forward); return what the format cannot hold."""
-    count = _count(splats, ".glb")
+def write_glb(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a scene in glTF's axes (x left, y up, z forward)."""
+    count = _count(splats)
     attributes = list(_attributes(splats))
     body = count * sum(attribute.row_bytes for attribute in attributes)
     ends = np.stack([splats.means.min(axis=0), splats.means.max(axis=0)]) * np.array(TO_PLY, np.float32)
@@ -298,13 +302,15 @@ def write_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent
     return tuple(notes)
 
 
-def write_spz_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
-    """Write a clean scene as ``.spz`` inside ``.glb``; return what the format cannot hold, one phrase each.
+def write_spz_glb(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a scene as ``.spz`` inside ``.glb``.
 
     The ``.spz`` has its own axes (x right, y up, z back), as the extension wants it, whose text has the library of
     ``.spz`` turn them from and to those of glTF. Accessors have types and counts, and no data.
     """
-    count = _count(splats, ".glb")
+    count = _count(splats)
     packed = io.BytesIO()  # its size stands before it
     notes = write_spz(packed, splats, progress=progress)
     body = packed.getbuffer()
@@ -321,14 +327,10 @@ def write_spz_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = si
     return notes
 
 
-def _in_gltf(origin: Origin) -> list[float]:
-    return [sign * value + 0.0 for sign, value in zip(TO_PLY, origin, strict=True)]
-
-
-def _count(splats: Splats, ending: str) -> int:
-    """Return the number of Gaussians."""
+def _count(splats: Splats) -> int:
+    """Return the number of Gaussians, which must not be zero."""
     if not len(splats):
-        raise UnsupportedError(f"a scene without Gaussians cannot be written as {ending}; write it as .ply")
+        raise UnsupportedError("a scene without Gaussians cannot be written as .glb; write it as .ply")
     return len(splats)
 
 
@@ -346,7 +348,7 @@ def _attributes(splats: Splats) -> Iterator[_Attribute]:
     """Yield all attributes in glTF's axes, half a turn about z from those of a ``.ply``."""
     axes = np.array(TO_PLY, np.float32)
     yield _Attribute("POSITION", 3, lambda part: splats.means[part] * axes)
-    yield _Attribute("COLOR_0", 4, lambda part: _linear_colors(splats, part), is_byte=True)
+    yield _Attribute("COLOR_0", 4, lambda part: _linear_colors(splats.select(part)), is_byte=True)
     # Half a turn of the Gaussian about its own axis precedes: the reader has the reason.
     turned = np.array([-1, 1, 1, -1], np.float32)
     yield _Attribute(f"{EXTENSION}:ROTATION", 4, lambda part: splats.quats[part][:, [2, 1, 0, 3]] * turned)
@@ -354,23 +356,20 @@ def _attributes(splats: Splats) -> Iterator[_Attribute]:
     yield _Attribute(f"{EXTENSION}:OPACITY", 1, lambda part: opacities_of(splats.opacities[part])[:, None])
     yield _Attribute(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3, lambda part: splats.sh0[part])
     bands = [(band, i) for band in range(1, splats.sh_degree + 1) for i in range(2 * band + 1)]
+    signs = sh_signs(TO_PLY, len(bands))
+
+    def coefficient(k: int) -> Callable[[slice], Shaped[np.ndarray, "B 3"]]:
+        return lambda part: splats.shN[part, k] * signs[k]
+
     for k, (band, i) in enumerate(bands):
-        name = f"{EXTENSION}:SH_DEGREE_{band}_COEF_{i}"
-        yield _Attribute(name, 3, partial(_sh_values, splats, k))
+        yield _Attribute(f"{EXTENSION}:SH_DEGREE_{band}_COEF_{i}", 3, coefficient(k))
 
 
-def _sh_values(splats: Splats, k: int, part: slice) -> Float32[np.ndarray, "B 3"]:
-    """Return one coefficient beyond the constant one."""
-    values: Float32[np.ndarray, "B 3"] = splats.shN[part, k] * sh_signs(TO_PLY, k + 1)[k]
-    return values
-
-
-def _linear_colors(splats: Splats, part: slice) -> Float64[np.ndarray, "B 4"]:
-    """Return linear colours and opacities as bytes; glTF's vertex colours are linear."""
-    srgb = np.clip(colors_of(splats.sh0[part]), 0, 1)
+def _linear_colors(splats: Splats) -> UInt8[np.ndarray, "B 4"]:
+    """Return linear colours, as glTF's vertex colours are, and opacities."""
+    srgb = np.clip(colors_of(splats.sh0), 0, 1)
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    rgba = np.concatenate([linear, opacities_of(splats.opacities[part])[:, None]], axis=1)
-    return to_bytes(255 * rgba).astype(np.float64)
+    return to_bytes(255 * np.concatenate([linear, opacities_of(splats.opacities)[:, None]], axis=1))
 
 
 def _accessors(count: int, attributes: list[_Attribute], ends: Float32[np.ndarray, "2 3"]) -> list[dict[str, Any]]:
@@ -401,6 +400,7 @@ def _json(
         "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }
+    translation = [sign * value + 0.0 for sign, value in zip(TO_PLY, origin, strict=True)]
     required: dict[str, Any] = {}
     if compression:
         splatting["extensions"] = compression
@@ -416,7 +416,7 @@ def _json(
         **required,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, **({} if origin == WORLD else {"translation": _in_gltf(origin)})}],
+        "nodes": [{"mesh": 0, **({} if origin == WORLD else {"translation": translation})}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,

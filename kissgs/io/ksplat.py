@@ -18,7 +18,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.conventions import OPACITY_OF_BYTE, SH0_OF_BYTE, log_scales
 from kissgs.io.files import SceneFile, open_scene_file, refuse_more_than
-from kissgs.io.scene_format import Codec, Facts, Match, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
 
 MAIN_BYTES, SECTION_BYTES = 4096, 1024
 
@@ -36,7 +36,6 @@ _SH = ("<f4", "<f2", "u1")
 
 _DEFAULT_RANGE = (1, 32767, 32767)
 _DEFAULT_SH_RANGE = (-1.5, 1.5)
-_BLOCK = 1 << 14
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +90,14 @@ def describe(path: Path | bytes, level: int = 0) -> Facts:
     )
 
 
-def read_ksplat(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
-    """Read a scene without cleaning it. Sections of a lower SH degree get zeros for the coefficients above it."""
+def read_ksplat(
+    source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
+) -> Splats:
+    """Read a scene; sections of a lower SH degree get zeros for the coefficients above it."""
     with open_scene_file(source) as opened:
         headers = _read_headers(opened)
         count = headers.count
-        refuse_more_than(max_gaussians, count, opened.name)
+        refuse_more_than(reading.max_gaussians, count, opened.name)
         progress("read", 0.0)
         splats = empty_splats(count, SH_REST_COUNTS[headers.degree])
         start = 0
@@ -171,15 +172,12 @@ def _read_section(opened: SceneFile, headers: _Headers, section: _Section, out: 
     """Decode the records of a section, some thousand at a time, into ``out``."""
     ends, centres = _read_buckets(opened, section) if headers.level and section.count else (None, None)
     order = _rest_order(section.degree)
-    block = np.empty(min(_BLOCK, section.count), section.dtype)
-    for start in range(0, section.count, _BLOCK):
-        rows = block[: section.count - start]
-        opened.read_into(section.offset + start * section.dtype.itemsize, rows)
-        part = out.select(slice(start, start + len(rows)))
+    for step, rows in opened.rows(section.offset, section.dtype, section.count):
+        part = out.select(step)
         if ends is None or centres is None:
             part.means[:] = rows["means"]
         else:
-            bucket = np.searchsorted(ends, np.arange(start, start + len(rows)), side="right")
+            bucket = np.searchsorted(ends, np.arange(step.start, step.stop), side="right")
             part.means[:] = (rows["means"].astype(np.float64) - section.middle) * section.step + centres[bucket]
         part.quats[:] = rows["quats"]
         part.scales[:] = log_scales(rows["scales"])
@@ -217,7 +215,6 @@ def _decode_rest(
     rows: Shaped[np.ndarray, " B"], order: Int[np.ndarray, " D"], headers: _Headers, out: Float32[np.ndarray, "B K 3"]
 ) -> None:
     width = len(order) // 3
-    out[:, width:] = 0
     if not width:
         return
     values = rows["rest"][:, order].astype(np.float32)
@@ -228,10 +225,4 @@ def _decode_rest(
     out[:, :width] = values.reshape(len(rows), width, 3)
 
 
-FORMAT = Codec(
-    sniff=_sniff,
-    info=describe,
-    read=lambda source, reading, threads, progress: read_ksplat(
-        source, max_gaussians=reading.max_gaussians, progress=progress
-    ),
-)
+FORMAT = Codec(sniff=_sniff, info=describe, read=read_ksplat)

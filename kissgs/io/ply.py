@@ -37,7 +37,7 @@ from kissgs.io.ply_rows import (
     rows,
     sh_degree,
 )
-from kissgs.io.scene_format import Codec, Facts, Match, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
 
 # PlayCanvas' compressed ``.ply``: Gaussians quantised to 16 bytes within chunks of 256, SH coefficients to one byte.
 #
@@ -184,8 +184,10 @@ def _require(ply: PlyFile, element: Element, names: tuple[str, ...], code: str) 
             )
 
 
-def write_compressed(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
-    """Write a clean scene in Morton order, so that the 256 Gaussians of a chunk are close to one another."""
+def write_compressed(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a scene in Morton order, so that the 256 Gaussians of a chunk are close to one another."""
     n, k = len(splats), splats.shN.shape[1]
     order = morton_order(splats.means)
     chunks = np.empty((-(-n // _CHUNK), 18), "<f4")
@@ -282,8 +284,6 @@ _IN_TIME = re.compile(
 )
 """Properties that move or change Gaussians in time, of SpacetimeGaussians, 4DGS, 4D-Rotor and FreeTimeGS."""
 
-_WRITE_ROWS = 4096
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlyInfo:
@@ -316,7 +316,9 @@ def read_ply_info(source: Path | bytes, *, size: int | None = None) -> PlyInfo:
         return _check(ply)
 
 
-def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
+def read_ply(
+    source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
+) -> Splats:
     """Read a scene without cleaning it: NaN, infinities and quaternions of any length are kept.
 
     Reads binary and ascii files, with properties in any order and of any type, and PlayCanvas' compressed ``.ply``.
@@ -327,24 +329,23 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
     """
     with open_ply(source) as ply:
         info = _check(ply)
-        refuse_more_than(max_gaussians, info.count, ply.name)
+        refuse_more_than(reading.max_gaussians, info.count, ply.name)
         progress("read", 0.0)
         read = read_compressed if info.compressed else _read_columns
         splats = read(ply, info.sh_degree, progress)
         return replace(splats, antialiased=info.antialiased, notes=(*_notes(ply.header), *splats.notes))
 
 
-def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Splats]:
+def read_ply_blocks(source: Path) -> Iterator[Splats]:
     """Yield a scene as :func:`read_ply` reads it, some 65,536 Gaussians at a time.
 
-    PlayCanvas' compressed ``.ply`` comes as one block. Arguments and errors are those of :func:`read_ply`; errors of
+    PlayCanvas' compressed ``.ply`` comes as one block. Errors are those of :func:`read_ply`; those of
     the body are raised when its block is reached.
     """
     with open_ply(source) as ply:
         info = _check(ply)
-        progress("read", 0.0)
         if info.compressed:
-            yield replace(read_compressed(ply, info.sh_degree, progress), notes=_notes(ply.header))
+            yield replace(read_compressed(ply, info.sh_degree, silent), notes=_notes(ply.header))
             return
         columns, waiting, done = _Columns(ply.header.elements["vertex"], info.encoding, info.sh_degree), [], 0
         origin = columns.origin(rows(ply, columns.vertex)) if columns.wide else WORLD
@@ -355,10 +356,11 @@ def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Sp
                 notes = dict.fromkeys([*_notes(ply.header), *(note for each in waiting for note in each.notes)])
                 yield replace(concatenate(waiting), antialiased=info.antialiased, notes=tuple(notes))
                 waiting = []
-                progress("read", done / info.count)
 
 
-def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
+def write_ply(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
     Positions are those of the world: float64 (``property double``) where float32 cannot hold them. An antialiased scene
@@ -371,13 +373,13 @@ def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent
     header = ["ply", "format binary_little_endian 1.0", *[MIP_COMMENT] * splats.antialiased, f"element vertex {n}"]
     header += [f"property {'double' if name in wide else 'float'} {name}" for name in names]
     file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
-    for start in range(0, n, _WRITE_ROWS):
-        part = splats.select(slice(start, start + _WRITE_ROWS))
+    for step in steps(n):
+        part = splats.select(step)
         rest = part.shN.transpose(0, 2, 1).reshape(len(part), 3 * k)  # all of R, then G, then B
         normals, opacities = np.zeros_like(part.means), part.opacities[:, None]
         table = np.concatenate([part.means, normals, part.sh0, rest, opacities, part.scales, part.quats], axis=1)
         file.write((_with_doubles(part, table) if wide else table.astype("<f4", copy=False)).data)
-        progress("write", min(1.0, (start + _WRITE_ROWS) / n))
+        progress("write", step.stop / n)
     return ()
 
 
@@ -471,7 +473,7 @@ def _read_columns(ply: PlyFile, degree: int, progress: Progress) -> Splats:
     for block in rows(ply, columns.vertex):
         columns.copy(block, splats.select(slice(start, start + len(block))))
         if columns.wide:
-            positions.append(_float64(block, _POSITION))
+            positions.append(_positions(block))
         start += len(block)
         progress("read", start / count)
     return from_world(splats, np.concatenate(positions)) if positions else splats
@@ -492,7 +494,7 @@ class _Columns:
         """Return the origin of a scene whose positions may have more digits than float32."""
         if not self.vertex.count:
             return WORLD
-        each = (np.column_stack([_float64(block, _POSITION), self.splats(block, WORLD).scales]) for block in blocks)
+        each = (np.column_stack([_positions(block), self.splats(block, WORLD).scales]) for block in blocks)
         some = sampled_rows(each, self.vertex.count)
         return origin_for(some[:, :3], some[:, 3:6].astype(np.float32))
 
@@ -500,7 +502,7 @@ class _Columns:
         """Return the Gaussians of some rows, relative to ``origin``."""
         splats = empty_splats(len(block), self._k)
         self.copy(block, splats)
-        return from_world(splats, _float64(block, _POSITION), origin) if self.wide else splats
+        return from_world(splats, _positions(block), origin) if self.wide else splats
 
     def copy(self, block: np.ndarray, out: Splats) -> None:
         """Copy rows to the arrays of ``out``, of the same length."""
@@ -541,8 +543,8 @@ def _apply_filters(filters: Shaped[np.ndarray, " N"], out: Splats) -> None:
 
 
 @np.errstate(invalid="ignore")  # signalling NaN
-def _float64(block: np.ndarray, names: tuple[str, ...]) -> Float64[np.ndarray, "B C"]:
-    return np.stack([block[name].astype(np.float64) for name in names], axis=1)
+def _positions(block: np.ndarray) -> Float64[np.ndarray, "B 3"]:
+    return np.stack([block[axis].astype(np.float64) for axis in _POSITION], axis=1)
 
 
 def _colour_to_sh(colour: Float32[np.ndarray, "N 3"]) -> None:
@@ -566,11 +568,6 @@ def _describe(path: Path | bytes, level: int) -> Facts:
 FORMAT = Codec(
     sniff=_sniff,
     info=_describe,
-    read=lambda source, reading, threads, progress: read_ply(
-        source, max_gaussians=reading.max_gaussians, progress=progress
-    ),
-    write={
-        ".ply": lambda file, splats, raw_axes, progress: write_ply(file, splats, progress=progress),
-        ".compressed.ply": lambda file, splats, raw_axes, progress: write_compressed(file, splats, progress=progress),
-    },
+    read=read_ply,
+    write={".ply": write_ply, ".compressed.ply": write_compressed},
 )

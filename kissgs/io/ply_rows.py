@@ -16,7 +16,7 @@ import numpy as np
 
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.io.files import open_scene_file
+from kissgs.io.files import SceneFile, open_scene_file
 
 # PLY headers: opening a file, parsing its header, and the SH degree that the header declares.
 
@@ -28,26 +28,9 @@ MAX_HEADER_BYTES = 1 << 20
 MAX_PROPERTIES = 4096
 """Largest number of properties per element; a degree-3 scene has 62, one with feature vectors some hundred more."""
 
-_TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "half": "f2",
-    "float": "f4",
-    "double": "f8",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float16": "f2",
-    "float32": "f4",
-    "float64": "f8",
-}
+_CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f2", "f4", "f8")
+_TYPES = dict(zip(("char", "uchar", "short", "ushort", "int", "uint", "half", "float", "double"), _CODES, strict=True))
+_TYPES |= {np.dtype(code).name: code for code in _CODES}
 """NumPy's code of every type name: both families of PLY names, and the half floats that some 3DGS tools write."""
 
 _LOOKALIKES = {
@@ -111,12 +94,9 @@ class Header:
 
 
 @dataclass(frozen=True, slots=True)
-class PlyFile:
-    """Open PLY file: ``name`` for messages, the seekable ``file``, its ``size`` in bytes, and its header."""
+class PlyFile(SceneFile):
+    """Open PLY file and its header."""
 
-    name: str
-    file: io.BufferedIOBase
-    size: int
     header: Header
 
 
@@ -127,7 +107,7 @@ def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFi
     ``size`` is that of the whole file if ``source`` is only its beginning.
     """
     with open_scene_file(source) as opened:
-        header = _read_header(opened.file, opened.name)
+        header = _read_header(opened)
         yield PlyFile(opened.name, opened.file, opened.size if size is None else size, header)
 
 
@@ -146,7 +126,8 @@ def sh_degree(element: Element, name: str) -> int:
     raise InvalidSceneError(f"{name} has {count} f_rest properties; SH degrees 0 to 3 have 0, 9, 24 or 45")
 
 
-def _read_header(file: io.BufferedIOBase, name: str) -> Header:
+def _read_header(opened: SceneFile) -> Header:
+    file, name = opened.file, opened.name
     start = file.read(64)
     mark = len(codecs.BOM_UTF8) if start.startswith(codecs.BOM_UTF8) else 0
     _recognise(start[mark:], name)

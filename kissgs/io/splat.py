@@ -23,39 +23,39 @@ from kissgs.io.conventions import (
     note_clamped,
     note_mark,
     opacities_of,
+    steps,
     to_bytes,
 )
 from kissgs.io.files import BinaryWriter, SceneFile, open_scene_file, refuse_more_than
-from kissgs.io.scene_format import Codec, Facts
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 """One Gaussian."""
 
-_BLOCK = 1 << 14
 
-
-def read_splat(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
-    """Read a scene without cleaning it."""
+def read_splat(
+    source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
+) -> Splats:
+    """Read a scene."""
     with open_scene_file(source) as opened:
         count = _count(opened)
-        refuse_more_than(max_gaussians, count, opened.name)
+        refuse_more_than(reading.max_gaussians, count, opened.name)
         progress("read", 0.0)
         splats = empty_splats(count, 0)
-        block = np.empty(min(_BLOCK, count), ROW)
-        for start in range(0, count, _BLOCK):
-            rows = block[: count - start]
-            opened.read_into(start * ROW.itemsize, rows)
-            _decode(rows, splats.select(slice(start, start + len(rows))))
-            progress("read", (start + len(rows)) / count)
+        for part, rows in opened.rows(0, ROW, count):
+            _decode(rows, splats.select(part))
+            progress("read", part.stop / count)
         return splats
 
 
-def write_splat(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
-    """Write a clean scene, large and opaque Gaussians first, as viewers that draw while they load expect."""
+def write_splat(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a scene, large and opaque Gaussians first, as viewers that draw while they load expect."""
     order = _largest_first(splats)
-    for start in range(0, len(splats), _BLOCK):
-        file.write(_encode(splats.select(order[start : start + _BLOCK])).tobytes())
-        progress("write", min(1.0, (start + _BLOCK) / len(splats)))
+    for part in steps(len(splats)):
+        file.write(_encode(splats.select(order[part])).tobytes())
+        progress("write", part.stop / len(splats))
     notes: list[str] = []
     if splats.sh_degree:
         notes.append(f"view-dependent colour (SH degree {splats.sh_degree}) is left out")
@@ -105,10 +105,4 @@ def _describe(path: Path | bytes, level: int) -> Facts:
         return Facts(title=".splat scene", count=_count(opened), sh_degree=0)
 
 
-FORMAT = Codec(
-    info=_describe,
-    read=lambda source, reading, threads, progress: read_splat(
-        source, max_gaussians=reading.max_gaussians, progress=progress
-    ),
-    write={".splat": lambda file, splats, raw_axes, progress: write_splat(file, splats, progress=progress)},
-)
+FORMAT = Codec(info=_describe, read=read_splat, write={".splat": write_splat})

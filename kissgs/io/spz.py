@@ -32,9 +32,9 @@ from kissgs.io.conventions import (
     to_codes,
 )
 from kissgs.io.files import BinaryWriter, SceneFile, listed, open_scene_file, refuse_more_than
-from kissgs.io.scene_format import Codec, Facts, Match, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
 
-# Decompression of ``.spz``: gzip and zstd, bounded by what the header needs.
+# Decompression: gzip and zstd, bounded by what the header needs.
 
 _GZIP = 16 + zlib.MAX_WBITS
 
@@ -108,7 +108,7 @@ def unpack_frame(frame: bytes, size: int, what: str) -> bytes:
     return data
 
 
-# Values of the ``.spz`` format: from the bytes of each stream to arrays, and back.
+# Values: from the bytes of each stream to arrays, and back.
 
 _BYTE = np.arange(256)
 
@@ -127,12 +127,6 @@ SH_STEPS = (4, 8)
 The format's own library writes 5 and 4 bits by default, which lose two decibels of fox to its photographs; the figures
 are in docs/reference/formats.md.
 """
-
-
-def decode_half_positions(codes: UInt8[np.ndarray, "N 6"], out: Float32[np.ndarray, "N 3"]) -> None:
-    """Decode positions of version 1: half floats."""
-    with np.errstate(all="ignore"):  # values may be any floats; they are not cleaned here
-        out[:] = codes.view("<f2")
 
 
 def decode_positions(codes: UInt8[np.ndarray, "N 9"], fractional_bits: int, out: Float32[np.ndarray, "N 3"]) -> None:
@@ -207,7 +201,7 @@ def encode_smallest_three(quats: Float32[np.ndarray, "B 4"]) -> UInt8[np.ndarray
     return words.astype("<u4").view(np.uint8).reshape(len(quats), 4)
 
 
-# The ``.spz`` format, versions 1 to 4: quantised attributes, one stream each, compressed with gzip or (4) zstd.
+# Reading.
 #
 # Axes are x right, y up, z back, unless a file's extension names others. Some tools store those of a ``.ply`` without
 # saying so; ``raw_axes`` reads their files.
@@ -251,20 +245,13 @@ MAX_EXTENSION_BYTES = 1 << 20
 class SpzInfo:
     """Properties of a scene that the header of its file states."""
 
-    version: int
-    """1 to 4."""
+    version: int  # 1 to 4
     count: int
-    """Number of Gaussians."""
-    sh_degree: int
-    """SH degree of the scene as it is read, 0 to 3."""
-    stored_degree: int
-    """SH degree of the file, up to 4; the highest band is left out when it is read."""
-    fractional_bits: int
-    """Bits of positions after the binary point."""
+    sh_degree: int  # as it is read, 0 to 3
+    stored_degree: int  # up to 4; the highest band is left out when it is read
+    fractional_bits: int  # of positions
     antialiased: bool
-    """Whether the scene was trained with an antialiasing filter."""
-    extensions: bool
-    """Whether the file has extension records."""
+    extensions: bool  # whether the file has extension records
 
     @property
     def widths(self) -> dict[str, int]:
@@ -279,11 +266,6 @@ class SpzInfo:
         }
 
 
-def header_bytes(count: int, sh_degree: int, fractional_bits: int, *, antialiased: bool) -> bytes:
-    """Return the header of a version 3 file without extension records."""
-    return _HEADER.pack(MAGIC, 3, count, sh_degree, fractional_bits, _ANTIALIASED * antialiased, 0)
-
-
 def read_spz_info(source: Path | bytes) -> SpzInfo:
     """Read the header."""
     with open_scene_file(source) as opened:
@@ -291,21 +273,21 @@ def read_spz_info(source: Path | bytes) -> SpzInfo:
 
 
 def read_spz(
-    source: Path | bytes, *, max_gaussians: int | None = None, raw_axes: bool = False, progress: Progress = silent
+    source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
 ) -> Splats:
-    """Read a scene without cleaning it, and turn it to the axes of a ``.ply``.
+    """Read a scene, and turn it to the axes of a ``.ply``.
 
     Of SH degree 4 the highest band is left out, as are unknown extension records, which ``notes`` says.
     """
     with open_scene_file(source) as opened:
         info = _read_header(opened)
-        refuse_more_than(max_gaussians, info.count, opened.name)
+        refuse_more_than(reading.max_compressed, info.count, opened.name)
         progress("read", 0.0)
         streams, extensions = _read_frames(opened, info) if info.version == 4 else _read_gzip(opened, info)
         progress("read", 0.5)
         splats = replace(_decode(streams, info), antialiased=info.antialiased)
         frame, unread = _read_extensions(extensions, opened.name)
-        if not raw_axes:
+        if not reading.raw_axes:
             mirror(splats, axis_signs(frame))
         progress("read", 1.0)
         if info.stored_degree > info.sh_degree:
@@ -400,16 +382,12 @@ def _decode(streams: dict[str, UInt8[np.ndarray, "N width"]], info: SpzInfo) -> 
     """Decode all streams; each is dropped when it is decoded."""
     coefficients = SH_REST_COUNTS[info.sh_degree]
     splats = empty_splats(info.count, coefficients)
-    positions, rotations = streams.pop("positions"), streams.pop("rotations")
     if info.version == 1:
-        decode_half_positions(positions, splats.means)
+        with np.errstate(all="ignore"):  # half floats; values may be any floats and are not cleaned here
+            splats.means[:] = streams.pop("positions").view("<f2")
     else:
-        decode_positions(positions, info.fractional_bits, splats.means)
-    if info.version < 3:
-        decode_three_bytes(rotations, splats.quats)
-    else:
-        decode_smallest_three(rotations, splats.quats)
-    del positions, rotations
+        decode_positions(streams.pop("positions"), info.fractional_bits, splats.means)
+    (decode_three_bytes if info.version < 3 else decode_smallest_three)(streams.pop("rotations"), splats.quats)
     look_up(OPACITY_OF_BYTE, streams.pop("alphas")[:, 0], splats.opacities)
     look_up(COLOR_OF_BYTE, streams.pop("colors"), splats.sh0)
     look_up(SCALE_OF_BYTE, streams.pop("scales"), splats.scales)
@@ -439,15 +417,15 @@ def _read_extensions(extensions: bytes, name: str) -> tuple[str, list[str]]:
     return frame, list(unread)
 
 
-# Writing of ``.spz``: version 3, one gzip member without extension records, which the most readers take.
+# Writing: version 3, one gzip member without extension records, which the most readers take.
 
 _Encode = Callable[[slice], UInt8[np.ndarray, "B width"]]
 
 
 def write_spz(
-    file: BinaryWriter, splats: Splats, *, raw_axes: bool = False, progress: Progress = silent
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
 ) -> tuple[str, ...]:
-    """Write a clean scene; return what the format cannot hold, one phrase each."""
+    """Write a scene."""
     count = len(splats)
     if not count:
         raise UnsupportedError("a scene without Gaussians cannot be written as .spz; write it as .ply")
@@ -455,7 +433,8 @@ def write_spz(
     bits = fractional_bits_for(reach)
     encoders = _encoders(splats, bits, axis_signs(PLY_FRAME if raw_axes else DEFAULT_FRAME))
     packer = zlib.compressobj(wbits=_GZIP)  # writes no time into the file
-    file.write(packer.compress(header_bytes(count, splats.sh_degree, bits, antialiased=splats.antialiased)))
+    header = _HEADER.pack(MAGIC, 3, count, splats.sh_degree, bits, _ANTIALIASED * splats.antialiased, 0)
+    file.write(packer.compress(header))
     for done, encode in enumerate(encoders, 1):
         for part in steps(count):
             file.write(packer.compress(encode(part).tobytes()))
@@ -515,13 +494,4 @@ def _describe(path: Path | bytes, level: int) -> Facts:
     )
 
 
-FORMAT = Codec(
-    sniff=_sniff,
-    info=_describe,
-    read=lambda source, reading, threads, progress: read_spz(
-        source, max_gaussians=reading.max_compressed, raw_axes=reading.raw_axes, progress=progress
-    ),
-    write={
-        ".spz": lambda file, splats, raw_axes, progress: write_spz(file, splats, raw_axes=raw_axes, progress=progress)
-    },
-)
+FORMAT = Codec(sniff=_sniff, info=_describe, read=read_spz, write={".spz": write_spz})

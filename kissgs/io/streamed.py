@@ -10,19 +10,18 @@ import contextlib
 import itertools
 import os
 import posixpath
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.positions import Origin, read_origin, recorded
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
-from kissgs.core.splats import ATTRIBUTES, MAX_GAUSSIANS, SH_REST_COUNTS, Splats, empty_splats
+from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.containers import Source, is_file_name, open_source, stored_size
-from kissgs.io.files import marked, parse_json, refuse_more_than
-from kissgs.io.scene_format import Codec, Facts, titled
+from kissgs.io.files import marked, parse_json, refuse_more_than, whole_number
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions, SceneSource, titled
 
 MAX_TREE_BYTES = 1 << 25
 """Largest size of a manifest, bytes; one of a thousand leaves and five levels takes 330 kB."""
@@ -30,42 +29,27 @@ MAX_TREE_BYTES = 1 << 25
 MAX_TREE_VALUES = 1 << 22
 """Largest number of values in a manifest; one of a thousand leaves and five levels has 30,000."""
 
+MAX_ROWS = 1 << 40
+"""Largest number of a row that a manifest may name."""
+
 MAX_LEVELS = 64
 """Largest number of levels; each has a fraction of the Gaussians of the one before."""
 
 
-@runtime_checkable
-class Layout(Protocol):
-    """Metadata of a container, read and checked."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Container:
+    """Container among the files of a streamed scene, whose metadata is read and checked."""
 
-    @property
-    def sh_degree(self) -> int:
-        """Degree of the SH coefficients, 0 to 3."""
-
-    @property
-    def antialiased(self) -> bool:
-        """Whether the scene was trained with antialiasing."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Phrases for what reading the container leaves out, one phrase each."""
-
-
-Ranges = dict[str, tuple[float, float]]
-
-L = TypeVar("L", bound=Layout)
-
-
-@dataclass(frozen=True, slots=True)
-class Container(Generic[L]):
-    """Container among the files of a streamed scene."""
-
-    layout: L
     count: int
+    sh_degree: int
+    antialiased: bool
+    notes: tuple[str, ...] = ()  # phrases for what reading leaves out
+    ranges: Callable[[], dict[str, tuple[float, float]]]
+    """Returns the values of the lowest and the highest level of each attribute."""
     stored: Callable[[], tuple[str, int]]
     """Returns the name of the container and the bytes of all its files."""
     decode: Callable[[Splats, Workers], None]
-    """Decodes all Gaussians into a scene, whose SH coefficients above the container's degree become zero."""
+    """Decodes all Gaussians into a scene, whose SH coefficients above the container's degree are zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +71,11 @@ class Manifest:
 
 
 @dataclass(frozen=True, slots=True)
-class Part(Generic[L]):
+class Part:
     """Container of which a level needs the row ranges ``rows``, offset and count; ``name`` is that of its file."""
 
     name: str
-    container: Container[L]
+    container: Container
     rows: tuple[tuple[int, int], ...]
 
     @property
@@ -115,7 +99,7 @@ class Part(Generic[L]):
 
 
 @dataclass(frozen=True, slots=True)
-class StreamedFormat(Generic[L]):
+class StreamedFormat:
     """Format of streamed scenes."""
 
     title: str
@@ -123,31 +107,22 @@ class StreamedFormat(Generic[L]):
     """File name of the manifest."""
     containers: str | None
     """Value that the manifest's key "format" must have where it has one; None if any value is valid."""
-    opened: Callable[[Source, str], Container[L]]
+    opened: Callable[[Source, str], Container]
     """Reads and checks the metadata of the container of a file."""
-    ranges: Callable[[list[L]], Ranges]
-    """Returns the values of the lowest and the highest level of each attribute, over all containers."""
 
     @property
     def codec(self) -> Codec:
         """Code of the format."""
-        return Codec(
-            info=self.describe,
-            read=lambda source, reading, threads, progress: self.decode(
-                source, level=reading.level, max_gaussians=reading.max_compressed, threads=threads, progress=progress
-            ),
-        )
+        return Codec(info=self.describe, read=self.decode)
 
     def describe(self, path: Path | bytes, level: int) -> Facts:
         """Return the facts of one level and the environment; no image is decoded."""
         with self.open(path) as files:
             manifest = self.read_manifest(files)
             parts = list(self.parts(files, manifest, level))
-            sizes = {
-                self.manifest: stored_size(files, self.manifest),
-                **dict(part.container.stored() for part in parts),
-            }
-        antialiased = bool(parts) and all(part.container.layout.antialiased for part in parts)
+            containers = [part.container for part in parts]
+            sizes = {self.manifest: stored_size(files, self.manifest), **dict(each.stored() for each in containers)}
+        antialiased = bool(parts) and all(each.antialiased for each in containers)
         levels = [manifest.count(one) for one in range(manifest.levels)]
         environment = parts[-1].count if manifest.environment is not None else 0
         beside = f"; in the environment, which belongs to every level: {environment:,}" if environment else ""
@@ -155,10 +130,10 @@ class StreamedFormat(Generic[L]):
         return Facts(
             title=titled(self.title, described, "antialiased" if antialiased else ""),
             count=sum(part.count for part in parts),
-            sh_degree=max((part.container.layout.sh_degree for part in parts), default=0),
+            sh_degree=max((each.sh_degree for each in containers), default=0),
             parts=sizes,
-            ranges=self.ranges([part.container.layout for part in parts]),
-            notes=tuple(dict.fromkeys(note for part in parts for note in part.container.layout.notes)),
+            ranges=_widest([each.ranges() for each in containers]),
+            notes=_all_notes(parts),
             details={
                 **recorded(manifest.origin),
                 "level": level,
@@ -171,7 +146,7 @@ class StreamedFormat(Generic[L]):
         )
 
     @contextlib.contextmanager
-    def open(self, source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
+    def open(self, source: SceneSource) -> Iterator[Source]:
         """Open a streamed scene for reading; errors about its files name the scene."""
         with open_source(source, self.manifest) as files:
             try:
@@ -193,10 +168,8 @@ class StreamedFormat(Generic[L]):
 
     def decode(
         self,
-        source: Path | bytes | Mapping[str, bytes],
-        *,
-        level: int = 0,
-        max_gaussians: int = MAX_GAUSSIANS,
+        source: SceneSource,
+        reading: ReadOptions = DEFAULT_READ_OPTIONS,
         threads: int = 0,
         progress: Progress = silent,
     ) -> Splats:
@@ -206,21 +179,18 @@ class StreamedFormat(Generic[L]):
         """
         with self.open(source) as files, Workers(threads) as pool:
             manifest = self.read_manifest(files)
-            parts = list(self.parts(files, manifest, level))
+            parts = list(self.parts(files, manifest, reading.level))
             count = sum(part.count for part in parts)
-            refuse_more_than(max_gaussians, count, f"level {level}")
-            splats = empty_splats(
-                count, max((SH_REST_COUNTS[part.container.layout.sh_degree] for part in parts), default=0)
-            )
+            refuse_more_than(reading.max_compressed, count, f"level {reading.level}")
+            splats = empty_splats(count, SH_REST_COUNTS[max((part.container.sh_degree for part in parts), default=0)])
             start = 0
             for part in parts:
-                refuse_more_than(max_gaussians, part.container.count, f"the file {part.name}")
+                refuse_more_than(reading.max_compressed, part.container.count, f"the file {part.name}")
                 progress("decode", start / max(count, 1))
                 start = part.decode(splats, start, pool)
             progress("decode", 1.0)
-            notes = dict.fromkeys(note for part in parts for note in part.container.layout.notes)
-            splats = replace(splats, origin=manifest.origin, notes=tuple(notes))
-            return marked(splats, [part.container.layout.antialiased for part in parts])
+            splats = replace(splats, origin=manifest.origin, notes=_all_notes(parts))
+            return marked(splats, [part.container.antialiased for part in parts])
 
     def read_manifest(self, files: Source) -> Manifest:
         """Read and check the manifest."""
@@ -231,8 +201,8 @@ class StreamedFormat(Generic[L]):
         for key, known in (("version", 1), ("format", self.containers)):
             if known is not None and (found := document.get(key, known)) != known:
                 raise UnsupportedError(f"{name} is of {key} {str(found)[:40]!r}; {key} {known} is read")
-        levels, names = document.get("lodLevels"), document.get("filenames")
-        if not isinstance(levels, int) or isinstance(levels, bool) or not 1 <= levels <= MAX_LEVELS:
+        levels, names = whole_number(document.get("lodLevels"), 1, MAX_LEVELS), document.get("filenames")
+        if levels is None:
             raise _invalid(name, f"lodLevels is not a whole number from 1 to {MAX_LEVELS}")
         if not isinstance(names, list):
             raise _invalid(name, "it lacks the list 'filenames'")
@@ -256,7 +226,7 @@ class StreamedFormat(Generic[L]):
                     raise _invalid(name, f"two leaves share rows of {names[file]}")
         return Manifest(levels, tuple(names), tuple(map(tuple, rows)), environment, read_origin(document, name))
 
-    def parts(self, files: Source, manifest: Manifest, level: int) -> Iterator[Part[L]]:
+    def parts(self, files: Source, manifest: Manifest, level: int) -> Iterator[Part]:
         """Yield the containers of a level, then the environment; their metadata is read and checked."""
         last = manifest.levels - 1
         if not 0 <= level <= last:
@@ -279,12 +249,20 @@ class StreamedFormat(Generic[L]):
             yield Part(manifest.environment, container, ((0, container.count),))
 
 
-def _leaf_rows(
-    name: str,
-    tree: Any,  # noqa: ANN401  any JSON
-    levels: int,
-    files: int,
-) -> Iterator[tuple[int, tuple[int, int, int]]]:
+def _all_notes(parts: list[Part]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(note for part in parts for note in part.container.notes))
+
+
+def _widest(ranges: list[dict[str, tuple[float, float]]]) -> dict[str, tuple[float, float]]:
+    """Return the range of each attribute over all containers that have it."""
+    found: dict[str, tuple[float, float]] = {}
+    for name, (low, high) in (item for each in ranges for item in each.items()):
+        lowest, highest = found.get(name, (low, high))
+        found[name] = min(low, lowest), max(high, highest)
+    return found
+
+
+def _leaf_rows(name: str, tree: object, levels: int, files: int) -> Iterator[tuple[int, tuple[int, int, int]]]:
     """Yield level, file, offset and count of every leaf and level that has Gaussians."""
     waiting = [tree]
     while waiting:
@@ -297,8 +275,9 @@ def _leaf_rows(
                 level = int(key) if key.isascii() and key.isdigit() and len(key) < 4 else levels
                 if level >= levels or not isinstance(lod, dict):
                     raise _invalid(name, f"a leaf has a level that is not 0 to {levels - 1}")
-                file, offset, count = (_whole(lod.get(part)) for part in ("file", "offset", "count"))
-                if file is None or offset is None or count is None or file >= files:
+                file = whole_number(lod.get("file"), 0, files - 1)
+                offset, count = (whole_number(lod.get(part), 0, MAX_ROWS) for part in ("offset", "count"))
+                if file is None or offset is None or count is None:
                     raise _invalid(name, "a leaf does not name a file, an offset and a count")
                 if count:
                     yield level, (file, offset, count)
@@ -306,10 +285,6 @@ def _leaf_rows(
             waiting.extend(children)
         elif lods is not None or children is not None:
             raise _invalid(name, "its tree has a node whose levels or children are of the wrong kind")
-
-
-def _whole(value: object) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 40 else None
 
 
 def _invalid(name: str, problem: str) -> InvalidContainerError:

@@ -45,20 +45,13 @@ def decode(
 def decode_files(files: Source, layout: SogLayout, out: Splats, pool: Workers, folder: str = "") -> None:
     """Decode all images in parallel into ``out``, which has the container's number of Gaussians.
 
-    ``out`` may have more SH coefficients than the container; they become zero. ``folder`` is the prefix of file names.
+    SH coefficients above the container's degree are left as they are. ``folder`` is the prefix of file names.
     """
     images = _Images(files, layout, folder)
-
-    def decode_rest() -> None:
-        rest = layout.rest
-        out.shN[:, rest.coefficients if rest else 0 :] = 0
-        if rest:
-            _decode_rest(images, rest, out.shN[:, : rest.coefficients])
-
     jobs: list[Callable[[], None]] = [
         lambda: _decode_quats(images, out.quats),
         lambda: _decode_means(images, out.means),
-        decode_rest,
+        lambda: _decode_rest(images, out),
         lambda: _decode_scales(images, out.scales),
         lambda: _decode_colors(images, out),
     ]
@@ -159,18 +152,22 @@ def _decode_levels(
             out[part, channel] = table[channel][levels[part, channel]]
 
 
-def _decode_rest(images: _Images, rest: Rest, out: Float32[np.ndarray, "N K 3"]) -> None:
+def _decode_rest(images: _Images, out: Splats) -> None:
+    rest = images.layout.rest
+    if rest is None:
+        return
+    shN = out.shN[:, : rest.coefficients]
     codes = images.codebook(rest)
     _check_levels(rest.centroids, codes, rest.table)
     codebook = rest.table[codes].reshape(len(codes), rest.coefficients, 3)
     labels = images.plane(rest.labels, 3)
-    for part in steps(len(out)):
+    for part in steps(len(shN)):
         entry = labels[part, 0] | labels[part, 1].astype(np.int64) << 8
         if int(entry.max()) >= len(codebook):
             raise InvalidContainerError(
                 f"{rest.labels} points outside the codebook of {len(codebook):,} entries; export the scene again"
             )
-        np.take(codebook, entry, axis=0, out=out[part], mode="clip")
+        np.take(codebook, entry, axis=0, out=shN[part], mode="clip")
 
 
 def _check_levels(name: str, levels: UInt8[np.ndarray, "..."], table: Float32[np.ndarray, " 256"]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,13 +59,10 @@ def write_files(
     if not plan.grid.mask.any():
         raise UnsupportedError("a SOG file cannot hold a scene without visible Gaussians; write SOG-XT (.zip) instead")
 
-    def report(fraction: float) -> None:
-        progress("images", fraction)
-
-    report(0.0)
+    progress("images", 0.0)
     images = render_planes(plan)
     with blas_workers(threads) as pool:
-        files = compress_images(images, settings, pool, report, codebook=SHN[0])
+        files = compress_images(images, settings, pool, partial(progress, "images"), codebook=SHN[0])
     return Encoded.of(plan, {META_NAME: metadata(plan, plan.scene.sh_degree), **files})
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.positions import WORLD, Origin, read_origin
+from kissgs.core.positions import WORLD, Origin, read_origin, signed_exp
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.containers import (
     MAX_METADATA_BYTES,
@@ -22,7 +22,7 @@ from kissgs.io.containers import (
     stated_text,
 )
 from kissgs.io.conventions import OPACITY_OF_BYTE
-from kissgs.io.files import listed, parse_json, whole_number
+from kissgs.io.files import is_number, listed, parse_json, whole_number
 
 ENTRIES_PER_ROW = 64
 """Entries of the SH codebook in a row of its image."""
@@ -32,6 +32,9 @@ FIRST_TAG = 252
 
 MAX_SH_ENTRIES = 1 << 16
 """Largest number of entries of the SH codebook: labels have two bytes."""
+
+MAX_FLOAT32 = 3e38
+"""Bound of numbers, which float32 must hold."""
 
 _LEVELS = 256
 
@@ -98,6 +101,18 @@ class SogLayout:
         """SH degree, 0 to 3."""
         return SH_REST_COUNTS.index(self.rest.coefficients) if self.rest else 0
 
+    def value_ranges(self) -> dict[str, tuple[float, float]]:
+        """Return the values of the lowest and the highest level of every attribute."""
+        tables = {
+            "means": signed_exp(np.concatenate([self.low, self.high])),
+            "scales": self.scales,
+            "opacities": self.opacities,
+            "sh0": self.sh0,
+            **({"shN": self.rest.table} if self.rest else {}),
+        }
+        finite = {name: table[np.isfinite(table)] for name, table in tables.items()}
+        return {name: (float(values.min()), float(values.max())) for name, values in finite.items() if values.size}
+
 
 def read_layout(source: Source, name: str = META_NAME) -> SogLayout:
     """Read and check the metadata of a container."""
@@ -108,7 +123,7 @@ def read_layout(source: Source, name: str = META_NAME) -> SogLayout:
     if version not in (1, 2) or isinstance(version, bool):
         raise UnsupportedError(f"{name} is of version {str(version)[:40]!r}; SOG versions 1 and 2 are read")
     try:
-        return _read_v1(document) if version == 1 else _read_v2(document)
+        return _read(document, int(version))
     except _MetadataError as error:
         raise InvalidContainerError(f"{name}: {error}") from error
 
@@ -117,91 +132,64 @@ class _MetadataError(Exception):
     """Problem at a place in the document, as the end of a sentence."""
 
 
-def _read_v2(document: dict[str, Any]) -> SogLayout:
+def _read(document: dict[str, Any], version: int) -> SogLayout:
+    first = version == 1  # whose levels are evenly spaced, also those of opacities, the fourth channel of colours
+    table = _even_table if first else _codebook
+    colors = table(document, "sh0", 4 if first else 3)
+    asset = document.get("asset")
+    return SogLayout(
+        version=version,
+        count=_first_count(document) if first else _whole(document, "count", "", 0, 1 << 32),
+        **_means(document),
+        scales=table(document, "scales", 3),
+        sh0=colors[:3],
+        opacities=np.clip(colors[3], OPACITY_OF_BYTE[0], OPACITY_OF_BYTE[-1]) if first else OPACITY_OF_BYTE,
+        files=_files(document),
+        rest=_rest(document, first) if document.get("shN") is not None else None,
+        model=None if first else _model(document),
+        generator=stated_text(asset.get("generator")) if isinstance(asset, dict) and not first else None,
+        origin=WORLD if first else read_origin(document, META_NAME),
+        unknown=tuple(key for key in document if key not in _KNOWN),
+    )
+
+
+def _model(document: dict[str, Any]) -> str | None:
+    """Return the variant of the renderer; one that does not draw 3D Gaussians is refused."""
     asset = document.get("asset")
     model = stated_text(document.get("model")) or (stated_text(asset.get("model")) if isinstance(asset, dict) else None)
     if model is None and document.get("antialias") is True:  # as the format's specification spells it
-        model = "antialiased"
+        return "antialiased"
     if model and model.lower() not in _MODELS:
         raise UnsupportedError(
             f"{META_NAME} names the model {model[:40]!r}, which is not supported; export 3D Gaussians (known are "
             f"{', '.join(_MODELS)})"
         )
-    rest = _part(document, "shN") if document.get("shN") is not None else None
-    return SogLayout(
-        version=2,
-        count=_whole(document, "count", "", 0, 1 << 32),
-        **_means(document),
-        scales=_codebook(document, "scales", 3),
-        sh0=_codebook(document, "sh0", 3),
-        opacities=OPACITY_OF_BYTE,
-        files=_files(document),
-        rest=None if rest is None else _rest_v2(document, rest),
-        model=model,
-        generator=stated_text(asset.get("generator")) if isinstance(asset, dict) else None,
-        origin=read_origin(document, META_NAME),
-        unknown=_unknown(document),
-    )
+    return model
 
 
-def _unknown(document: dict[str, Any]) -> tuple[str, ...]:
-    return tuple(key for key in document if key not in _KNOWN)
-
-
-def _rest_v2(document: dict[str, Any], rest: dict[str, Any]) -> Rest:
-    centroids, labels = _names(rest, "shN", 2)
-    return Rest(
-        entries=_whole(rest, "count", "shN.", 1, MAX_SH_ENTRIES),
-        coefficients=SH_REST_COUNTS[_whole(rest, "bands", "shN.", 1, 3)],
-        table=_codebook(document, "shN", 1)[0],
-        centroids=centroids,
-        labels=labels,
-    )
-
-
-def _read_v1(document: dict[str, Any]) -> SogLayout:
+def _first_count(document: dict[str, Any]) -> int:
+    """Return the number of Gaussians of version 1."""
+    if _part(document, "quats").get("encoding", "quaternion_packed") != "quaternion_packed":
+        found = str(document["quats"]["encoding"])[:40]
+        raise _MetadataError(f"quats.encoding is {found!r}; only 'quaternion_packed' is read")
     shape = _part(document, "means").get("shape")
     if not isinstance(shape, list) or not shape:
         raise _MetadataError("means.shape does not give the number of Gaussians; export the scene again")
-    encoding = _part(document, "quats").get("encoding", "quaternion_packed")
-    if encoding != "quaternion_packed":
-        raise _MetadataError(f"quats.encoding is {str(encoding)[:40]!r}; only 'quaternion_packed' is read")
-    colors = _ranges(document, "sh0", 4)
-    opacities = _clamped_logits(colors[3])
-    rest = _part(document, "shN") if document.get("shN") is not None else None
-    return SogLayout(
-        version=1,
-        count=_whole({"count": shape[0]}, "count", "means.shape: ", 0, 1 << 32),
-        **_means(document),
-        scales=_ranges(document, "scales", 3),
-        sh0=colors[:3],
-        opacities=opacities,
-        files=_files(document),
-        rest=None if rest is None else _rest_v1(document, rest),
-        model=None,
-        generator=None,
-        origin=WORLD,
-        unknown=_unknown(document),
-    )
+    return _whole({"count": shape[0]}, "count", "means.shape: ", 0, 1 << 32)
 
 
-def _rest_v1(document: dict[str, Any], rest: dict[str, Any]) -> Rest:
+def _rest(document: dict[str, Any], first: bool) -> Rest:
+    rest = _part(document, "shN")
+    centroids, labels = _names(rest, "shN", 2)
+    if not first:
+        coefficients = SH_REST_COUNTS[_whole(rest, "bands", "shN.", 1, 3)]
+        entries = _whole(rest, "count", "shN.", 1, MAX_SH_ENTRIES)
+        return Rest(entries, coefficients, _codebook(document, "shN", 1)[0], centroids, labels)
     shape = rest.get("shape")
     width = shape[1] if isinstance(shape, list) and len(shape) == 2 else None
     if width not in (9, 24, 45) or isinstance(width, bool):
         raise _MetadataError("shN.shape does not have 9, 24 or 45 values per Gaussian; export the scene again")
-    centroids, labels = _names(rest, "shN", 2)
-    return Rest(
-        entries=None,
-        coefficients=int(width) // 3,
-        table=_ranges(document, "shN", 1)[0],
-        centroids=centroids,
-        labels=labels,
-    )
-
-
-def _clamped_logits(logits: Float32[np.ndarray, " 256"]) -> Float32[np.ndarray, " 256"]:
-    return np.clip(logits, OPACITY_OF_BYTE[0], OPACITY_OF_BYTE[-1])
+    return Rest(None, int(width) // 3, _even_table(document, "shN", 1)[0], centroids, labels)
 
 
 def _part(document: dict[str, Any], key: str) -> dict[str, Any]:
@@ -221,17 +209,12 @@ def _means(document: dict[str, Any]) -> dict[str, Float64[np.ndarray, " 3"]]:
 def _numbers(part: dict[str, Any], key: str, where: str, count: int) -> Float64[np.ndarray, " count"]:
     values = part.get(key)
     values = values if isinstance(values, list) else [values]
-    if len(values) != count or not all(map(_is_number, values)):
+    if len(values) != count or not all(is_number(value, MAX_FLOAT32) for value in values):
         raise _MetadataError(f"{where}{key} is not a list of {count} finite numbers; export the scene again")
     return np.array(values, dtype=np.float64)
 
 
-def _is_number(value: object) -> bool:
-    """Whether a value is a number that float32 can hold."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 3e38
-
-
-def _ranges(document: dict[str, Any], key: str, channels: int) -> Float32[np.ndarray, "channels 256"]:
+def _even_table(document: dict[str, Any], key: str, channels: int) -> Float32[np.ndarray, "channels 256"]:
     """Return the values of version 1: levels evenly spaced between the smallest and the largest."""
     low, high = (_numbers(_part(document, key), end, f"{key}.", channels) for end in ("mins", "maxs"))
     levels = np.arange(_LEVELS) / (_LEVELS - 1)
@@ -247,7 +230,7 @@ def _codebook(document: dict[str, Any], key: str, channels: int) -> Float32[np.n
     values = _part(document, key).get("codebook")
     if not isinstance(values, list) or not 1 <= len(values) <= _LEVELS:
         raise _MetadataError(f"{key}.codebook is not a list of up to {_LEVELS} numbers; export the scene again")
-    if not all(value is None or _is_number(value) for value in values):
+    if not all(value is None or is_number(value, MAX_FLOAT32) for value in values):
         raise _MetadataError(f"{key}.codebook has something else than finite numbers; export the scene again")
     table = np.full(_LEVELS, np.nan)
     table[: len(values)] = [math.nan if value is None else value for value in values]

@@ -20,11 +20,9 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import MAX_GAUSSIANS, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.containers import Source, open_source
+from kissgs.io.conventions import ROWS, steps
 from kissgs.io.images import decode_plane
 from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout, read_layout
-
-CHUNK = 1 << 14
-"""Gaussians per task."""
 
 CHANNELS_OF_PLAIN = {"quaternions": 4, "scales": 3, "f_dc": 3, "opacities": 1}
 """Number of channels of the attributes that are one image of 8-bit levels each."""
@@ -51,7 +49,7 @@ def decode(
 def decode_files(files: Source, layout: Layout, out: Splats, pool: Workers) -> None:
     """Decode a container whose metadata states the number of Gaussians into ``out``, which has as many.
 
-    ``out`` may have more SH coefficients than the container; they become zero.
+    SH coefficients of ``out`` above the container's degree are left as they are.
     """
     planes = _Planes(files, layout, len(out))
     planes.load(pool)
@@ -65,7 +63,7 @@ class _Planes:
     means: UInt16[np.ndarray, "cells 3"]
     means_table: Float32[np.ndarray, " levels"]
     labels: UInt8[np.ndarray, "cells 2"]
-    codebook: Float32[np.ndarray, "entries D"]
+    codebook: Float32[np.ndarray, "entries K 3"]
 
     def __init__(self, files: Source, layout: Layout, max_gaussians: int) -> None:
         self.files, self.layout, self.max_gaussians = files, layout, max_gaussians
@@ -128,7 +126,7 @@ class _Planes:
         low, high = (limit.reshape(3, 15).T.reshape(45) for limit in self.layout.limits("f_rest_centroids"))
         entries = np.empty((side * side, 45), dtype=np.float32)
         _Lookup(tiles, low, high)(tiles, entries)
-        self.codebook = np.ascontiguousarray(entries[:, : 3 * self.coefficients])
+        self.codebook = np.ascontiguousarray(entries.reshape(-1, 15, 3)[:, : self.coefficients])
 
     def grid_plane(self, name: str, channels: int) -> UInt8[np.ndarray, "cells C"]:
         """Return an image of the grid's size, as one row per cell."""
@@ -147,7 +145,7 @@ class _Planes:
     def look_up(self, pool: Workers, out: Splats | None = None) -> Splats:
         """Convert levels to values, some thousand Gaussians at a time, so that temporaries stay in the cache.
 
-        They are written to ``out`` if it is given, whose SH coefficients above the container's become zero.
+        They are written to ``out`` if it is given.
         """
         mask = self.mask[:, 0] > 0
         count = int(np.count_nonzero(mask))
@@ -160,21 +158,18 @@ class _Planes:
         splats = empty_splats(count, self.coefficients) if out is None else out
         outputs = (splats.quats, splats.scales, splats.sh0, splats.opacities[:, None])
         plain = [(*self.plain[field], out) for field, out in zip(CHANNELS_OF_PLAIN, outputs, strict=True)]
-        shN = splats.shN.reshape(count, 3 * splats.shN.shape[1])
-        more = shN.shape[1] - self.codebook.shape[1]
-        codebook = np.pad(self.codebook, ((0, 0), (0, more))) if more else self.codebook
+        shN = splats.shN[:, : self.coefficients]
 
-        def work(first: int) -> None:
-            rows = slice(first, min(first + CHUNK, count))
+        def work(rows: slice) -> None:
             source = rows if cells is None else cells[rows]
             np.take(self.means_table, self.means[source], out=splats.means[rows], mode="clip")
             for levels, lookup, out in plain:
                 lookup(levels[source], out[rows])
             if shN.shape[1]:
                 entries = _entry(self.labels[source], self.layout.codebook_side)
-                np.take(codebook, entries, axis=0, out=shN[rows], mode="clip")
+                np.take(self.codebook, entries, axis=0, out=shN[rows], mode="clip")
 
-        pool.map(work, range(0, count, CHUNK))
+        pool.map(work, steps(count))
         return splats
 
 
@@ -189,13 +184,13 @@ class _Lookup:
     def __init__(self, image: UInt8[np.ndarray, "..."], low: np.ndarray, high: np.ndarray) -> None:
         table = _table(image, low, high).astype(np.float32)
         self._table = table.reshape(-1)
-        # One row of offsets per Gaussian of a chunk: NumPy adds equal shapes faster than it broadcasts short rows.
-        self._offsets = np.tile(np.arange(len(table), dtype=np.uint16) * table.shape[1], (CHUNK, 1))
+        # One row of offsets per Gaussian of a step: NumPy adds equal shapes faster than it broadcasts short rows.
+        self._offsets = np.tile(np.arange(len(table), dtype=np.uint16) * table.shape[1], (ROWS, 1))
 
     def __call__(self, levels: UInt8[np.ndarray, "N C"], out: Float32[np.ndarray, "N C"]) -> None:
-        for first in range(0, len(levels), CHUNK):
-            some = levels[first : first + CHUNK]
-            np.take(self._table, some + self._offsets[: len(some)], out=out[first : first + CHUNK], mode="clip")
+        for part in steps(len(levels)):
+            some = levels[part]
+            np.take(self._table, some + self._offsets[: len(some)], out=out[part], mode="clip")
 
 
 def _table(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> Float64[np.ndarray, "C levels"]:

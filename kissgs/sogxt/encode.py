@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -30,14 +30,12 @@ def encode(
     *,
     sensitivity: Sensitivity | None = None,
     recolor: ColorRefit | None = None,
-    cleaned: Cleaned = NOTHING_CLEANED,
-    compacted: int = 0,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Encoded:
     """Encode a clean scene: :func:`kissgs.planning.planner.plan_encoding`, then :func:`write_files`."""
     plan = plan_encoding(splats, settings, sensitivity=sensitivity, recolor=recolor, threads=threads, progress=progress)
-    return write_files(plan, settings, cleaned=cleaned, compacted=compacted, threads=threads, progress=progress)
+    return write_files(plan, settings, threads=threads, progress=progress)
 
 
 def write_files(
@@ -51,9 +49,10 @@ def write_files(
     progress: Progress = silent,
 ) -> Encoded:
     """Make the files of a plan; the bytes do not depend on the number of threads. The metadata records the counts."""
+    progress("images", 0.0)
     images = render_planes(plan)
     with blas_workers(threads) as pool:
-        files = compress_images(images, settings, pool, _stage(progress, "images"))
+        files = compress_images(images, settings, pool, partial(progress, "images"))
     scene, count = plan.scene, int(plan.grid.mask.sum())
     omitted = {*GOALS, "max_encodes"} | (
         {"sh_codebook_size"} if settings.sh_codebook_size == MAX_CODEBOOK_SIDE**2 else set()
@@ -121,8 +120,3 @@ def _ranges(fields: dict[str, Quantized]) -> dict[str, tuple[list[float], list[f
 
     ranges = {name: observed_range(field) for name, field in fields.items()}
     return {name: (digits(name, low), digits(name, high)) for name, (low, high) in ranges.items()}
-
-
-def _stage(progress: Progress, name: str) -> Callable[[float], None]:
-    progress(name, 0.0)
-    return lambda fraction: progress(name, fraction)

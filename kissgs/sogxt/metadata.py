@@ -15,7 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from pydantic_core import PydanticCustomError
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.positions import WORLD, Origin, read_origin, recorded
+from kissgs.core.positions import WORLD, Origin, read_origin, recorded, signed_exp
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE, SH_REST_COUNTS
 from kissgs.formats import LEVELS_NAME, LOD_NAME
 from kissgs.io.containers import MAX_METADATA_BYTES, MAX_SIGNED_LOG, Source, is_antialiased, stated_text
@@ -31,6 +31,9 @@ TILE_ROWS, TILE_COLUMNS = 3, 5
 
 CHANNELS = {"opacities": 1, "means": 1, "scales": 3, "quaternions": 4, "f_dc": 3, "f_rest_centroids": 45}
 """Fields with a range, and its number of channels. One number is written as such, several as a list."""
+
+ATTRIBUTE_OF = {field: field for field in CHANNELS} | {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
+"""Attribute of a scene that each field holds."""
 
 CHECKED = ("f_dc", "opacities", "scales", "quaternions", "means", "f_rest_centroids")
 """Order of the ranges in the checksum of the metadata."""
@@ -91,15 +94,20 @@ class Layout(BaseModel):
         """Whether the scene was trained with antialiasing."""
         return is_antialiased(self.model)
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Phrases for what reading leaves out: nothing is."""
-        return ()
-
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
         """Return ``low`` and ``high`` of a field, one number per channel: float32 numbers, as float64."""
         low, high = self.ranges[field]
         return np.array(low, dtype=np.float32).astype(np.float64), np.array(high, dtype=np.float32).astype(np.float64)
+
+    def value_ranges(self) -> dict[str, tuple[float, float]]:
+        """Return the values of the lowest and the highest level of every attribute."""
+        ranges = {}
+        for field, name in ATTRIBUTE_OF.items():
+            if field != "f_rest_centroids" or self.sh_degree > 0:
+                ends = np.concatenate(self.limits(field))
+                ends = signed_exp(ends) if field == "means" else ends
+                ranges[name] = float(ends.min()), float(ends.max())
+        return ranges
 
     @property
     def sh_degree(self) -> int:

@@ -39,6 +39,7 @@ from kissgs.streaming.layout import (
     leaves_file,
     level_file,
     manifest,
+    read_counts,
     read_leaves,
     rows_file,
     write_json,
@@ -46,10 +47,9 @@ from kissgs.streaming.layout import (
 from kissgs.streaming.levels import (
     Environment,
     append_rows,
-    chunk_depth,
     chunk_levels,
     from_rows,
-    level_count,
+    halvings,
     read_rows,
     row_bytes,
     sync,
@@ -206,24 +206,26 @@ def partition(
     done = visible_count = 0
     origin = WORLD
 
-    def counted() -> Iterator[Splats]:
+    def visible_blocks() -> Iterator[tuple[Splats, dict[str, int]]]:
+        """Yield what is visible of each block, and the numbers of Gaussians that were changed or left out."""
         nonlocal done
         for block in blocks():
-            yield block
+            splats, cleaned = clean(block)
+            visible = visible_gaussians(splats, settings)
+            yield splats.select(visible), {**cleaned.as_dict(), "invisible": len(splats) - len(visible)}
             done += len(block)
             progress("partition", done / (2 * count))
 
-    def visible_rows(block: Splats) -> Float32[np.ndarray, "n 4"]:
+    def places_and_sizes() -> Iterator[Float32[np.ndarray, "n 4"]]:
         nonlocal visible_count
-        splats = clean(block)[0]
-        splats = splats.select(visible_gaussians(splats, settings))
-        visible_count += len(splats)
-        return np.column_stack([splats.means, visible_sizes(splats.scales).astype(np.float32)])
+        for splats, _ in visible_blocks():
+            visible_count += len(splats)
+            yield np.column_stack([splats.means, visible_sizes(splats.scales).astype(np.float32)])
 
-    sample = sampled_rows(map(visible_rows, counted()), count)
+    sample = sampled_rows(places_and_sizes(), count)
     environment = Environment.of(sample[:, :3], visible_count)
     sample = sample[~environment.contains(sample[:, :3])]
-    cuts = Cuts.of(sample[:, :3], chunk_depth(count, CHUNK))
+    cuts = Cuts.of(sample[:, :3], halvings(count, CHUNK))
     if container == "sog":  # which has a range of each axis
         cuts = cuts_without_coarse(sample, cuts, count)
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in range(cuts.chunks))):
@@ -231,12 +233,10 @@ def partition(
     notes: tuple[str, ...] = ()
     far_count, counts, sh_degree, changed = 0, np.zeros(cuts.chunks, np.int64), 0, Counter[str]()
     antialiased = False
-    for block in counted():
-        splats, cleaned = clean(block)
+    for splats, removed in visible_blocks():
         notes = tuple(dict.fromkeys([*notes, *reading_notes(splats)]))
-        visible = visible_gaussians(splats, settings)
-        changed.update({**cleaned.as_dict(), "invisible": len(splats) - len(visible)})
-        splats, sh_degree, antialiased = splats.select(visible), splats.sh_degree, splats.antialiased
+        changed.update(removed)
+        sh_degree, antialiased = splats.sh_degree, splats.antialiased
         far = environment.contains(splats.means)
         append_rows(environment_file(work), to_rows(splats.select(far)))
         far_count, splats, origin = far_count + int(far.sum()), splats.select(~far), splats.origin
@@ -247,7 +247,7 @@ def partition(
             append_rows(chunk_file(work, int(chunk)), some)
             counts[chunk] += len(some)
     total = int(counts.sum())
-    levels = level_count(total, COARSEST)
+    levels = 1 + halvings(total, COARSEST)
     layout = Layout(
         container=container,
         source_count=count,
@@ -348,14 +348,14 @@ def _others(work: Path, layout: Layout, file: ContainerFile) -> Splats:
 
 def coarse_note(work: Path, layout: Layout) -> str:
     """Return the note of the first file of the finest level whose positions are coarse; else an empty string."""
-    notes = (json.loads(rows_file(work, file.name).read_bytes())["note"] for file in layout.files() if not file.level)
+    notes = (read_counts(work, file.name)["note"] for file in layout.files() if not file.level)
     note = next(filter(None, notes), "")
     return note.removesuffix(f": {STREAMED_REMEDY}") if layout.container == "sog" else note
 
 
 def environment_count(work: Path) -> int:
     """Return the number of Gaussians in the file of the environment."""
-    return sum(json.loads(rows_file(work, ENVIRONMENT).read_bytes())["counts"])
+    return sum(read_counts(work, ENVIRONMENT)["counts"])
 
 
 def read_environment(work: Path, layout: Layout) -> Splats:
@@ -379,7 +379,7 @@ def make_manifest(work: Path, layout: Layout) -> None:
     lods: dict[tuple[int, int], dict[int, tuple[int, int, int]]] = {}
     filenames: list[str] = []
     for file in layout.files():
-        counts = json.loads(rows_file(work, file.name).read_bytes())["counts"]
+        counts = read_counts(work, file.name)["counts"]
         leaves_of_file = [
             (chunk, leaf) for chunk in file.chunks for leaf in range(len(read_leaves(work, chunk)["bounds"]))
         ]

@@ -18,7 +18,7 @@ from kissgs.core.positions import middle_of, with_origin, world_positions
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import BLOCK, Splats
 from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
-from kissgs.io.files import atomic_file, reason_of
+from kissgs.io.files import reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_level, stored_bytes
@@ -48,6 +48,7 @@ from kissgs.streaming.layout import (
     keep_layout,
     read_layout,
     work_folder,
+    write_json,
 )
 
 # ``with_time_left``: progress events of the work items of a streamed scene, with an estimate of the time left.
@@ -183,8 +184,7 @@ def compress_streamed(
         if (found := read_json(work / REPORT)) is None:
             layout = _partition(work, source, container, settings, reading, threads, progress)
             found = asdict(_make(work, layout, settings, runner, threads, progress))
-            with atomic_file(work / REPORT) as done:
-                done.write(json.dumps(found).encode())
+            write_json(work / REPORT, found)
         finish(work, manifest, source, overwrite=overwrite)
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
 
@@ -218,7 +218,7 @@ def _make(
     run("images", [item(file=file.name) for file in layout.all_files()])
     report("images", 1.0)
     build.make_manifest(work, layout)
-    return _report(work, layout, len(layout.filled))
+    return _report(work, layout)
 
 
 def _check_settings(settings: Settings) -> None:
@@ -309,15 +309,14 @@ def _announce(work: Path, needed: int, progress: Progress) -> None:
     progress("scratch", 1.0, f"{work} takes up to {megabytes(needed)} until the work is done")
 
 
-def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
+def _report(work: Path, layout: Layout) -> StreamedReport:
     out = work / OUT
     document = json.loads((out / layout.manifest).read_bytes())
     sizes = [0] * layout.levels
     for file in layout.files():
         path = out / layout.path(file.name)
-        sizes[file.level] += (
-            stored_bytes(path) if path.exists() else 0
-        )  # files without a visible Gaussian are not written
+        if path.exists():  # files without a visible Gaussian are not written
+            sizes[file.level] += stored_bytes(path)
     environment = out / layout.path(ENVIRONMENT)
     environment_count, environment_bytes = 0, 0
     if environment.exists():
@@ -330,7 +329,7 @@ def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
         level_bytes=tuple(sizes),
         environment_count=environment_count,
         environment_bytes=environment_bytes,
-        chunks=chunks,
+        chunks=len(layout.filled),
         note="; ".join(filter(None, [*layout.notes, build.coarse_note(work, layout)])),
         total_bytes=sum(sizes) + environment_bytes + (out / layout.manifest).stat().st_size,
     )

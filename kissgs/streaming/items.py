@@ -17,14 +17,23 @@ from typing import Any, BinaryIO
 from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.core.progress import Progress
 from kissgs.formats import MANIFESTS
-from kissgs.io.files import atomic_file, path_state, reason_of
+from kissgs.io.files import path_state, reason_of
 from kissgs.io.streamed import MAX_TREE_BYTES
 from kissgs.runners import Resources, Runner, WorkItem, error_of
 from kissgs.settings import EncodeSettings
 from kissgs.sog.encode import FILES
 from kissgs.streaming import build
 from kissgs.streaming.build import CHUNK
-from kissgs.streaming.layout import OUT, PARTITION, Layout, continuation, leaves_file, read_layout, rows_file
+from kissgs.streaming.layout import (
+    OUT,
+    PARTITION,
+    Layout,
+    continuation,
+    leaves_file,
+    read_layout,
+    rows_file,
+    write_json,
+)
 from kissgs.streaming.levels import row_bytes
 
 # The work folder of a streamed scene: whose work it holds, its room on the disk, and the last step of the work.
@@ -127,8 +136,7 @@ def _take_over(work: Path, mine: dict[str, Any]) -> None:
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"cannot use {work}: {reason_of(error)}") from error
-    with atomic_file(work / WORK, overwrite=True) as file:
-        file.write(json.dumps(mine).encode())
+    write_json(work / WORK, mine)
 
 
 def _locked(lock: BinaryIO) -> bool:

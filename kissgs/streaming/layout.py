@@ -148,6 +148,11 @@ def rows_file(work: Path, name: str) -> Path:
     return work / f"file_{name}.json"
 
 
+def read_counts(work: Path, name: str) -> dict[str, Any]:
+    """Return the number of rows of each leaf in a container, and the note of its encoding."""
+    return json.loads(rows_file(work, name).read_bytes())
+
+
 def write_json(path: Path, values: object) -> None:
     """Write JSON atomically."""
     with atomic_file(path, overwrite=True) as file:

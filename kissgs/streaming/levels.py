@@ -88,9 +88,9 @@ def read_rows(path: Path, sh_degree: int, count: int) -> Float32[np.ndarray, "N 
     return values.reshape(count, row_bytes(sh_degree) // 4)
 
 
-def chunk_depth(count: int, chunk: int) -> int:
-    """Return the number of cuts one after another until chunks of a scene have at most about ``chunk`` Gaussians."""
-    return max(0, int(np.ceil(np.log2(max(count, 1) / chunk))))
+def halvings(count: int, most: int) -> int:
+    """Return how often ``count`` Gaussians are halved until there are at most about ``most``."""
+    return max(0, int(np.ceil(np.log2(max(count, 1) / most))))
 
 
 def leaf_groups(
@@ -168,11 +168,6 @@ class ChunkLevels:
     counts: list[list[int]]
     bounds: Float64[np.ndarray, "leaves 2 3"]
     errors: list[list[float]]
-
-
-def level_count(count: int, coarsest: int) -> int:
-    """Return how many levels a scene has until the coarsest, by halving, has at most ``coarsest`` Gaussians."""
-    return 1 + max(0, int(np.ceil(np.log2(max(count, 1) / coarsest))))
 
 
 def chunk_levels(chunk: Splats, levels: int, leaf: int, threads: int, progress: Progress = silent) -> ChunkLevels:

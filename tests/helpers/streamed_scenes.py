@@ -7,9 +7,9 @@ import kissgs
 from helpers.reference_sog import sog_files, sog_folder, streamed_files
 from kissgs import Settings
 from kissgs.sog.decode import decode as decode_sog
-from kissgs.sog.streamed import STREAMED as SOG_FORMAT
+from kissgs.sog.scenes import STREAMED as SOG_FORMAT
 from kissgs.sogxt.decode import decode as decode_sogxt
-from kissgs.sogxt.streamed import STREAMED as SOGXT_FORMAT
+from kissgs.sogxt.scenes import STREAMED as SOGXT_FORMAT
 from kissgs.streaming import build
 
 ALL = Settings.research("fast", prune_invisible=False)
@@ -53,6 +53,10 @@ KINDS = {kind.format: kind for kind in (SOG, SOGXT)}
 
 TARGETS = ("city/lod-meta.json", "city.sogxt/levels.json")
 """Manifests to write, one of each kind."""
+
+
+class Stop(Exception):
+    """Raised by a test's progress callback to interrupt the work."""
 
 
 def tree_leaves(node):

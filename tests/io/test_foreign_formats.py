@@ -30,6 +30,7 @@ from kissgs.io.gltf import read_gltf
 from kissgs.io.gltf_document import write_glb, write_spz_glb
 from kissgs.io.ksplat import read_ksplat
 from kissgs.io.ply import read_ply, write_ply
+from kissgs.io.scene_format import ReadOptions
 from kissgs.io.splat import read_splat, write_splat
 from kissgs.io.spz import read_spz, write_spz
 from kissgs.sog.decode import decode
@@ -60,10 +61,10 @@ def ply_of(scene, path):
     return path
 
 
-def written(writer, scene, path, **options):
+def written(writer, scene, path):
     """Write the cleaned scene, and return the path."""
     with path.open("wb") as file:
-        writer(file, clean(scene)[0], **options)
+        writer(file, clean(scene)[0])
     return path
 
 
@@ -119,7 +120,9 @@ def test_spz_of_its_library(version, count, degree, tmp_path):
     theirs = splats_of_cloud(foreign("read-spz", path, "RDF"))
     assert_alike(read_spz(path), theirs, atol=2e-5 if version == 2 else 5e-7, opacities=1e-4)
     stored = splats_of_cloud(foreign("read-spz", path, "UNSPECIFIED"))
-    assert_alike(read_spz(path, raw_axes=True), stored, atol=2e-5 if version == 2 else 5e-7, opacities=1e-4)
+    assert_alike(
+        read_spz(path, ReadOptions(raw_axes=True)), stored, atol=2e-5 if version == 2 else 5e-7, opacities=1e-4
+    )
 
 
 @needs_foreign_formats
@@ -273,7 +276,7 @@ def test_our_spz_inside_glb_in_cesium(count, degree, tmp_path):
     """Cesium takes the axes as they are stored, which is half a turn about the vertical axis from the extension's."""
     scene = made_scene(count, degree)
     found = foreign("read-glb-in-cesium", written(write_spz_glb, scene, tmp_path / "a.spz.glb"))
-    wanted = read_spz(written(write_spz, scene, tmp_path / "a.spz"), raw_axes=True)
+    wanted = read_spz(written(write_spz, scene, tmp_path / "a.spz"), ReadOptions(raw_axes=True))
     np.testing.assert_array_equal(floats(found.pop("POSITION"), count, 3), wanted.means)
     np.testing.assert_allclose(floats(found.pop(f"{NAME}:SCALE"), count, 3), np.exp(wanted.scales), rtol=1e-5)
     quats = np.roll(floats(found.pop(f"{NAME}:ROTATION"), count, 4), 1, axis=1)

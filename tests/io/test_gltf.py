@@ -13,6 +13,7 @@ from helpers.reference_spz import spz_bytes
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.spherical_harmonics import sh_basis
 from kissgs.io.gltf import describe, read_gltf
+from kissgs.io.scene_format import ReadOptions
 from kissgs.io.spz import read_spz
 
 
@@ -158,7 +159,7 @@ def test_several_primitives_and_nodes():
     assert found.notes == ("left out: animations, _LABEL, meshes without Gaussians, hidden nodes",)
     np.testing.assert_allclose(found.means, np.tile(scene.means, (4, 1)), atol=1e-6)
     with pytest.raises(UnsupportedError, match=r"has 16 Gaussians; the limit is 15"):
-        read_gltf(glb_bytes(root, buffer), max_gaussians=15)
+        read_gltf(glb_bytes(root, buffer), ReadOptions(max_gaussians=15))
 
 
 def instanced(root, buffer, **columns):

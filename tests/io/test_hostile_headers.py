@@ -17,13 +17,17 @@ def glb(text):
     return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text
 
 
-def packed(count, **files):
+def with_entries(count):
+    """Return a zip of so many empty files."""
+    local = struct.pack("<4s22xHH5s", b"PK\3\4", 5, 0, b"empty")
+    entry = struct.pack("<4s24xHHH8xI5s", b"PK\1\2", 5, 0, 0, 0, b"empty")
+    return local + count * entry + struct.pack("<4s4xHHIIH", b"PK\5\6", count, count, count * len(entry), len(local), 0)
+
+
+def sog(meta):
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for i in range(count):
-            archive.writestr(f"{i:x}", b"")
-        for name, data in files.items():
-            archive.writestr(name.replace("_", "."), data)
+        archive.writestr("meta.json", meta)
     return buffer.getvalue()
 
 
@@ -39,9 +43,9 @@ FILES = {
     "texts.glb": lambda: glb(b'{"nodes": [' + b'"a",' * 1_000_000 + b"0]}"),
     "lists.glb": lambda: glb(b'{"nodes": ' + b"[[]," * 1_000_000 + b"0" + b"]" * 1_000_000 + b"}"),
     "objects.glb": lambda: glb(b'{"nodes": [' + b'{"a":0},' * 120_000 + b"{}]}"),
-    "meta.sog": lambda: packed(0, meta_json=b'{"version": 2, "means": [' + b'{"a":0},' * 125_000 + b"0]}"),
-    "entries.sog": lambda: packed(40_000),
-    "hidden.sog": lambda: behind_its_end(packed(40_000)),
+    "meta.sog": lambda: sog(b'{"version": 2, "means": [' + b'{"a":0},' * 125_000 + b"0]}"),
+    "entries.sog": lambda: with_entries(40_000),
+    "hidden.sog": lambda: behind_its_end(with_entries(40_000)),
     "sections.ksplat": lambda: KSPLAT,
 }
 

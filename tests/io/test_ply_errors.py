@@ -10,6 +10,7 @@ from helpers.reference_ply import declaration, header_bytes, names, ply_bytes, r
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.io import ply_rows as ply_body
 from kissgs.io.ply import read_ply, read_ply_info
+from kissgs.io.scene_format import ReadOptions
 
 VERTEX = ["element vertex 1", *(f"property float {name}" for name in names(0))]
 ROW = b"0 " * 14
@@ -205,9 +206,9 @@ def test_a_line_without_end_is_not_collected(monkeypatch):
 
 def test_more_than_the_limit_is_refused_before_reading():
     data = ply_bytes(random_columns(3, 0))
-    assert len(read_ply(data, max_gaussians=3)) == 3
+    assert len(read_ply(data, ReadOptions(max_gaussians=3))) == 3
     with pytest.raises(UnsupportedError, match=r"^the data has 3 Gaussians; the limit is 2: raise it"):
-        read_ply(data, max_gaussians=2)
+        read_ply(data, ReadOptions(max_gaussians=2))
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])

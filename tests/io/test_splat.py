@@ -9,9 +9,9 @@ from helpers.reference_splat import SH_C0, ksplat_bytes, splat_bytes
 
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.splats import Splats, clean
-from kissgs.io import splat
+from kissgs.io import conventions, splat
 from kissgs.io.ksplat import FORMAT, read_ksplat
-from kissgs.io.scene_format import Match
+from kissgs.io.scene_format import Match, ReadOptions
 from kissgs.io.splat import read_splat
 
 
@@ -40,7 +40,7 @@ def test_opacities_0_and_1_and_scales_of_0():
 
 @pytest.mark.parametrize("count", [0, 1, 65, 600])
 def test_splat_within_half_a_step(count, monkeypatch):
-    monkeypatch.setattr(splat, "_BLOCK", 100)
+    monkeypatch.setattr(conventions, "ROWS", 100)
     scene = made_scene(count, 0)
     found = read_splat(splat_bytes(scene))
     assert splat.FORMAT.info(splat_bytes(scene), 0).count == len(found) == count
@@ -60,9 +60,9 @@ def test_splat_of_a_wrong_size(size):
 
 def test_limits():
     with pytest.raises(UnsupportedError, match=r"has 3 Gaussians; the limit is 2"):
-        read_splat(bytes(96), max_gaussians=2)
+        read_splat(bytes(96), ReadOptions(max_gaussians=2))
     with pytest.raises(UnsupportedError, match=r"has 3 Gaussians; the limit is 2"):
-        read_ksplat(ksplat_bytes([made_scene(3, 0)], 0), max_gaussians=2)
+        read_ksplat(ksplat_bytes([made_scene(3, 0)], 0), ReadOptions(max_gaussians=2))
 
 
 def test_a_position_of_level_1_by_hand():

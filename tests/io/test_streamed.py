@@ -39,7 +39,7 @@ def joined(kind, scenes):
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_every_level_with_the_environment(kind, files, level):
-    found = kind.decode(files, level=level)
+    found = kind.decode(files, ReadOptions(level=level))
     for name, wanted in joined(kind, [*LEVELS[level], ENVIRONMENT]).items():
         np.testing.assert_array_equal(getattr(found, name), wanted)
 
@@ -103,14 +103,14 @@ def test_damaged_trees(kind, files, message, change):
     damaged = edited(kind, files, change) if callable(change) else files
     damaged = {**files, kind.manifest: b"7"} if change == 7 else damaged
     with pytest.raises(KissgsError) as error:
-        kind.decode(damaged, level=3 if change is None else 0)
+        kind.decode(damaged, ReadOptions(level=3 if change is None else 0))
     assert message.replace("MANIFEST", kind.manifest).replace("FIRST", first) in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_limits_and_depth(kind, files):
     with pytest.raises(UnsupportedError, match=r"level 0 has 112 Gaussians; the limit is 111"):
-        kind.decode(files, max_gaussians=111)
+        kind.decode(files, ReadOptions(max_gaussians=111))
     deep = b'{"lodLevels": 1, "filenames": [], "tree": ' + b'{"children": [' * 100_000
     with pytest.raises(InvalidContainerError, match=rf"{kind.manifest} is not readable JSON"):
         kind.decode({kind.manifest: deep})
@@ -145,7 +145,7 @@ def test_messages_about_files_name_the_scene(kind, files, tmp_path, packed):
         scene.with_suffix(".zip").write_bytes(zip_of(damaged))
         source = scene.with_suffix(".zip") if packed else write_folder(damaged, scene)
         with pytest.raises(KissgsError) as error:
-            kind.decode(source, level=level)
+            kind.decode(source, ReadOptions(level=level))
         with pytest.raises(type(error.value)) as described:
             describe(source, ReadOptions(level=level))
         shutil.rmtree(scene, ignore_errors=True)

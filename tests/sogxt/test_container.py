@@ -14,7 +14,8 @@ from helpers.memory import takes_less_than
 
 from kissgs import Settings, compress, decompress
 from kissgs.core.errors import InvalidContainerError, OutputError
-from kissgs.io.containers import MAX_ZIP_ENTRIES, open_source
+from kissgs.io import containers
+from kissgs.io.containers import MAX_ZIP_ENTRIES, DirectorySource, is_below, open_source, zip_names
 from kissgs.sogxt.container import check_destination, write_container, zip_bytes
 
 FILES = {"container_meta.yaml": b"meta", "meta.json": b"{}", "a.webp": bytes(range(256)) * 4, "empty.webp": b""}
@@ -57,18 +58,13 @@ def test_zip_has_the_same_bytes_at_any_time_and_place(monkeypatch):
             assert entry.external_attr >> 16 == 0o644
 
 
-@pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 @pytest.mark.parametrize("folder", ["", "scene/", "a/b/c/", "a\\b\\", "/abs/", "../../", "C:\\"])
-def test_zips_of_other_tools_are_read(folder, compression):
-    """Deflated, or packed with their folder; a path is only ever a name here, so it leads nowhere."""
-    data = archive([(f"{folder}{name}", content) for name, content in FILES.items()], compression)
-    assert contents(data) == FILES
-
-
-def test_folder_entries_and_notes_are_ignored():
-    entries = [("scene/", b""), *((f"scene/{name}", data) for name, data in FILES.items())]
-    found = contents(archive([*entries, ("__MACOSX/._a.webp", b"x"), ("scene/README.txt", b"hello")]))
-    assert {name: found[name] for name in FILES} == FILES
+def test_zips_of_other_tools_are_read(folder):
+    """Deflated, or packed with their folder, its entry, and notes; a path is only ever a name, so it leads nowhere."""
+    entries = [(f"{folder}{name}", content) for name, content in FILES.items()]
+    assert contents(archive(entries, zipfile.ZIP_DEFLATED)) == FILES
+    found = contents(archive([("scene/", b""), *entries, ("__MACOSX/._a.webp", b"x"), ("scene/README.txt", b"hello")]))
+    assert found == {**FILES, "._a.webp": b"x", "README.txt": b"hello"}
 
 
 def test_names_do_not_end_at_a_nul():
@@ -78,36 +74,26 @@ def test_names_do_not_end_at_a_nul():
 
 
 def test_a_container_is_read_from_anything(tmp_path):
-    write_container(FILES, tmp_path / "folder")
-    write_container(FILES, tmp_path / "file.zip")
-    sources = [FILES, tmp_path / "folder", tmp_path / "file.zip", (tmp_path / "file.zip").read_bytes()]
-    assert all(contents(source) == FILES for source in sources)
-    (tmp_path / "folder" / "subfolder").mkdir()
-    assert contents(tmp_path / "folder") == FILES
-
-
-@pytest.mark.parametrize("kind", ["memory", "folder", "zip"])
-def test_sizes_are_reported_without_reading(kind, tmp_path):
-    source = {"memory": FILES, "folder": tmp_path / "folder", "zip": tmp_path / "file.zip"}[kind]
-    if kind != "memory":
-        write_container(FILES, source)
+    """Sizes are those of the file system, or of zipfile; missing and oversized files are refused."""
+    folder, packed = tmp_path / "folder", tmp_path / "file.zip"
+    write_container(FILES, folder)
+    write_container(FILES, packed)
+    (folder / "subfolder").mkdir()
     sizes = {name: len(data) for name, data in FILES.items()}
-    if kind == "zip":
-        with zipfile.ZipFile(source) as archive:
-            sizes = {entry.filename: entry.compress_size for entry in archive.infolist()}
-    with open_source(source) as files:
-        assert {name: files.size(name) for name in files.names()} == sizes
-
-
-@pytest.mark.parametrize("kind", ["memory", "folder", "zip"])
-def test_missing_and_oversized_files_are_refused(kind, tmp_path):
-    source = {"memory": FILES, "folder": tmp_path / "folder", "zip": tmp_path / "file.zip"}[kind]
-    if kind != "memory":
-        write_container(FILES, source)
-    assert refusal(source, "b.webp") == "the container has no file 'b.webp'; export or download it again"
-    assert refusal(source, "a.webp", 1023) == "a.webp has 1024 bytes; the limit for this file is 1023"
-    with open_source(source) as files:
-        assert len(files.read("a.webp", 1024)) == 1024
+    with zipfile.ZipFile(packed) as file:
+        packed_sizes = {entry.filename: entry.compress_size for entry in file.infolist()}
+    for source, wanted in (
+        (FILES, sizes),
+        (folder, sizes),
+        (packed, packed_sizes),
+        (packed.read_bytes(), packed_sizes),
+    ):
+        assert contents(source) == FILES
+        with open_source(source) as files:
+            assert {name: files.size(name) for name in files.names()} == wanted
+            assert len(files.read("a.webp", 1024)) == 1024
+        assert refusal(source, "b.webp") == "the container has no file 'b.webp'; export or download it again"
+        assert refusal(source, "a.webp", 1023) == "a.webp has 1024 bytes; the limit for this file is 1023"
 
 
 @pytest.mark.parametrize("data", [b"", b"PK\x05\x06", b"PK\x03\x04" + bytes(50), b"no zip", zip_bytes(FILES)[:-30]])
@@ -118,26 +104,20 @@ def test_what_is_no_zip_is_refused(data, tmp_path):
     assert refusal(path) == f"{path} is not a readable zip file; export or download it again"
 
 
-def test_no_such_file(tmp_path):
+def test_missing_files_and_paths_that_no_file_system_has(tmp_path):
+    """Asking whether such a path is a folder once raised a bare OSError or ValueError."""
     path = tmp_path / "none.zip"
     assert refusal(path) == f"cannot read {path}: no such file or directory"
-
-
-@pytest.mark.parametrize("name", ["x" * 300 + ".zip", "x" * 300, "nul\0.zip"])
-def test_paths_that_no_file_system_has_are_refused_in_a_sentence(tmp_path, name):
-    """Asking whether such a path is a folder once raised a bare OSError or ValueError."""
-    assert refusal(tmp_path / name).startswith("cannot read")
+    for name in ("x" * 300 + ".zip", "x" * 300, "nul\0.zip"):
+        assert refusal(tmp_path / name).startswith("cannot read")
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
-@pytest.mark.parametrize("second", ["a.webp", "other/a.webp"])
-def test_two_files_of_one_name_are_refused(second):
+def test_two_files_of_one_name_and_thousands_of_files_are_refused():
     """Readers differ in which of them they use, so a checked file could differ from the one that is used."""
-    data = archive([("a.webp", b"one"), (second, b"two")])
-    assert refusal(data) == "the input holds two files named 'a.webp'"
-
-
-def test_thousands_of_entries_are_refused():
+    for second in ("a.webp", "other/a.webp"):
+        data = archive([("a.webp", b"one"), (second, b"two")])
+        assert refusal(data) == "the input holds two files named 'a.webp'"
     data = archive([(f"{i}.txt", b"") for i in range(MAX_ZIP_ENTRIES + 1)])
     assert refusal(data) == f"the input has {MAX_ZIP_ENTRIES + 1} entries; a container has 12 files"
 
@@ -207,23 +187,17 @@ def test_a_folder_that_holds_more_than_a_container_is_never_replaced(tmp_path, s
     assert sorted(folder.iterdir()) == before
 
 
-def test_a_file_is_not_replaced_by_a_folder(tmp_path):
+def test_a_file_is_not_replaced_by_a_folder_nor_a_folder_by_a_zip(tmp_path):
     (tmp_path / "file").write_text("text")
     with pytest.raises(OutputError):
         write_container(FILES, tmp_path / "file", overwrite=True)
     assert (tmp_path / "file").read_text() == "text"
-
-
-def test_a_folder_is_not_replaced_by_a_zip(tmp_path):
     (tmp_path / "x.zip").mkdir()
     with pytest.raises(OutputError, match="is a folder; name a file"):
         write_container(FILES, tmp_path / "x.zip", overwrite=True)
-
-
-@pytest.mark.parametrize("name", ["missing/new", "missing/new.zip"])
-def test_a_missing_folder_above_is_an_output_error(tmp_path, name):
-    with pytest.raises(OutputError, match=f"cannot write .*{name}: there is no folder"):
-        write_container(FILES, tmp_path / name)
+    for name in ("missing/new", "missing/new.zip"):
+        with pytest.raises(OutputError, match=f"cannot write .*{name}: there is no folder"):
+            write_container(FILES, tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["a.zip", "folder"])
@@ -303,3 +277,44 @@ def test_a_whole_container_survives_repacking():
     compressed = compress(random_scene(50, 1), settings=Settings.from_preset("fast"))
     repacked = archive([(f"my scene/{name}", data) for name, data in compressed.files.items()], zipfile.ZIP_DEFLATED)
     assert (decompress(repacked).means == decompress(compressed.files).means).all()
+
+
+@pytest.mark.parametrize("name", ["a", "a/b.webp", "a b/c", "..a/b", "a/..b", "a\\b"])
+def test_paths_below_a_folder(name):
+    assert is_below(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["", "/a", "..", "../a", "a/../b", "a\\..\\b", "\\a", "C:/a", "C:\\a", "https://a", "a\0"]
+)
+def test_paths_outside_a_folder(name, tmp_path):
+    assert not is_below(name)
+    with pytest.raises(InvalidContainerError, match="has no file"):
+        DirectorySource(tmp_path).read(name, 1000)
+
+
+def test_files_by_name_or_by_path_from_a_root():
+    data = archive([(name, b"x") for name in ("top/index", "top/a/one", "top/b/two", "elsewhere/three")])
+    with open_source(data) as files:
+        assert files.names() == {"index", "one", "two", "three"}
+        assert files.read("any/one", 10) == b"x"
+    with open_source(data, "index") as files:
+        assert files.names() == {"index", "a/one", "b/two"}
+        assert files.read("a/one", 10) == b"x"
+        with pytest.raises(InvalidContainerError, match="has no file 'one'"):
+            files.read("one", 10)
+    for names, count in ((["a/index", "b/index"], 2), (["a"], 0)):
+        with pytest.raises(InvalidContainerError, match=f"holds {count} files named 'index'; one is needed"):
+            open_source(archive([(name, b"x") for name in names]), "index").__enter__()
+
+
+def test_lists_of_entries_that_are_too_large_or_of_zip64(monkeypatch):
+    data = archive([(f"{i:04}", b"x") for i in range(200)])
+    assert len(zip_names(io.BytesIO(data))) == 200
+    monkeypatch.setattr(containers, "MAX_DIRECTORY_BYTES", 5000)
+    assert zip_names(io.BytesIO(data)) == []
+    assert refusal(data) == "the input has a list of entries above 5000 bytes; pack it again"
+    data = archive([("a", b"x")])
+    end = data.rindex(b"PK\5\6")
+    zip64 = data[:end] + b"PK\6\7".ljust(20, b"\0") + data[end:]
+    assert refusal(zip64) == "the input is a zip64 file; pack it as an ordinary zip"

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.splat_transform import convert, needs_splat_transform
-from helpers.streamed_scenes import FAST, TARGETS, files_of, small_sizes
+from helpers.streamed_scenes import FAST, TARGETS, Stop, small_sizes
 
 import kissgs
 from kissgs import Settings
@@ -19,8 +19,8 @@ from kissgs.streaming.levels import FEWEST, MOST, Environment
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    small_sizes(monkeypatch, chunk=800, leaf=150, coarsest=500)
-    monkeypatch.setattr(levels, "FEWEST", 100)
+    small_sizes(monkeypatch, chunk=400, leaf=120, coarsest=250)
+    monkeypatch.setattr(levels, "FEWEST", 50)
 
 
 def directions(count, seed=0):
@@ -78,9 +78,9 @@ def test_degenerate_scenes_have_no_environment():
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A sample scene, whose sky is 12 % of it; and the distance of its sky."""
+    """A sample scene, whose sky is 12 % of it."""
     path = tmp_path_factory.mktemp("sky") / "scene.ply"
-    kissgs.save(kissgs.sample_scene(3000, sh_degree=1, seed=3), path)
+    kissgs.save(kissgs.sample_scene(1500, sh_degree=1, seed=3), path)
     return path
 
 
@@ -110,34 +110,6 @@ def test_every_level_has_the_whole_sky(scene, tmp_path, name, preset):
     assert report.total_bytes == total
     lost = report.source_count - report.counts[0] - report.environment_count
     assert lost == report.changed["invisible"] + report.changed["pruned_by_rd"]
-
-
-class Stop(Exception):
-    pass
-
-
-@pytest.mark.quick(0)
-@pytest.mark.parametrize("name", TARGETS)
-def test_interrupted_work_ends_with_the_same_bytes_and_is_replaced_as_a_whole(scene, tmp_path, name):
-    for folder in ("whole", "parts"):
-        (tmp_path / folder).mkdir()
-    compress_streamed(scene, tmp_path / "whole" / name, settings=FAST)
-    target = tmp_path / "parts" / name
-    for stage in ("merge", "images", "images"):
-        seen = 0
-
-        def stop(now, fraction, note="", stage=stage):
-            nonlocal seen
-            seen += now == stage
-            if seen > 1:
-                raise Stop
-
-        with pytest.raises(Stop):
-            compress_streamed(scene, target, settings=FAST, progress=stop)
-    compress_streamed(scene, target, settings=FAST)
-    assert files_of(target.parent) == files_of((tmp_path / "whole" / name).parent)
-    compress_streamed(scene, target, settings=Settings.research("fast", sh0_step=0.1), overwrite=True)
-    assert not list(target.parent.parent.glob("*.partial"))
 
 
 @pytest.mark.quick(1)
@@ -171,7 +143,7 @@ def test_images_never_go_back_and_have_the_time_left(scene, tmp_path, monkeypatc
 
 def test_an_environment_that_nobody_sees_is_left_out(tmp_path):
     """Nothing of a sky reaches the output if every renderer skips its opacity."""
-    original = kissgs.sample_scene(3000, sh_degree=0, seed=3)
+    original = kissgs.sample_scene(1500, sh_degree=0, seed=3)
     away = np.linalg.norm(original.means - np.median(original.means, axis=0), axis=1)
     original.opacities[away > 8 * np.median(away)] = -9.0
     kissgs.save(original, tmp_path / "scene.ply")

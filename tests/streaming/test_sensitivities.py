@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from helpers.render_scenes import blobs
-from helpers.streamed_scenes import small_sizes
+from helpers.streamed_scenes import Stop, small_sizes
 
 import kissgs
 from kissgs import Settings
@@ -60,10 +60,6 @@ def test_cameras_are_the_same_after_a_file():
         np.testing.assert_array_equal(camera.K, other.K)
         assert (camera.width, camera.height) == (other.width, other.height)
     np.testing.assert_array_equal(read.background, CAMERAS.background)
-
-
-class Stop(Exception):
-    pass
 
 
 @pytest.mark.quick(0)

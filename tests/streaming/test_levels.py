@@ -1,13 +1,14 @@
-"""Partition. Oracle: each position compared with the cuts on its way, and the counts of a direct assignment."""
+"""Partition and errors of levels. Oracles: each position compared with the cuts on its way; leaves of known images."""
 
 import itertools
 
 import numpy as np
 import pytest
+from helpers.render_scenes import blobs, one
 
 from kissgs.core.positions import Cuts
 from kissgs.core.splats import sampled_rows
-from kissgs.streaming.levels import chunk_depth, leaf_groups
+from kissgs.streaming.levels import SIZE, halvings, leaf_groups, level_errors
 
 
 def positions(count, seed=0):
@@ -45,10 +46,10 @@ def test_a_sample_has_every_kth_position_whatever_the_blocks(sizes, monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("count", "chunk", "depth"), [(0, 100, 0), (100, 100, 0), (101, 100, 1), (800, 100, 3), (801, 100, 4)]
+    ("count", "most", "times"), [(0, 100, 0), (100, 100, 0), (101, 100, 1), (800, 100, 3), (801, 100, 4)]
 )
-def test_depth(count, chunk, depth):
-    assert chunk_depth(count, chunk) == depth
+def test_halvings(count, most, times):
+    assert halvings(count, most) == times
 
 
 @pytest.mark.parametrize("count", [1, 7, 64, 65, 1000])
@@ -59,3 +60,25 @@ def test_leaves_hold_every_gaussian_once(count):
     assert edges[0] == 0
     assert edges[-1] == count
     assert all((np.diff(order[a:b]) > 0).all() for a, b in itertools.pairwise(edges))
+
+
+def test_equal_levels_have_no_error():
+    leaf = blobs(50)
+    assert level_errors([leaf, leaf.select(np.arange(49, -1, -1)), leaf]) == [0, 0, 0]
+
+
+def test_a_ball_in_front_of_grey():
+    """An opaque ball of one colour, and one of another: the error is the difference times the ball's share."""
+    size = -2.0
+    ball = one(scale=(size,) * 3, opacity=20.0, sh0=(1.7724539,) * 3)  # white
+    grey = one(scale=(size,) * 3, opacity=20.0, sh0=(0, 0, 0))  # as the background: no error but the white ball's
+    found = level_errors([ball, grey])[1]
+    pixels = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
+    squared = (pixels[:, None] ** 2 + pixels[None, :] ** 2) * 4  # the radius of the leaf is two standard deviations
+    assert found == pytest.approx(0.5 * np.sqrt(np.mean(np.exp(-0.5 * squared) ** 2)), rel=0.03)
+
+
+def test_a_coarser_level_never_has_a_smaller_error():
+    leaf = blobs(60)
+    errors = level_errors([leaf, leaf.select(np.arange(10)), leaf.select(np.arange(40))])
+    assert 0 < errors[1] == errors[2]

@@ -1,22 +1,29 @@
-"""Facts of a SOG-XT container from its metadata, for ``kissgs info``."""
+"""Scenes of SOG-XT in the table of formats: single containers, and streamed ones of ``levels.json`` and zips."""
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 
 from kissgs.core.errors import InvalidContainerError
-from kissgs.core.positions import recorded, signed_exp
+from kissgs.core.positions import recorded
 from kissgs.core.progress import Progress
+from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.io.containers import Source, open_source
+from kissgs.formats import LEVELS_NAME
+from kissgs.io.containers import Source, ZipSource, open_source, stored_size
 from kissgs.io.scene_format import Codec, Facts, ReadOptions, SceneSource, titled
+from kissgs.io.streamed import Container, StreamedFormat
+from kissgs.sogxt import container
 from kissgs.sogxt.container import FILES, PLANES
-from kissgs.sogxt.metadata import CHANNELS, Layout, read_layout, read_provenance
+from kissgs.sogxt.metadata import Layout, read_layout, read_provenance
 
-NAMES = {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
 MAX_PLANE_BYTES = 1 << 30
+
+MAX_FILE_BYTES = 1 << 28
+"""Largest size of a zip in a streamed scene, bytes; one of 400,000 Gaussians takes about 5 MB."""
 
 
 def describe(path: Path | bytes, level: int) -> Facts:
@@ -37,7 +44,7 @@ def describe(path: Path | bytes, level: int) -> Facts:
         count=count,
         sh_degree=layout.sh_degree,
         parts=parts,
-        ranges=ranges_of([layout]),
+        ranges=layout.value_ranges(),
         changed=made.changed if made else {},
         details={
             **recorded(layout.origin),
@@ -50,18 +57,6 @@ def describe(path: Path | bytes, level: int) -> Facts:
         },
         lines=(f"grid {grid} x {grid}, codebook {codebook} x {codebook}; encoder: {origin}",),
     )
-
-
-def ranges_of(layouts: list[Layout]) -> dict[str, tuple[float, float]]:
-    """Return the values of the lowest and the highest level of every attribute, over all containers."""
-    ranges = {}
-    for field in CHANNELS:
-        having = [layout for layout in layouts if field != "f_rest_centroids" or layout.sh_degree > 0]
-        if having:
-            ends = np.concatenate([end for layout in having for end in layout.limits(field)])
-            ends = signed_exp(ends) if field == "means" else ends
-            ranges[NAMES.get(field, field)] = float(ends.min()), float(ends.max())
-    return ranges
 
 
 def _count_mask(files: Source, layout: Layout) -> int:
@@ -79,3 +74,30 @@ def _read(source: SceneSource, reading: ReadOptions, threads: int, progress: Pro
 
 
 FORMAT = Codec(info=describe, read=_read)
+
+
+def _opened(files: Source, name: str) -> Container:
+    """Read the metadata of a zip, whose bytes are not kept until its images are decoded."""
+
+    def opened() -> Source:
+        return ZipSource(io.BytesIO(files.read(name, MAX_FILE_BYTES)), name)
+
+    def decode(out: Splats, pool: Workers) -> None:
+        from kissgs.sogxt.decode import decode_files
+
+        decode_files(opened(), layout, out, pool)
+
+    layout = read_layout(opened())
+    if layout.count is None:
+        raise InvalidContainerError(f"{name} does not state its number of Gaussians; compress the scene again")
+    return Container(
+        count=layout.count,
+        sh_degree=layout.sh_degree,
+        antialiased=layout.antialiased,
+        ranges=layout.value_ranges,
+        stored=lambda: (name, stored_size(files, name)),
+        decode=decode,
+    )
+
+
+STREAMED = StreamedFormat("streamed SOG-XT scene", LEVELS_NAME, container.FORMAT, _opened)

@@ -1,18 +1,18 @@
-"""Facts of a SOG container from its metadata, for ``kissgs info``."""
+"""Scenes of SOG in the table of formats: single containers, and streamed ones of ``lod-meta.json`` and folders."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-
-from kissgs.core.positions import recorded, signed_exp
+from kissgs.core.positions import recorded
 from kissgs.core.progress import Progress
+from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.io.containers import META_NAME, open_source, stored_size
+from kissgs.formats import LOD_NAME
+from kissgs.io.containers import META_NAME, Source, open_source, stored_size
 from kissgs.io.scene_format import Codec, Facts, ReadOptions, SceneSource, titled
-from kissgs.sog.metadata import SogLayout, read_layout
+from kissgs.io.streamed import Container, StreamedFormat
+from kissgs.sog.metadata import read_layout
 
 
 def describe(path: Path | bytes, level: int) -> Facts:
@@ -25,7 +25,7 @@ def describe(path: Path | bytes, level: int) -> Facts:
         count=layout.count,
         sh_degree=layout.sh_degree,
         parts=parts,
-        ranges=ranges_of([layout]),
+        ranges=layout.value_ranges(),
         notes=layout.notes,
         details={
             **recorded(layout.origin),
@@ -38,24 +38,6 @@ def describe(path: Path | bytes, level: int) -> Facts:
     )
 
 
-def ranges_of(layouts: list[SogLayout]) -> dict[str, tuple[float, float]]:
-    """Return the values of the lowest and the highest level of every attribute, over all containers."""
-    values: dict[str, Iterable[np.ndarray]] = {
-        "means": [signed_exp(end) for layout in layouts for end in (layout.low, layout.high)],
-        "scales": [layout.scales for layout in layouts],
-        "opacities": [layout.opacities for layout in layouts],
-        "sh0": [layout.sh0 for layout in layouts],
-        "shN": [layout.rest.table for layout in layouts if layout.rest],
-    }
-    found = {}
-    for name, arrays in values.items():
-        finite = [array[np.isfinite(array)] for array in arrays]
-        if any(array.size for array in finite):
-            together = np.concatenate(finite)
-            found[name] = float(together.min()), float(together.max())
-    return found
-
-
 def _read(source: SceneSource, reading: ReadOptions, threads: int, progress: Progress) -> Splats:
     from kissgs.sog.decode import decode  # which the description does not need
 
@@ -63,3 +45,29 @@ def _read(source: SceneSource, reading: ReadOptions, threads: int, progress: Pro
 
 
 FORMAT = Codec(info=describe, read=_read)
+
+
+def _opened(files: Source, name: str) -> Container:
+    """Read the container of a metadata file."""
+    layout, folder = read_layout(files, name), name[: name.rfind("/") + 1]
+
+    def stored() -> tuple[str, int]:
+        return folder or META_NAME, sum(stored_size(files, folder + each) for each in (META_NAME, *layout.images))
+
+    def decode(out: Splats, pool: Workers) -> None:
+        from kissgs.sog.decode import decode_files
+
+        decode_files(files, layout, out, pool, folder)
+
+    return Container(
+        count=layout.count,
+        sh_degree=layout.sh_degree,
+        antialiased=layout.antialiased,
+        notes=layout.notes,
+        ranges=layout.value_ranges,
+        stored=stored,
+        decode=decode,
+    )
+
+
+STREAMED = StreamedFormat("streamed SOG scene", LOD_NAME, None, _opened)
