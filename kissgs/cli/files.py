@@ -232,6 +232,10 @@ def source(name: str) -> Path | bytes:
     return sys.stdin.buffer.read()
 
 
+CHECKPOINT = ".checkpoint.npz"
+"""Ending of checkpoints beside scenes."""
+
+
 def sibling(name: str, suffix: str) -> Path:
     """Return the path next to an input with another ending."""
     if name == "-":
