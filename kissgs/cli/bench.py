@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar, cast
 
 import typer
 
-from kissgs.cli.files import print_json, progress_bar, say_notes, show
+from kissgs.cli.files import print_json, progress_bar, say_notes, show, write_output
 from kissgs.cli.options import (
     CaptureOptions,
     ForceOption,
@@ -387,8 +387,6 @@ def row_of(name: str, found: Measurement) -> Row:
 
 def _print_and_write(rows: Sequence[Row], output: Path | None, plot: Path | None, force: bool) -> None:
     """Print the table, write it and plot it; what cannot be printed is written nevertheless."""
-    from kissgs.io.files import atomic_file
-
     try:
         show(_table(rows))
     finally:
@@ -397,11 +395,9 @@ def _print_and_write(rows: Sequence[Row], output: Path | None, plot: Path | None
             writer = csv.DictWriter(text, list(asdict(rows[0])))
             writer.writeheader()
             writer.writerows(map(asdict, rows))
-            with atomic_file(output, overwrite=force) as file:
-                file.write(text.getvalue().encode())
+            write_output(output, text.getvalue().encode(), force=force)
         if plot is not None:
-            with atomic_file(plot, overwrite=force) as file:
-                file.write(_png(rows))
+            write_output(plot, _png(rows), force=force)
 
 
 def _table(rows: Sequence[Row]) -> Table:

@@ -87,7 +87,7 @@ def compact(
         ),
     ] = None,
     *,
-    budget: CompactionOptions,
+    compaction: CompactionOptions,
     evaluate: Annotated[
         bool, typer.Option("--evaluate", help="Measure PSNR, SSIM, MS-SSIM and compressed size after every step.")
     ] = False,
@@ -105,7 +105,7 @@ def compact(
     from kissgs.pipeline.pipeline import compact as run
     from kissgs.training.checkpoint import delete_checkpoints
 
-    settings, quiet = budget.settings(), common.quiet or as_json
+    settings, quiet = compaction.settings(), common.quiet or as_json
     training.refuse_without_training(settings)
     if output is None:
         raise UnsupportedError("missing -o: by default the output would overwrite the input")

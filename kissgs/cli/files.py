@@ -309,6 +309,17 @@ def write_stdout(data: bytes) -> None:
         sys.stdout.buffer.write(data)
 
 
+def write_output(target: Path, data: bytes, *, force: bool) -> None:
+    """Write a file atomically, or to standard output for "-"."""
+    if str(target) == "-":
+        write_stdout(data)
+        return
+    from kissgs.io.files import atomic_file
+
+    with atomic_file(target, overwrite=force) as file:
+        file.write(data)
+
+
 def say_notes(name: str, notes: Sequence[str], quiet: bool) -> None:
     """Print what reading a scene left out or changed on standard error; empty notes count for nothing."""
     if any(notes) and not quiet:

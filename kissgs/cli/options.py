@@ -60,7 +60,7 @@ ViewsOption = Annotated[
 def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command the options of each dataclass among its parameters, in the place of that parameter."""
     hints = get_type_hints(command, include_extras=True)
-    groups = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     options = dict[str, inspect.Parameter]()
     for name, parameter in inspect.signature(command).parameters.items():
         if name in groups:

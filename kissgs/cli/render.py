@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kissgs.cli.files import check_input, for_each_input, progress_bar, say_notes, show, source, write_stdout
+from kissgs.cli.files import check_input, for_each_input, progress_bar, say_notes, show, source, write_output
 from kissgs.cli.interrupts import Interrupted
 from kissgs.cli.options import CaptureOptions, ForceOption, SceneOptions, device_of, with_option_groups
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
@@ -72,7 +72,7 @@ def view(
 
 
 def _write(scene: str, common: SceneOptions, output: Path, force: bool) -> None:
-    from kissgs.io.files import atomic_file, refuse_existing
+    from kissgs.io.files import refuse_existing
     from kissgs.preview import fitting_level, is_streamed, page_container, standalone_page
 
     if output.suffix.lower() not in (".html", ".htm"):
@@ -87,8 +87,7 @@ def _write(scene: str, common: SceneOptions, output: Path, force: bool) -> None:
         container = page_container(content, reading, threads=common.threads, progress=progress)
     say_notes(scene, container.notes, common.quiet)
     page = standalone_page(container)
-    with atomic_file(output, overwrite=force) as file:
-        file.write(page)
+    write_output(output, page, force=force)
     if not common.quiet:
         made = f", compressed by the preset balanced to {len(container.data):,} bytes" if container.converted else ""
         show(f"{output}  {len(page):,} bytes, holds {container.name}{chosen}{made}")
@@ -311,7 +310,7 @@ def render(
             data = _encoded(rendered, suffix)
             progress("write", 1.0)
         say_notes(name, job.splats.notes, common.quiet)
-        _deliver(data, target, force=force)
+        write_output(target, data, force=force)
         if image.save_camera is not None:
             write_camera(image.save_camera, rendered.views[0].camera, overwrite=force)
         report = _report(rendered, len(data))
@@ -321,16 +320,6 @@ def render(
         return report
 
     for_each_input([file], output, suffix, as_json, work)
-
-
-def _deliver(data: bytes, target: Path, *, force: bool) -> None:
-    from kissgs.io.files import atomic_file
-
-    if str(target) == "-":
-        write_stdout(data)
-        return
-    with atomic_file(target, overwrite=force) as file:
-        file.write(data)
 
 
 def _suffix(file: str, output: str | None) -> str:
