@@ -12,7 +12,9 @@ import kissgs
 from kissgs.cli.options import chosen, steps_of
 
 SHORT = {"views": 24, "view_size": 48}
-OPTIONS = ["-p", "fast", *(word for name, value in SHORT.items() for word in ("--set", f"finetune.{name}={value}"))]
+LOOK = {"sensitivity_views": 8, "sensitivity_view_size": 48}
+CHANGES = {**{f"finetune.{name}": value for name, value in SHORT.items()}, **LOOK}
+OPTIONS = [word for name, value in CHANGES.items() for word in ("--set", f"{name}={value}")]
 
 
 @pytest.mark.parametrize("container", ["sogxt", "sog"])
@@ -21,7 +23,7 @@ def test_output_and_report_are_those_of_the_library(folder: Path, tmp_path: Path
     words = ["compress", "--finetune", "6", folder / "a.ply", "-o", target, *OPTIONS]
     done = run(*words)
     assert done.returncode == 0, done.stderr
-    settings = kissgs.Settings.research("fast", finetune={"enabled": True, "steps": 6, **SHORT})
+    settings = kissgs.Settings.research("balanced", finetune={"enabled": True, "steps": 6, **SHORT}, **LOOK)
     found = kissgs.compress(SCENE, settings=settings, container=container)
     assert target.read_bytes() == found.to_zip()
     report = found.report.finetuning
