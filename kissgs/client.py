@@ -19,7 +19,7 @@ from kissgs.core.errors import Cancelled, InvalidSceneError, KissgsError, Remote
 from kissgs.core.progress import Progress, silent
 from kissgs.formats import ContainerName, named_container
 from kissgs.io.files import atomic_file, reason_of, refuse_existing
-from kissgs.settings import Settings
+from kissgs.settings import GROUPS, Settings
 
 if TYPE_CHECKING:
     import httpx
@@ -325,11 +325,7 @@ def _given(settings: Settings) -> dict[str, Any]:
     """Return the settings as JSON without what belongs to the preset, which the server's version decides."""
     values = settings.model_dump(mode="json", exclude_unset=True)
     if not settings.for_research:
-        for name, group in (
-            ("compact", settings.compact),
-            ("encode", settings.encode),
-            ("finetune", settings.finetune),
-        ):
+        for name, group in GROUPS.items():
             values[name] = {key: value for key, value in values.get(name, {}).items() if key in group.public()}
     return values
 

@@ -143,12 +143,9 @@ def page_files() -> dict[str, Path]:
         raise UnsupportedError(
             "Spark and three.js, which draw the scene, are not installed; add --fetch-viewer to download them once"
         )
-    paths = {path.relative_to(folder).as_posix(): path for path in _candidates(folder)}
+    found = [path for part in ("*", "preview/*", "vendor/**/*") for path in folder.glob(part) if path.is_file()]
+    paths = {path.relative_to(folder).as_posix(): path for path in found}
     return {PAGE: folder / PAGE, **{name: path for name, path in sorted(paths.items()) if _FILE.fullmatch(name)}}
-
-
-def _candidates(folder: Path) -> list[Path]:
-    return [path for part in ("*", "preview/*", "vendor/**/*") for path in folder.glob(part) if path.is_file()]
 
 
 def fetch_viewer() -> None:
@@ -156,11 +153,6 @@ def fetch_viewer() -> None:
     done = subprocess.run([sys.executable, ROOT / "scripts" / "vendor"], stdout=sys.stderr, check=False)
     if done.returncode:
         raise UnsupportedError("Spark and three.js could not be downloaded; the reason is above")
-
-
-def read_page(files: dict[str, Path]) -> str:
-    """Return the page as browsers see it, with ``\\n`` at the ends of lines."""
-    return files[PAGE].read_text(encoding="utf-8").replace("\r\n", "\n")
 
 
 def import_map(page: str) -> str:
@@ -196,23 +188,20 @@ def page_scene(
 ) -> PageScene:
     """Return a scene for the page: a SOG-XT or SOG container unchanged, any other as a ``.ply`` of equal values."""
     splats, cleaned, _ = open_scene(source, reading, threads, progress)
-    notes = (*splats.notes, *cleaned.notes)
-    container = _as_container(source, reading)
-    if container is not None:
-        return replace(container, notes=notes)
-    file = io.BytesIO()
-    write_ply(file, replace(splats, origin=WORLD), progress=progress)  # viewers draw a scene better near the origin
-    return PageScene(f"{_stem(source)}.ply", file.getvalue(), converted=recognise(source) != "ply", notes=notes)
+    found = _as_container(source, reading)
+    if found is None:
+        file = io.BytesIO()
+        write_ply(file, replace(splats, origin=WORLD), progress=progress)  # viewers draw a scene better near the origin
+        found = PageScene(f"{_stem(source)}.ply", file.getvalue(), converted=recognise(source) != "ply")
+    return replace(found, notes=(*splats.notes, *cleaned.notes))
 
 
 def page_container(
     source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, *, threads: int = 0, progress: Progress = silent
 ) -> PageScene:
     """Return a scene as a container: SOG-XT or SOG unchanged, any other compressed by the preset ``balanced``."""
-    container = _as_container(source, reading)
-    if container is not None:  # whoever gets the page cannot mend a damaged one
-        splats, cleaned, _ = open_scene(source, reading, threads, progress)
-        return replace(container, notes=(*splats.notes, *cleaned.notes))
+    if _as_container(source, reading) is not None:  # decoded, too: whoever gets the page cannot mend a damaged one
+        return page_scene(source, reading, threads=threads, progress=progress)
     result = compress(source, reading=reading, threads=threads, progress=progress)
     notes = tuple(filter(None, (result.report.note, *result.report.cleaned.notes)))
     return PageScene(f"{_stem(source)}.zip", result.to_zip(), converted=True, notes=notes)
@@ -272,7 +261,7 @@ _STANDALONE_POLICY = (
 def standalone_page(scene: PageScene) -> bytes:
     """Return the page with a container inside: UTF-8, equal bytes for equal input."""
     files = page_files()
-    page = read_page(files)
+    page = _text(files[PAGE])
     style, start = _text(files[_STYLE]), _text(files[_START])
     modules = _Modules(files, json.loads(import_map(page))["imports"])
     modules.add(_PROGRAM)
@@ -335,6 +324,7 @@ class _Modules:
 
 
 def _text(path: Path) -> str:
+    """Return a text as browsers see it, with ``\\n`` at the ends of lines."""
     return path.read_text(encoding="utf-8").replace("\r\n", "\n")
 
 
@@ -387,7 +377,7 @@ class PageServer(ThreadingHTTPServer):
 
     def __init__(self, scene: PageScene | StreamedFolder, port: int = 0) -> None:
         files = page_files()
-        page = read_page(files)
+        page = _text(files[PAGE])
         self.contents: dict[str, bytes | Path] = {f"/{name}": path for name, path in files.items()}
         self.contents |= {"/": page.encode(), f"/{PAGE}": page.encode()}
         address = f"scene/{scene.name}"

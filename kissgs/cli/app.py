@@ -6,7 +6,6 @@ import contextlib
 import errno
 import json
 import logging
-import os
 import sys
 from typing import Annotated, NoReturn
 
@@ -37,7 +36,6 @@ app = typer.Typer(
 
 def run() -> None:
     """Run the command line."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would otherwise spin and slow ours down
     if logging.lastResort is not None:  # prints the warnings of the library
         logging.lastResort.setFormatter(logging.Formatter("kissgs: %(message)s"))
     unwinding(_run)

@@ -22,20 +22,17 @@ from typing import TYPE_CHECKING, Annotated, TypeVar, cast
 
 import typer
 
-from kissgs.cli.files import print_json, progress_bar, say_notes, show
+from kissgs.cli.files import print_json, progress_bar, say_notes, show, write_output
 from kissgs.cli.options import (
+    CaptureOptions,
     ForceOption,
-    ImagesOption,
-    RenderDeviceOption,
-    ScaleOption,
     SceneOptions,
-    SplitOption,
     ViewsOption,
     choice,
     chosen,
     device_of,
     open_views,
-    reads_scenes,
+    with_option_groups,
 )
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 
@@ -112,7 +109,7 @@ def _measure_speed() -> None:
 # ``kissgs evaluate``: compare a scene with its original, and with photographs.
 
 
-@reads_scenes
+@with_option_groups
 def evaluate(
     reference: Annotated[
         Path, typer.Argument(metavar="REFERENCE", help="Original scene, of any format that kissgs reads.")
@@ -120,10 +117,11 @@ def evaluate(
     candidate: Annotated[
         Path, typer.Argument(metavar="CANDIDATE", help="Scene to evaluate, of any format that kissgs reads.")
     ],
-    views: ViewsOption = None,
-    scale: ScaleOption = None,
-    images: ImagesOption = None,
-    split: SplitOption = "test",
+    *,
+    capture: CaptureOptions,
+    split: Annotated[
+        str, typer.Option(help="Views of --views to use: test (held-out), train or all.", show_default=True)
+    ] = "test",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual cameras.")] = 0,
     distance: Annotated[
         float,
@@ -137,10 +135,8 @@ def evaluate(
         Path | None,
         typer.Option(metavar="FILE", help="Write an HTML report with renderings of both scenes and error maps."),
     ] = None,
-    device: RenderDeviceOption = "cpu",
     force: ForceOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON report.")] = False,
-    *,
     common: SceneOptions,
 ) -> None:
     """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""
@@ -152,38 +148,32 @@ def evaluate(
 
     quiet, threads = common.quiet or as_json, common.threads
     used_split = cast(Split, choice("--split", split, Split))
-    render_device = device_of(device)
+    device = device_of(capture.device)
     if html is not None:
         refuse_existing(html, overwrite=force)
-    capture = open_views(views, scale=scale, images=images)
+    views = capture.open()
     with progress_bar(quiet) as progress:
         sides = _sides_of((reference, candidate), common, progress)
         sides[1] = replace(sides[1], splats=with_origin(sides[1].splats, sides[0].splats.origin))
         scenes = sides[0].splats, sides[1].splats
         result = measure(
             *scenes,
-            capture,
+            views,
             split=used_split,
             seed=seed,
             distance=distance,
             flip=flip,
             lpips=lpips,
-            device=render_device,
+            device=device,
             threads=threads,
             progress=progress,
         )
         if html is not None:
-            page = html_report(result, sides[0], sides[1], device=render_device, threads=threads, progress=progress)
+            page = html_report(result, sides[0], sides[1], device=device, threads=threads, progress=progress)
             with atomic_file(html, overwrite=force) as file:
                 file.write(page.encode(errors="replace"))  # file names may be invalid UTF-8
-    for side in sides:
-        say_notes(side.name, side.splats.notes, common.quiet)
-    if scenes[0].antialiased != scenes[1].antialiased and not common.quiet:
-        marked, other = sides if scenes[0].antialiased else sides[::-1]
-        sys.stderr.write(
-            f"kissgs: {marked.name} is marked as trained with antialiasing, and {other.name} is not; each is drawn so "
-            "(for both: --antialiased or --classic)\n"
-        )
+    if not common.quiet:
+        _warn_of_differences(sides)
     sizes = {"reference": sides[0].bytes, "candidate": sides[1].bytes}
     if as_json:
         print_json({**result.as_dict(), "bytes": sizes})
@@ -211,6 +201,17 @@ def _sides_of(paths: Sequence[Path], common: SceneOptions, progress: Progress) -
     return sides
 
 
+def _warn_of_differences(sides: list[ReportScene]) -> None:
+    for side in sides:
+        say_notes(side.name, side.splats.notes, quiet=False)
+    if sides[0].splats.antialiased != sides[1].splats.antialiased:
+        marked, other = sides if sides[0].splats.antialiased else sides[::-1]
+        sys.stderr.write(
+            f"kissgs: {marked.name} is marked as trained with antialiasing, and {other.name} is not; each is drawn so "
+            "(for both: --antialiased or --classic)\n"
+        )
+
+
 # ``kissgs bench``: bytes, seconds and quality of a scene with each preset and in limited times.
 #
 # The studies behind the documentation's figures are in ``bench/`` of the source repository, and use :func:`measured`.
@@ -223,16 +224,12 @@ TIMES = ("5s", "30s", "2min")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measurement:
-    """A scene that was compressed, decompressed and evaluated.
+    """A scene that was compressed, decompressed and evaluated."""
 
-    ``report`` has the times from file to zip, ``decode_seconds`` and ``decode_cpu_seconds`` are from there to arrays,
-    and ``peak_memory`` is that of both, bytes; 0 where the system does not report it.
-    """
-
-    report: Report
-    decode_seconds: float
+    report: Report  # with the times from file to zip
+    decode_seconds: float  # from there to arrays
     decode_cpu_seconds: float
-    peak_memory: int
+    peak_memory: int  # of both, bytes; 0 where the system does not report it
     evaluation: Evaluation
 
 
@@ -390,8 +387,6 @@ def row_of(name: str, found: Measurement) -> Row:
 
 def _print_and_write(rows: Sequence[Row], output: Path | None, plot: Path | None, force: bool) -> None:
     """Print the table, write it and plot it; what cannot be printed is written nevertheless."""
-    from kissgs.io.files import atomic_file
-
     try:
         show(_table(rows))
     finally:
@@ -400,11 +395,9 @@ def _print_and_write(rows: Sequence[Row], output: Path | None, plot: Path | None
             writer = csv.DictWriter(text, list(asdict(rows[0])))
             writer.writeheader()
             writer.writerows(map(asdict, rows))
-            with atomic_file(output, overwrite=force) as file:
-                file.write(text.getvalue().encode())
+            write_output(output, text.getvalue().encode(), force=force)
         if plot is not None:
-            with atomic_file(plot, overwrite=force) as file:
-                file.write(_png(rows))
+            write_output(plot, _png(rows), force=force)
 
 
 def _table(rows: Sequence[Row]) -> Table:

@@ -3,53 +3,81 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kissgs.cli.files import for_each_input, progress_bar, say_notes, show, sibling, source, stdout
+from kissgs.cli.files import CHECKPOINT, for_each_input, progress_bar, say_notes, show, sibling, source, stdout
 from kissgs.cli.options import (
-    CHECKPOINT,
-    CheckpointOption,
-    CompactOption,
-    ContainerOption,
-    DeviceOption,
-    EvaluateOption,
-    FinetuneOption,
+    EncodingOptions,
     ForceOption,
-    ForceViewsOption,
     JsonOption,
-    MaxPsnrDropOption,
-    MaxSsimDropOption,
-    OriginOption,
     PresetOption,
-    PsnrOption,
-    RayOption,
-    ResearchOption,
     SceneOptions,
     ScenesArgument,
-    SeedOption,
-    SetOption,
-    TargetSizeOption,
-    TimeOption,
-    ViewsOption,
-    budget_of,
+    TrainingOptions,
     chosen,
     count_of,
     device_of,
     open_views,
-    reads_scenes,
-    refuse_without_training,
     share_of,
+    with_option_groups,
 )
 from kissgs.core.errors import UnsupportedError
+
+if TYPE_CHECKING:
+    from kissgs.settings import Settings
 
 # ``kissgs compact``: a ``.ply`` with fewer Gaussians.
 
 
-@reads_scenes
+@dataclass(frozen=True, kw_only=True)
+class CompactionOptions:
+    """Options of ``kissgs compact``: how many Gaussians to keep, and how."""
+
+    count: Annotated[
+        str | None,
+        typer.Option("--count", "-n", metavar="N", help="Number of Gaussians to keep, such as 200k or 1.5M."),
+    ] = None
+    ratio: Annotated[
+        str | None, typer.Option(metavar="SHARE", help="Share of the Gaussians to keep, such as 0.2 or 20%.")
+    ] = None
+    max_psnr_drop: Annotated[
+        float | None,
+        typer.Option(metavar="DB", help="Keep as few Gaussians as lose at most this PSNR. Takes several runs."),
+    ] = None
+    method: Annotated[
+        str | None,
+        typer.Option(
+            metavar="METHOD",
+            help="prune: remove what images miss least, and train the rest. merge: replace neighbours by one Gaussian; "
+            "takes seconds, needs neither views nor torch. Default: prune.",
+        ),
+    ] = None
+    preset: PresetOption = "balanced"
+    changes: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", hidden=True)] = None
+
+    def settings(self) -> Settings:
+        """Return the settings that these options stand for."""
+        values = {
+            "method": self.method,
+            "count": count_of(self.count),
+            "ratio": share_of(self.ratio),
+            "max_psnr_drop": self.max_psnr_drop,
+        }
+        given = {name: value for name, value in values.items() if value is not None}
+        settings = chosen(self.preset, self.changes, group="compact", compact=given)
+        if not settings.compact.enabled:
+            raise UnsupportedError(
+                "missing the number of Gaussians to keep: give -n 200k, --ratio 0.2 or --max-psnr-drop 0.2"
+            )
+        return settings
+
+
+@with_option_groups
 def compact(
     scenes: ScenesArgument,
     output: Annotated[
@@ -58,37 +86,14 @@ def compact(
             "--output", "-o", metavar="PATH", help="Output NAME.ply, a folder, or '-' for standard output. Required."
         ),
     ] = None,
-    count: Annotated[
-        str | None,
-        typer.Option("--count", "-n", metavar="N", help="Number of Gaussians to keep, such as 200k or 1.5M."),
-    ] = None,
-    ratio: Annotated[
-        str | None, typer.Option(metavar="SHARE", help="Share of the Gaussians to keep, such as 0.2 or 20%.")
-    ] = None,
-    max_psnr_drop: Annotated[
-        float | None,
-        typer.Option(metavar="DB", help="Keep as few Gaussians as lose at most this PSNR. Takes several runs."),
-    ] = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            metavar="METHOD",
-            help="prune: remove what images miss least, and train the rest. merge: replace neighbours by one Gaussian; "
-            "takes seconds, needs neither views nor torch. Default: prune.",
-        ),
-    ] = None,
-    views: ViewsOption = None,
-    force_views: ForceViewsOption = False,
-    preset: PresetOption = "balanced",
-    changes: ResearchOption = None,
+    *,
+    compaction: CompactionOptions,
     evaluate: Annotated[
         bool, typer.Option("--evaluate", help="Measure PSNR, SSIM, MS-SSIM and compressed size after every step.")
     ] = False,
-    checkpoint: CheckpointOption = False,
-    device: DeviceOption = "cpu",
     force: ForceOption = False,
     as_json: JsonOption = False,
-    *,
+    training: TrainingOptions,
     common: SceneOptions,
 ) -> None:
     """Reduce the number of Gaussians of scenes at nearly equal quality: score, prune and train (POPSpa), or merge.
@@ -100,22 +105,11 @@ def compact(
     from kissgs.pipeline.pipeline import compact as run
     from kissgs.training.checkpoint import delete_checkpoints
 
-    budget = {
-        "method": method,
-        "count": None if count is None else count_of(count),
-        "ratio": None if ratio is None else share_of(ratio),
-        "max_psnr_drop": max_psnr_drop,
-    }
-    given = {name: value for name, value in budget.items() if value is not None}
-    settings, quiet = chosen(preset, changes, group="compact", budget=given), common.quiet or as_json
-    if not settings.compact.enabled:
-        raise UnsupportedError(
-            "missing the number of Gaussians to keep: give -n 200k, --ratio 0.2 or --max-psnr-drop 0.2"
-        )
-    refuse_without_training(settings, checkpoint=checkpoint, device=device)
+    settings, quiet = compaction.settings(), common.quiet or as_json
+    training.refuse_without_training(settings)
     if output is None:
         raise UnsupportedError("missing -o: by default the output would overwrite the input")
-    capture, training_device = open_views(views), device_of(device)
+    capture, training_device = open_views(training.views), device_of(training.device)
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
@@ -127,8 +121,8 @@ def compact(
                 reading=common.reading(),
                 evaluate=evaluate,
                 views=capture,
-                force_views=force_views,
-                checkpoint=sibling(scene, CHECKPOINT) if checkpoint else None,
+                force_views=training.force_views,
+                checkpoint=sibling(scene, CHECKPOINT) if training.checkpoint else None,
                 overwrite=force,
                 threads=common.threads,
                 device=training_device,
@@ -151,7 +145,7 @@ def compact(
 # ``kissgs compress``: compress scenes into containers.
 
 
-@reads_scenes
+@with_option_groups
 def compress(
     scenes: ScenesArgument,
     output: Annotated[
@@ -164,84 +158,76 @@ def compress(
             "'-' for standard output. Default: next to the scene.",
         ),
     ] = None,
-    container: ContainerOption = None,
-    preset: PresetOption = "balanced",
-    changes: SetOption = None,
-    psnr: PsnrOption = None,
-    target_size: TargetSizeOption = None,
-    max_psnr_drop: MaxPsnrDropOption = None,
-    max_ssim_drop: MaxSsimDropOption = None,
-    time: TimeOption = None,
-    compact: CompactOption = None,
-    finetune: FinetuneOption = None,
-    seed: SeedOption = None,
+    *,
+    encoding: EncodingOptions,
+    time: Annotated[
+        str | None,
+        typer.Option(
+            "--time",
+            metavar="TIME",
+            help="Time for each scene, such as 30s, 2min or 1h: the best that is found in it. With a goal, which comes "
+            "first, it bounds the search. --evaluate takes longer.",
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of all random choices; same seed, same result. Default: 0.")
+    ] = None,
     unpacked: Annotated[bool, typer.Option("--unpacked", help="Write a folder instead of a zip.")] = False,
-    evaluate: EvaluateOption = False,
-    views: ViewsOption = None,
-    force_views: ForceViewsOption = False,
+    training: TrainingOptions,
     cache: Annotated[
         bool, typer.Option("--cache", help="Cache the sensitivity next to the scene as NAME.sensitivity.npz.")
     ] = False,
-    checkpoint: CheckpointOption = False,
-    origin: OriginOption = None,
-    device: DeviceOption = "cpu",
-    ray: RayOption = None,
-    force: ForceOption = False,
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            "--ray",
+            metavar="[HOST:PORT]",
+            help="Compress the scenes on the nodes of a Ray cluster: all machines must see scenes, outputs and --views "
+            "at the same paths, on shared storage. Default address: RAY_ADDRESS, a cluster on this machine, or a new "
+            "one that uses its processors. Needs the extra ray; docs/guide/many-machines.md.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
-    *,
     common: SceneOptions,
 ) -> None:
     """Compress each scene into a SOG-XT container, into SOG, or into a folder with levels of detail."""
-    from kissgs.cli.options import CompressOptions
+    from kissgs.cli import compress_scenes
     from kissgs.formats import ending_of, named_container, named_manifest
     from kissgs.pipeline.training_choice import decided
 
-    named = None if output is None else Path(output)
-    manifest = None if named is None else named_manifest(named)
-    kind = named_container(container, None if manifest or output == "-" else output)
-    settings = chosen(
-        preset,
-        changes,
-        budget=None if compact is None else budget_of(compact),
-        finetune=finetune,
-        seed=seed,
-        time=time,
-        psnr=psnr,
-        target_size=target_size,
-        max_psnr_drop=max_psnr_drop,
-        max_ssim_drop=max_ssim_drop,
+    manifest = None if output is None else named_manifest(Path(output))
+    kind = named_container(encoding.container, None if manifest or output == "-" else output)
+    settings = encoding.settings(time=time, seed=seed)
+    renders = (
+        encoding.evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
     )
-    renders = evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
-    capture, training_device = open_views(views), device_of(device)
-    refuse_without_training(decided(settings, capture), checkpoint=checkpoint, device=device)
-    if views is not None and not renders and not common.quiet:
-        sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
-    options = CompressOptions(
+    capture, device = open_views(training.views), device_of(training.device)
+    training.refuse_without_training(decided(settings, capture))
+    if capture is not None and not renders and not common.quiet:
+        sys.stderr.write(
+            f"kissgs: --views has no effect: the preset {encoding.preset} renders no images; add --evaluate\n"
+        )
+    each = compress_scenes.SceneCompression(
         settings=settings,
-        reading=common.reading(origin),
+        reading=common.reading(encoding.origin),
         container=kind,
         cache=cache,
-        evaluate=evaluate,
-        views=views,
-        force_views=force_views,
-        checkpoint=checkpoint,
-        force=force,
+        evaluate=encoding.evaluate,
+        views=None if training.views is None else training.views.absolute(),
+        force_views=training.force_views,
+        checkpoint=training.checkpoint,
+        force=encoding.force,
         threads=common.threads,
-        device=training_device,
+        device=device,
         quiet=common.quiet or as_json,
     )
     ending = "" if unpacked else ending_of(kind)
     if manifest is not None:
-        from kissgs.cli.compress_scenes import compress_streamed, refuse_options
-
-        refuse_options(manifest, options, container=container, unpacked=unpacked)
-        for_each_input(scenes, manifest, ".json", as_json, partial(compress_streamed, options, ray))
+        compress_scenes.refuse_options(manifest, each, container=encoding.container, unpacked=unpacked)
+        work = partial(compress_scenes.compress_streamed, each, ray)
+        for_each_input(scenes, manifest, ".json", as_json, work)
     elif ray is not None:
-        from kissgs.cli.compress_scenes import ClusterCompression
-
-        cluster = ClusterCompression(ray, options)
+        cluster = compress_scenes.ClusterCompression(ray, each)
         for_each_input(scenes, output, ending, as_json, cluster.result, during=cluster.submitted)
     else:
-        from kissgs.cli.compress_scenes import compress_here
-
-        for_each_input(scenes, output, ending, as_json, partial(compress_here, options, capture))
+        for_each_input(scenes, output, ending, as_json, partial(compress_scenes.compress_here, each, capture))

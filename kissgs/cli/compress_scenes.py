@@ -14,54 +14,81 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from kissgs.cli.files import output, progress_bar, say_notes, show, sibling, source, write_stdout
+from pydantic import BaseModel, ConfigDict
+from rich.console import Console
+from rich.text import Text
+
+from kissgs.cli.files import CHECKPOINT, output, progress_bar, say_notes, show, sibling, source, write_stdout
 from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
-from kissgs.cli.options import CHECKPOINT
+from kissgs.cli.options import open_views
 from kissgs.cli.signals import stoppable
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import Progress, load_kernels, silent
+from kissgs.formats import ContainerName
 from kissgs.io.files import move_into_place, open_scene_file, reason_of
-from kissgs.pipeline.pipeline import compress
+from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline.pipeline import Compressed, compress
 from kissgs.pipeline.training_choice import decided
 from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of
+from kissgs.settings import Settings
 from kissgs.sogxt.container import check_destination
 from kissgs.training.checkpoint import delete_checkpoints
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
-    from kissgs.cli.options import CompressOptions
 
 
-# ``compress_here``: ``kissgs compress`` of one scene, in this process.
+class SceneCompression(BaseModel):
+    """How one ``kissgs compress`` compresses each scene: its options, checked; other machines get them as JSON."""
+
+    model_config = ConfigDict(frozen=True)
+
+    settings: Settings
+    reading: ReadOptions
+    container: ContainerName
+    cache: bool
+    evaluate: bool
+    views: Path | None
+    force_views: bool
+    checkpoint: bool
+    force: bool
+    threads: int
+    device: Literal["cpu", "cuda"]
+    quiet: bool
+
+    def run(self, scene: str, target: Path | None, capture: Views | None, progress: Progress) -> Compressed:
+        """Compress a scene; ``capture`` are the ``views``, loaded."""
+        if self.evaluate:  # reported here, because evaluation reports only one stage
+            load_kernels(progress)
+        return compress(
+            source(scene),
+            target,
+            settings=self.settings,
+            reading=self.reading,
+            container=self.container,
+            cache=sibling(scene, ".sensitivity.npz") if self.cache else None,
+            evaluate=self.evaluate,
+            views=capture,
+            force_views=self.force_views,
+            checkpoint=sibling(scene, CHECKPOINT) if self.checkpoint else None,
+            overwrite=self.force,
+            threads=self.threads,
+            device=self.device,
+            progress=progress,
+        )
 
 
-def compress_here(options: CompressOptions, capture: Views | None, scene: str, target: Path) -> dict[str, Any]:
-    """Compress a scene, show a table of the result and return its report; ``capture`` are the ``options.views``."""
+# ``kissgs compress`` of one scene, in this process.
+
+
+def compress_here(options: SceneCompression, capture: Views | None, scene: str, target: Path) -> dict[str, Any]:
+    """Compress a scene, show a table of the result and return its report."""
     piped = str(target) == "-"
     searches = decided(options.settings, capture).searches
     with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:
-        if options.evaluate:  # reported here, because evaluation reports only one stage
-            from kissgs.core.progress import load_kernels
-
-            load_kernels(progress)
-        result = compress(
-            source(scene),
-            None if piped else target,
-            settings=options.settings,
-            reading=options.reading,
-            container=options.container,
-            cache=sibling(scene, ".sensitivity.npz") if options.cache else None,
-            evaluate=options.evaluate,
-            views=capture,
-            force_views=options.force_views,
-            checkpoint=sibling(scene, CHECKPOINT) if options.checkpoint else None,
-            overwrite=options.force,
-            threads=options.threads,
-            device=options.device,
-            progress=progress,
-        )
+        result = options.run(scene, None if piped else target, capture, progress)
     if piped:
         say_notes(scene, (result.report.note, *result.report.cleaned.notes), options.quiet)
         write_stdout(result.to_zip())
@@ -73,10 +100,10 @@ def compress_here(options: CompressOptions, capture: Views | None, scene: str, t
     return result.report.as_dict()
 
 
-# ``compress_streamed``: ``kissgs compress -o FOLDER/lod-meta.json`` of one scene, into levels of detail.
+# ``kissgs compress -o FOLDER/lod-meta.json`` of one scene, into levels of detail.
 
 
-def refuse_options(manifest: Path, options: CompressOptions, *, container: str | None, unpacked: bool) -> None:
+def refuse_options(manifest: Path, options: SceneCompression, *, container: str | None, unpacked: bool) -> None:
     """Raise UnsupportedError for options that levels of detail do not have."""
     unused = {
         "--views": options.views,
@@ -89,24 +116,29 @@ def refuse_options(manifest: Path, options: CompressOptions, *, container: str |
         raise UnsupportedError(f"levels of detail ({manifest.name}) are made without {wrong}")
 
 
-def compress_streamed(options: CompressOptions, ray: str | None, scene: str, target: Path) -> dict[str, Any]:
+def compress_streamed(options: SceneCompression, ray: str | None, scene: str, target: Path) -> dict[str, Any]:
     """Compress a scene into a streamed scene, show a table and return its report; ``ray`` is an address or None."""
     if scene == "-":
         raise UnsupportedError("levels of detail need a file: it is read more than once")
-    with _stages(options.quiet) as progress, contextlib.ExitStack() as ending:
+    with progress_bar(options.quiet) as bar, contextlib.ExitStack() as ending:
         from kissgs.streaming.layout import continuation, work_folder
 
         work = work_folder(target)
-        say_when_interrupted(continuation(work))  # a second signal may stop the removal of what was made
-        ending.callback(_say_what_is_left, work)
-        progress("kernels", 0.0)
+        say_when_interrupted(lambda: continuation(work) if work.exists() else NOTHING_LEFT)
+        bar("kernels", 0.0)
         from kissgs.streaming.compress import compress_streamed as run
 
         runner = None
         if ray is not None:
-            progress("cluster", 0.0)
+            bar("cluster", 0.0)
             runner = RayRunner(ray)
             ending.callback(runner.close)
+
+        def progress(stage: str, fraction: float, note: str = "") -> None:
+            if stage == "scratch" and not options.quiet:
+                sys.stderr.write(f"kissgs: {note}\n")
+            bar(stage, fraction, note)
+
         report = run(
             scene,
             target,
@@ -124,41 +156,11 @@ def compress_streamed(options: CompressOptions, ray: str | None, scene: str, tar
     return asdict(report)
 
 
-@contextlib.contextmanager
-def _stages(quiet: bool) -> Iterator[Progress]:
-    """Yield a receiver of progress that announces the scratch folder, and says when an interruption leaves it."""
-    with progress_bar(quiet) as bar:
-
-        def receive(stage: str, fraction: float, note: str = "") -> None:
-            if stage == "scratch" and not quiet:
-                sys.stderr.write(f"kissgs: {note}\n")
-            if stage in ("merge", "cameras", "images"):  # what is interrupted earlier begins anew
-                say_when_interrupted("the same command goes on where it was")
-            bar(stage, fraction, note)
-
-        yield receive
-
-
-def _say_what_is_left(work: Path) -> None:
-    """Let the message of an interruption say whether something is left, and what the same command does with it."""
-    from kissgs.streaming.layout import continuation
-
-    say_when_interrupted(continuation(work) if work.exists() else NOTHING_LEFT)
-
-
 # ``compress_scene``: compression of one scene as a work item, for ``kissgs compress --ray``.
 
 
 def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
-    """Compress a scene into a new folder within the work folder, from where whoever submitted it moves the result.
-
-    Returns:
-        "written", the path of the output; "report" for JSON; "table", the report as text for the terminal.
-    """
-    from kissgs.cli.options import open_views
-    from kissgs.io.scene_format import ReadOptions
-    from kissgs.settings import Settings
-
+    """Compress a scene into a new folder within the work folder, from where whoever submitted it moves the result."""
     scene, work = Path(arguments["scene"]), Path(arguments["work"])
     _check_shared(scene, arguments["bytes"], work)
     try:
@@ -169,30 +171,14 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
             "same user as this command, on storage with room"
         ) from error
     written = Path(attempt) / Path(arguments["target"]).name
-    if arguments["evaluate"]:  # reported here, because evaluation reports only one stage
-        from kissgs.core.progress import load_kernels
+    options = SceneCompression.model_validate(arguments["options"])
+    report = options.run(str(scene), written, open_views(options.views), progress).report
+    from kissgs.cli.tables import report_table  # once the kernels are loaded
 
-        load_kernels(progress)
-    result = compress(
-        scene,
-        written,
-        settings=Settings.model_validate(arguments["settings"]),
-        reading=ReadOptions(**arguments["reading"]),
-        container=arguments["container"],
-        cache=arguments["cache"],
-        evaluate=arguments["evaluate"],
-        views=open_views(None if arguments["views"] is None else Path(arguments["views"])),
-        force_views=arguments["force_views"],
-        checkpoint=arguments["checkpoint"],
-        threads=arguments["threads"],
-        device=arguments["device"],
-        progress=progress,
-    )
-    return {
-        "written": str(written),
-        "report": result.report.as_dict(),
-        "table": _table(result.report, arguments),
-    }
+    table = io.StringIO()
+    terminal = {"width": arguments["width"], "force_terminal": arguments["color"]}
+    Console(file=table, highlight=False, markup=False, **terminal).print(report_table(report, arguments["target"]))
+    return {"written": str(written), "report": report.as_dict(), "table": table.getvalue()}
 
 
 def _check_shared(scene: Path, size: int, work: Path) -> None:
@@ -208,19 +194,6 @@ def _check_shared(scene: Path, size: int, work: Path) -> None:
     raise UnsupportedError(
         f"the machine {socket.gethostname()} {problem}; --ray needs storage that all machines see at the same path"
     )
-
-
-def _table(report: Any, arguments: dict[str, Any]) -> str:  # noqa: ANN401  kissgs.Report, imported later
-    from rich.console import Console
-
-    from kissgs.cli.tables import report_table
-
-    text = io.StringIO()
-    console = Console(
-        file=text, width=arguments["width"], force_terminal=arguments["color"], highlight=False, markup=False
-    )
-    console.print(report_table(report, arguments["target"]))
-    return text.getvalue()
 
 
 # ``ClusterCompression``: ``kissgs compress --ray``, scenes as work items on the nodes of a Ray cluster.
@@ -243,7 +216,7 @@ class ClusterCompression:
     """
 
     address: str
-    options: CompressOptions
+    options: SceneCompression
     _handles: dict[Path, RunHandle | KissgsError] = field(default_factory=dict)
     _work: dict[Path, Path] = field(default_factory=dict)
     _bar: Progress = silent
@@ -284,8 +257,6 @@ class ClusterCompression:
         check_destination(target, overwrite=self.options.force)
         move_into_place(Path(outcome.result["written"]), target)
         if not self.options.quiet:
-            from rich.text import Text
-
             show(Text.from_ansi(outcome.result["table"].removesuffix("\n")))
         report: dict[str, Any] = outcome.result["report"]
         return report
@@ -309,23 +280,14 @@ class ClusterCompression:
                 pass
         work = self._work[target] = _new_work(target)
         size = scene.stat().st_size if scene.is_file() else 0
-        resources = self._with_memory(runner, requested, self._memory(scene, size))
+        resources = with_memory(runner, requested, self._memory(scene, size))
         console = output()
         arguments = {
             "scene": str(scene),
             "bytes": size,
             "work": str(work.absolute()),
             "target": str(target),
-            "settings": options.settings.model_dump(mode="json"),
-            "reading": asdict(options.reading),
-            "container": options.container,
-            "cache": str(sibling(name, ".sensitivity.npz")) if options.cache else None,
-            "evaluate": options.evaluate,
-            "views": None if options.views is None else str(options.views.absolute()),
-            "force_views": options.force_views,
-            "checkpoint": str(sibling(name, CHECKPOINT)) if options.checkpoint else None,
-            "threads": int(requested.cpus),
-            "device": options.device,
+            "options": options.model_copy(update={"threads": int(requested.cpus)}).model_dump(mode="json"),
             "width": console.width,
             "color": console.is_terminal,
         }
@@ -338,14 +300,6 @@ class ClusterCompression:
             self._bar("scenes", ended / max(len(self._handles), 1), details)
 
         return runner.submit(WorkItem("kissgs.cli.compress_scenes:compress_scene", arguments, resources), progress)
-
-    def _with_memory(self, runner: Runner, requested: Resources, memory: int) -> Resources:
-        """Return a request with memory, at most that of the largest node that has the rest of it."""
-        nodes = [node.memory for node in runner.nodes if requested.fits(node)]
-        resources = Resources(requested.cpus, min(memory, max(nodes, default=0)), requested.gpus)
-        if refusal := runner.refusal(resources):
-            raise UnsupportedError(refusal)
-        return resources
 
     def _memory(self, scene: Path, size: int) -> int:
         """Return an estimate of the memory that a scene needs, bytes."""
@@ -371,3 +325,12 @@ def _new_work(target: Path) -> Path:
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(mode=0o700)
     return work
+
+
+def with_memory(runner: Runner, requested: Resources, memory: int) -> Resources:
+    """Return a request with memory, at most that of the largest node that has the rest of it."""
+    nodes = [node.memory for node in runner.nodes if requested.fits(node)]
+    resources = Resources(requested.cpus, min(memory, max(nodes, default=0)), requested.gpus)
+    if refusal := runner.refusal(resources):
+        raise UnsupportedError(refusal)
+    return resources

@@ -16,7 +16,7 @@ from kissgs.cli.options import (
     OriginOption,
     SceneOptions,
     ScenesArgument,
-    reads_scenes,
+    with_option_groups,
 )
 from kissgs.core.errors import InvalidContainerError, InvalidSceneError, OutputError
 from kissgs.formats import ENDINGS, OUTPUT_FORMATS, SCENE_ENDINGS, WRITTEN, alternatives, output_format
@@ -24,7 +24,7 @@ from kissgs.formats import ENDINGS, OUTPUT_FORMATS, SCENE_ENDINGS, WRITTEN, alte
 # ``kissgs info``: describe the contents of scene files.
 
 
-@reads_scenes
+@with_option_groups
 def info(
     files: FilesArgument,
     as_json: JsonOption = False,
@@ -47,7 +47,7 @@ def info(
 # ``kissgs decompress``: decode containers and scenes of other formats into ``.ply`` files.
 
 
-@reads_scenes
+@with_option_groups
 def decompress(
     containers: ScenesArgument,
     output: Annotated[
@@ -103,7 +103,7 @@ def decompress(
 # ``kissgs convert``: write scenes of any format in a plain one.
 
 
-@reads_scenes
+@with_option_groups
 def convert(
     files: Annotated[
         list[str],

@@ -232,6 +232,10 @@ def source(name: str) -> Path | bytes:
     return sys.stdin.buffer.read()
 
 
+CHECKPOINT = ".checkpoint.npz"
+"""Ending of checkpoints beside scenes."""
+
+
 def sibling(name: str, suffix: str) -> Path:
     """Return the path next to an input with another ending."""
     if name == "-":
@@ -303,6 +307,17 @@ def write_stdout(data: bytes) -> None:
     """Write bytes to standard output."""
     with stdout():
         sys.stdout.buffer.write(data)
+
+
+def write_output(target: Path, data: bytes, *, force: bool) -> None:
+    """Write a file atomically, or to standard output for "-"."""
+    if str(target) == "-":
+        write_stdout(data)
+        return
+    from kissgs.io.files import atomic_file
+
+    with atomic_file(target, overwrite=force) as file:
+        file.write(data)
 
 
 def say_notes(name: str, notes: Sequence[str], quiet: bool) -> None:

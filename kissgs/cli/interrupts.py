@@ -7,6 +7,7 @@ import signal
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import FrameType
     from typing import NoReturn
 
@@ -17,14 +18,14 @@ class Interrupted(BaseException):
 
 def exit_on_signal() -> None:
     """Exit at once on SIGINT and SIGTERM: for the time before and after the work, when no file is being written."""
-    signal.signal(signal.SIGINT, _exit)
-    signal.signal(signal.SIGTERM, _exit)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: exit_by_signal(number))
 
 
 def unwind_on_signal() -> None:
     """Raise :class:`Interrupted` on SIGINT and SIGTERM."""
-    signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGTERM, _interrupt)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
 
 
 def signal_behind(error: BaseException | None) -> int | None:
@@ -38,24 +39,21 @@ def signal_behind(error: BaseException | None) -> int | None:
 
 NOTHING_LEFT = "no partial file is left"
 
-_left = [NOTHING_LEFT]
+_says_what_is_left: list[Callable[[], str]] = [lambda: NOTHING_LEFT]
 
 
-def say_when_interrupted(left: str) -> None:
+def say_when_interrupted(left: Callable[[], str]) -> None:
     """Set what the message of an interruption says about files."""
-    _left[:] = [left]
+    _says_what_is_left[0] = left
 
 
 def exit_by_signal(number: int) -> NoReturn:
     """Print a message and exit, without waiting for threads inside libwebp, which cannot be stopped."""
     try:
-        os.write(2, f"kissgs: interrupted; {_left[0]}\n".encode())  # sys.stderr may hold an incomplete line
+        left = _says_what_is_left[0]()
+        os.write(2, f"kissgs: interrupted; {left}\n".encode())  # sys.stderr may hold an incomplete line
     finally:
         os._exit(128 + number)
-
-
-def _exit(number: int, frame: FrameType | None) -> NoReturn:
-    exit_by_signal(number)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share, as typer types."""
+"""Options that several commands share, in groups, and the conversion of their values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import inspect
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args, get_type_hints
 
@@ -19,14 +19,71 @@ from kissgs.formats import ENDINGS, SCENE_ENDINGS
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
-    from kissgs.formats import ContainerName
     from kissgs.io.scene_format import ReadOptions
     from kissgs.settings import Settings
+
+# Single arguments and options.
+
+ScenesArgument = Annotated[
+    list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
+]
+FilesArgument = Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns.")]
+PresetOption = Annotated[
+    str, typer.Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced, small or paper.")
+]
+ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print a JSON report: an object for one file, a list for several.")
+]
+OriginOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="auto",
+        help="auto: make positions relative to the middle of the scene, where they have fine steps, and record it: for "
+        "scenes far from the origin. Default: as in the file.",
+    ),
+]
+ViewsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--views",
+        metavar="DATA",
+        help="Capture to work and evaluate with, cameras and optionally photographs: a folder with a COLMAP model or a "
+        "transforms.json. Default: virtual cameras.",
+    ),
+]
+
+
+# Groups of options: dataclasses, whose fields become options of the commands that take one as an argument.
+
+
+def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of each dataclass among its parameters, in the place of that parameter."""
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    options = dict[str, inspect.Parameter]()
+    for name, parameter in inspect.signature(command).parameters.items():
+        if name in groups:
+            hints |= get_type_hints(groups[name], include_extras=True)
+            options |= inspect.signature(groups[name]).parameters
+        else:
+            options[name] = parameter.replace(kind=parameter.KEYWORD_ONLY)
+
+    @functools.wraps(command)
+    def with_options(**given: Any) -> None:  # noqa: ANN401
+        for name, group in groups.items():
+            given[name] = group(**{field: given.pop(field) for field in inspect.signature(group).parameters})
+        command(**given)
+
+    annotated = [option.replace(annotation=hints[name]) for name, option in options.items()]
+    with_options.__annotations__ = {name: hints[name] for name in options}
+    vars(with_options)["__signature__"] = inspect.Signature(annotated)
+    return with_options
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
-    """Options of every command that reads scenes: :func:`reads_scenes` adds them, ``kissgs --help`` explains them."""
+    """Options of every command that reads scenes; ``kissgs --help`` explains them."""
 
     level: Annotated[int | None, typer.Option(min=0, hidden=True)] = None
     max_gaussians: Annotated[int | None, typer.Option(min=0, hidden=True)] = None
@@ -46,22 +103,6 @@ class SceneOptions:
             origin=origin_of(origin),
             antialiased=self.antialiased,
         )
-
-
-def reads_scenes(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of :class:`SceneOptions`, which it takes as its argument ``common``."""
-    shared = inspect.signature(SceneOptions).parameters
-    hints = get_type_hints(command, include_extras=True) | get_type_hints(SceneOptions, include_extras=True)
-
-    @functools.wraps(command)
-    def with_options(**given: Any) -> None:  # noqa: ANN401
-        command(common=SceneOptions(**{name: given.pop(name) for name in shared}), **given)
-
-    own = {name: found for name, found in inspect.signature(command).parameters.items() if name != "common"}
-    parameters = [found.replace(annotation=hints[name]) for name, found in {**own, **shared}.items()]
-    with_options.__annotations__ = {name: hints[name] for name in (*own, *shared)}
-    vars(with_options)["__signature__"] = inspect.Signature(parameters)
-    return with_options
 
 
 SCENE_OPTIONS = """Every command that reads scenes also takes:
@@ -86,155 +127,137 @@ SEE_SCENE_OPTIONS = (
     "Also: --level, --max-gaussians, --raw-axes, --antialiased/--classic, --threads, --quiet; see 'kissgs --help'."
 )
 
-ScenesArgument = Annotated[
-    list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
-]
-FilesArgument = Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns.")]
-ContainerOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME",
-        help="Container: sogxt, or sog for other viewers. Default: sog if --output ends in .sog, else sogxt.",
-    ),
-]
-PresetOption = Annotated[
-    str, typer.Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced, small or paper.")
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set", metavar="NAME=VALUE", help="Change another setting; repeatable. List: docs/reference/settings.md."
-    ),
-]
-ResearchOption = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", hidden=True)]
-SeedOption = Annotated[int | None, typer.Option(help="Seed of all random choices; same seed, same result. Default: 0.")]
-ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print a JSON report: an object for one file, a list for several.")
-]
-OriginOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="auto",
-        help="auto: make positions relative to the middle of the scene, where they have fine steps, and record it: for "
-        "scenes far from the origin. Default: as in the file.",
-    ),
-]
-ViewsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--views",
-        metavar="DATA",
-        help="Capture to work and evaluate with, cameras and optionally photographs: a folder with a COLMAP model or a "
-        "transforms.json. Default: virtual cameras.",
-    ),
-]
-ForceViewsOption = Annotated[
-    bool, typer.Option("--force-views", help="Accept --views whose photographs do not show the scene.")
-]
-ScaleOption = Annotated[
-    int | None,
-    typer.Option(min=1, help="Downscaling factor of the photographs of --views: 4 reads the folder images_4."),
-]
-ImagesOption = Annotated[
-    Path | None, typer.Option(help="Folder of the photographs of --views, if it is not the capture's own.")
-]
-SplitOption = Annotated[
-    str, typer.Option(help="Views of --views to use: test (held-out), train or all.", show_default=True)
-]
-RenderDeviceOption = Annotated[str, typer.Option(help="Device of the rasteriser: cpu or cuda.")]
-PsnrOption = Annotated[
-    float | None,
-    typer.Option(metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."),
-]
-TargetSizeOption = Annotated[
-    str | None,
-    typer.Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB."),
-]
-MaxPsnrDropOption = Annotated[
-    float | None,
-    typer.Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
-]
-MaxSsimDropOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="SSIM",
-        help="Find the smallest container that loses at most this SSIM, such as 0.003.",
-    ),
-]
-TimeOption = Annotated[
-    str | None,
-    typer.Option(
-        "--time",
-        metavar="TIME",
-        help="Time for each scene, such as 30s, 2min or 1h: the best that is found in it. With a goal, which comes "
-        "first, it bounds the search. --evaluate takes longer.",
-    ),
-]
-CompactOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="BUDGET",
-        help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
-        "PSNR drop (0.2dB); 100% keeps all; auto searches the number that serves a goal best, which is the default "
-        "with held-out photographs, and without --views where it is fine-tuned.",
-    ),
-]
-FinetuneOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="[STEPS]",
-        help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
-        "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset; 0: never. "
-        "Default with a goal, if photographs are held out or there is no --views.",
-    ),
-]
-EvaluateOption = Annotated[
-    bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
-]
-CHECKPOINT = ".checkpoint.npz"
-"""Ending of checkpoints beside their outputs."""
 
-CheckpointOption = Annotated[
-    bool, typer.Option("--checkpoint", help="Save the state of training next to the scene, and resume from it.")
-]
-DeviceOption = Annotated[
-    str, typer.Option(help="Device of training: cpu (reproducible) or cuda (results vary slightly).")
-]
-RayOption = Annotated[
-    str | None,
-    typer.Option(
-        "--ray",
-        metavar="[HOST:PORT]",
-        help="Compress the scenes on the nodes of a Ray cluster: all machines must see scenes, outputs and --views at "
-        "the same paths, on shared storage. Default address: RAY_ADDRESS, a cluster on this machine, or a new one that "
-        "uses its processors. Needs the extra ray; docs/guide/many-machines.md.",
-    ),
-]
+@dataclass(frozen=True, kw_only=True)
+class EncodingOptions:
+    """Options of ``kissgs compress`` and ``kissgs remote compress``."""
 
+    container: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Container: sogxt, or sog for other viewers. Default: sog if --output ends in .sog, else sogxt.",
+        ),
+    ] = None
+    preset: PresetOption = "balanced"
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="Change another setting; repeatable. List: docs/reference/settings.md."
+        ),
+    ] = None
+    psnr: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."
+        ),
+    ] = None
+    target_size: Annotated[
+        str | None,
+        typer.Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB."),
+    ] = None
+    max_psnr_drop: Annotated[
+        float | None,
+        typer.Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
+    ] = None
+    max_ssim_drop: Annotated[
+        float | None,
+        typer.Option(metavar="SSIM", help="Find the smallest container that loses at most this SSIM, such as 0.003."),
+    ] = None
+    compact: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BUDGET",
+            help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
+            "PSNR drop (0.2dB); 100% keeps all; auto searches the number that serves a goal best, which is the default "
+            "with held-out photographs, and without --views where it is fine-tuned.",
+        ),
+    ] = None
+    finetune: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[STEPS]",
+            help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
+            "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset; 0: never. "
+            "Default with a goal, if photographs are held out or there is no --views.",
+        ),
+    ] = None
+    evaluate: Annotated[
+        bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
+    ] = False
+    origin: OriginOption = None
+    force: ForceOption = False
 
-# ``CompressOptions``: options of ``kissgs compress``, read and checked.
+    def settings(self, *, time: str | None = None, seed: int | None = None) -> Settings:
+        """Return the settings that these options stand for."""
+        return chosen(
+            self.preset,
+            self.changes,
+            compact=budget_of(self.compact),
+            finetune=steps_of(self.finetune),
+            time=time,
+            seed=seed,
+            psnr=self.psnr,
+            target_size=self.target_size,
+            max_psnr_drop=self.max_psnr_drop,
+            max_ssim_drop=self.max_ssim_drop,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompressOptions:
-    """Options that apply to each scene of one ``kissgs compress``, checked."""
+class TrainingOptions:
+    """Options of the commands that train."""
 
-    settings: Settings
-    reading: ReadOptions
-    container: ContainerName
-    cache: bool
-    evaluate: bool
-    views: Path | None
-    force_views: bool
-    checkpoint: bool
-    force: bool
-    threads: int
-    device: Literal["cpu", "cuda"]
-    quiet: bool
+    views: ViewsOption = None
+    force_views: Annotated[
+        bool, typer.Option("--force-views", help="Accept --views whose photographs do not show the scene.")
+    ] = False
+    checkpoint: Annotated[
+        bool, typer.Option("--checkpoint", help="Save the state of training next to the scene, and resume from it.")
+    ] = False
+    device: Annotated[
+        str, typer.Option(help="Device of training: cpu (reproducible) or cuda (results vary slightly).")
+    ] = "cpu"
+
+    def refuse_without_training(self, settings: Settings) -> None:
+        """Raise UnsupportedError if ``--checkpoint`` or ``--device`` is given where nothing could train."""
+        trains = settings.finetune.enabled or (settings.compact.enabled and settings.compact.trains) or settings.aims
+        if trains or not (self.checkpoint or self.device != "cpu"):
+            return
+        remedy = "leave them out, these settings take no training steps"
+        if not settings.compact.enabled:
+            remedy = "add --compact or --finetune"
+        elif settings.compact.method == "merge":
+            remedy = "leave them out, the method merge does not train"
+        raise UnsupportedError(f"--checkpoint and --device only apply to training: {remedy}")
 
 
-# Conversion of command line options to settings, captures and devices.
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """Options of the commands that render and can compare with photographs."""
+
+    views: ViewsOption = None
+    scale: Annotated[
+        int | None,
+        typer.Option(min=1, help="Downscaling factor of the photographs of --views: 4 reads the folder images_4."),
+    ] = None
+    images: Annotated[
+        Path | None, typer.Option(help="Folder of the photographs of --views, if it is not the capture's own.")
+    ] = None
+    device: Annotated[str, typer.Option(help="Device of the rasteriser: cpu or cuda.")] = "cpu"
+
+    def open(self) -> Views | None:
+        """Load the capture; return None if there is none, and refuse options of its photographs then."""
+        if self.views is None:
+            for name, value in (("--scale", self.scale), ("--images", self.images)):
+                if value is not None:
+                    raise UnsupportedError(
+                        f"{name} only applies to the photographs of a capture; give one with --views"
+                    )
+        return open_views(self.views, scale=self.scale, images=self.images)
+
+
+# Conversion of values to settings, captures and devices.
 
 Values = dict[str, Any]
 THOUSANDS = {"k": 1e3, "m": 1e6}
@@ -245,15 +268,14 @@ def chosen(
     changes: list[str] | None,
     *,
     group: str = "encode",
-    budget: Values | None = None,
-    finetune: str | None = None,
+    compact: Values | None = None,
+    finetune: Values | None = None,
     time: str | None = None,
     **options: float | str | None,
 ) -> Settings:
-    """Return the settings of a preset with ``NAME=VALUE`` or ``GROUP.NAME=VALUE`` changes, which ``options`` override.
+    """Return the settings of a preset with ``NAME=VALUE`` or ``GROUP.NAME=VALUE`` changes, which the others override.
 
-    Changes may be values that belong to the preset. ``group`` is that of changes without one; ``options`` are settings
-    of encode.
+    Changes may be values that belong to the preset; ``group`` is that of changes without one.
     """
     from kissgs.settings import Settings
 
@@ -270,12 +292,11 @@ def chosen(
                 f"--set {change!r}: unknown group {of!r}; the groups are compact, encode and finetune"
             )
         values[of if dot else group][inner if dot else of] = None if value.strip() == "auto" else value.strip()
-    values["compact"].update(budget or {})
+    values["compact"].update(compact or {})
     values["encode"].update({name: value for name, value in options.items() if value is not None})
-    values["finetune"].update(_finetune_values(finetune))
-    groups = {"compact": values["compact"], "finetune": values["finetune"]}
+    values["finetune"].update(finetune or {})
     made = Settings.research if changes else Settings.from_preset
-    return made(preset, time_limit=time, **groups, **values["encode"])
+    return made(preset, time_limit=time, compact=values["compact"], finetune=values["finetune"], **values["encode"])
 
 
 FINETUNE, RAY = "--finetune", "--ray"
@@ -309,18 +330,21 @@ def _is_host(word: str) -> bool:
     return "://" in word or ("/" not in word and Path(word).suffix.lower() not in (*ENDINGS, *SCENE_ENDINGS, ".json"))
 
 
-def _finetune_values(steps: str | None) -> Values:
-    if steps is None:
+def steps_of(text: str | None) -> Values:
+    """Parse the value of ``--finetune``: a number of steps, or auto for that of the preset; 0 turns it off."""
+    if text is None:
         return {}
-    if steps != "auto" and not steps.isdecimal():
-        raise UnsupportedError(f"{FINETUNE} {steps}: give a number of steps, or none for that of the preset")
-    if steps == "auto":
+    if text == "auto":
         return {"enabled": True}
-    return {"enabled": True, "steps": steps} if int(steps) else {"enabled": False}
+    if not text.isdecimal():
+        raise UnsupportedError(f"{FINETUNE} {text}: give a number of steps, or none for that of the preset")
+    return {"enabled": True, "steps": text} if int(text) else {"enabled": False}
 
 
-def count_of(text: str) -> int:
+def count_of(text: str | None) -> int | None:
     """Parse a number of Gaussians: 200000, 200,000, 200k, 1.5M."""
+    if text is None:
+        return None
     word = text.strip().lower()
     if re.fullmatch(r"[0-9]{1,3}(,[0-9]{3})+|[0-9]+", word):
         return int(word.replace(",", ""))
@@ -331,8 +355,10 @@ def count_of(text: str) -> int:
     )
 
 
-def share_of(text: str) -> float:
+def share_of(text: str | None) -> float | None:
     """Parse a share: 0.2 or 20%."""
+    if text is None:
+        return None
     word = text.strip()
     try:
         return float(word.removesuffix("%")) * (0.01 if word.endswith("%") else 1.0)
@@ -340,8 +366,10 @@ def share_of(text: str) -> float:
         raise UnsupportedError(f"--ratio {text}: give a share such as 0.2 or 20%") from error
 
 
-def budget_of(text: str) -> Values:
-    """Parse a budget: a count such as 200k, a share such as 20%, a PSNR drop such as 0.2dB, or auto with a goal."""
+def budget_of(text: str | None) -> Values:
+    """Parse the value of ``--compact``: 200k Gaussians, a share of 20%, a PSNR drop of 0.2dB, or auto with a goal."""
+    if text is None:
+        return {}
     word = text.strip().lower().replace(" ", "")
     if word == "auto":
         return {"auto_count": True}
@@ -359,11 +387,8 @@ def budget_of(text: str) -> Values:
 
 
 def open_views(path: Path | None, *, scale: int | None = None, images: Path | None = None) -> Views | None:
-    """Load the capture at ``path``; return None if there is none, and refuse options of its photographs then."""
+    """Load the capture at ``path``, if there is one."""
     if path is None:
-        for name, value in (("--scale", scale), ("--images", images)):
-            if value is not None:
-                raise UnsupportedError(f"{name} only applies to the photographs of a capture; give one with --views")
         return None
     from kissgs.cameras.captures.load import load_views
 
@@ -378,19 +403,6 @@ def device_of(name: str) -> Literal["cpu", "cuda"]:
 def origin_of(name: str | None) -> Literal["auto"] | None:
     """Check the value of ``--origin``."""
     return None if name is None else cast(Literal["auto"], choice("--origin", name, Literal["auto"]))
-
-
-def refuse_without_training(settings: Settings, *, checkpoint: bool, device: str) -> None:
-    """Raise UnsupportedError if ``--checkpoint`` or ``--device`` is given where nothing could train."""
-    trains = settings.finetune.enabled or (settings.compact.enabled and settings.compact.trains) or settings.aims
-    if trains or not (checkpoint or device != "cpu"):
-        return
-    remedy = "leave them out, these settings take no training steps"
-    if not settings.compact.enabled:
-        remedy = "add --compact or --finetune"
-    elif settings.compact.method == "merge":
-        remedy = "leave them out, the method merge does not train"
-    raise UnsupportedError(f"--checkpoint and --device only apply to training: {remedy}")
 
 
 def choice(option: str, value: str, allowed: Any) -> str:  # noqa: ANN401  a Literal has no type of its own

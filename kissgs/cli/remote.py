@@ -10,31 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kissgs.cli.files import for_each_input, print_json, progress_bar, show
-from kissgs.cli.options import (
-    CompactOption,
-    ContainerOption,
-    EvaluateOption,
-    FilesArgument,
-    FinetuneOption,
-    ForceOption,
-    MaxPsnrDropOption,
-    MaxSsimDropOption,
-    OriginOption,
-    PresetOption,
-    PsnrOption,
-    SetOption,
-    TargetSizeOption,
-    budget_of,
-    chosen,
-    origin_of,
-)
+from kissgs.cli.options import EncodingOptions, FilesArgument, ForceOption, origin_of, with_option_groups
+from kissgs.core.errors import OutputError, UnsupportedError
+from kissgs.formats import ENDINGS, ending_of, named_container
 
 if TYPE_CHECKING:
+    from kissgs.client import Remote
     from kissgs.core.progress import Progress
 
 ServerOption = Annotated[
     str, typer.Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="URL of the service.")
 ]
+ServiceJsonOption = Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")]
+JobArgument = Annotated[str, typer.Argument(help="Id of the job, see 'kissgs remote list'.")]
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 
 app = typer.Typer(
@@ -45,6 +33,7 @@ app = typer.Typer(
 
 
 @app.command()
+@with_option_groups
 def compress(
     scenes: FilesArgument,
     output: Annotated[
@@ -53,42 +42,19 @@ def compress(
             "--output", "-o", metavar="PATH", help="Output NAME.zip, NAME.sog or a folder. Default: next to the scene."
         ),
     ] = None,
-    container: ContainerOption = None,
     server: ServerOption = DEFAULT_SERVER,
-    preset: PresetOption = "balanced",
-    changes: SetOption = None,
-    psnr: PsnrOption = None,
-    target_size: TargetSizeOption = None,
-    max_psnr_drop: MaxPsnrDropOption = None,
-    max_ssim_drop: MaxSsimDropOption = None,
-    compact: CompactOption = None,
-    finetune: FinetuneOption = None,
-    evaluate: EvaluateOption = False,
-    origin: OriginOption = None,
-    force: ForceOption = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")] = False,
+    *,
+    encoding: EncodingOptions,
+    as_json: ServiceJsonOption = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job."""
     from kissgs.cli.tables import status_table
-    from kissgs.client import Remote
-    from kissgs.core.errors import UnsupportedError
-    from kissgs.formats import ending_of, named_container
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
-    kind = named_container(container, output)
-    settings = chosen(
-        preset,
-        changes,
-        budget=None if compact is None else budget_of(compact),
-        finetune=finetune,
-        psnr=psnr,
-        target_size=target_size,
-        max_psnr_drop=max_psnr_drop,
-        max_ssim_drop=max_ssim_drop,
-    )
-    with Remote(server, key=os.environ.get("KISSGS_KEY")) as remote:
+    kind, settings = named_container(encoding.container, output), encoding.settings()
+    with _service(server) as remote:
 
         def work(scene: str, target: Path) -> dict[str, Any]:
             with progress_bar(quiet or as_json) as progress:
@@ -97,9 +63,9 @@ def compress(
                     target,
                     settings=settings,
                     container=kind,
-                    evaluate=evaluate,
-                    origin=origin_of(origin),
-                    overwrite=force,
+                    evaluate=encoding.evaluate,
+                    origin=origin_of(encoding.origin),
+                    overwrite=encoding.force,
                     progress=_announcing(progress, server, quiet),
                 )
             if not (quiet or as_json):
@@ -112,12 +78,10 @@ def compress(
 @app.command(name="list")
 def list_jobs(
     server: ServerOption = DEFAULT_SERVER,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")] = False,
+    as_json: ServiceJsonOption = False,
 ) -> None:
     """List the latest jobs on a server."""
-    from kissgs.client import Remote
-
-    with Remote(server, key=os.environ.get("KISSGS_KEY")) as remote:
+    with _service(server) as remote:
         jobs = remote.jobs()
     if as_json:
         print_json(jobs)
@@ -129,7 +93,7 @@ def list_jobs(
 
 @app.command()
 def get(
-    job: Annotated[str, typer.Argument(help="Id of the job, see 'kissgs remote list'.")],
+    job: JobArgument,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Output NAME.zip or NAME.sog. Default: the name of the scene.")
     ] = None,
@@ -138,14 +102,11 @@ def get(
 ) -> None:
     """Wait for a job to finish, and download its container."""
     from kissgs.cli.tables import status_table
-    from kissgs.client import Remote
-    from kissgs.core.errors import OutputError
-    from kissgs.formats import ENDINGS, ending_of, named_container
     from kissgs.io.files import refuse_existing
 
     if output is not None and output.suffix.lower() not in ENDINGS:
         raise OutputError(f"{output!s:.100} is not the name of a container; end it in {' or '.join(ENDINGS)}")
-    with Remote(server, key=os.environ.get("KISSGS_KEY")) as remote, progress_bar(False) as bar:
+    with _service(server) as remote, progress_bar(False) as bar:
         progress = _announcing(bar, server, False)
         known = remote.status(job)
         kind = named_container(known["options"].get("format"), output)  # services of older versions state none
@@ -158,14 +119,18 @@ def get(
 
 @app.command()
 def cancel(
-    job: Annotated[str, typer.Argument(help="Id of the job, see 'kissgs remote list'.")],
+    job: JobArgument,
     server: ServerOption = DEFAULT_SERVER,
 ) -> None:
     """Cancel a job."""
+    with _service(server) as remote:
+        show(f"{job} {remote.cancel(job)['state']}")
+
+
+def _service(server: str) -> Remote:
     from kissgs.client import Remote
 
-    with Remote(server, key=os.environ.get("KISSGS_KEY")) as remote:
-        show(f"{job} {remote.cancel(job)['state']}")
+    return Remote(server, key=os.environ.get("KISSGS_KEY"))
 
 
 def _announcing(progress: Progress, server: str, quiet: bool) -> Progress:

@@ -8,25 +8,15 @@ import re
 import sys
 import threading
 import webbrowser
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kissgs.cli.files import check_input, for_each_input, progress_bar, say_notes, show, source, write_stdout
+from kissgs.cli.files import check_input, for_each_input, progress_bar, say_notes, show, source, write_output
 from kissgs.cli.interrupts import Interrupted
-from kissgs.cli.options import (
-    ForceOption,
-    ImagesOption,
-    RenderDeviceOption,
-    ScaleOption,
-    SceneOptions,
-    ViewsOption,
-    device_of,
-    open_views,
-    reads_scenes,
-)
+from kissgs.cli.options import CaptureOptions, ForceOption, SceneOptions, device_of, with_option_groups
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 
 if TYPE_CHECKING:
@@ -37,7 +27,7 @@ if TYPE_CHECKING:
 # ``kissgs view``: show a scene in the browser, or write a page that shows it.
 
 
-@reads_scenes
+@with_option_groups
 def view(
     scene: Annotated[
         str, typer.Argument(metavar="FILE", help="Scene of any format, or a container; '-' reads standard input.")
@@ -82,7 +72,7 @@ def view(
 
 
 def _write(scene: str, common: SceneOptions, output: Path, force: bool) -> None:
-    from kissgs.io.files import atomic_file, refuse_existing
+    from kissgs.io.files import refuse_existing
     from kissgs.preview import fitting_level, is_streamed, page_container, standalone_page
 
     if output.suffix.lower() not in (".html", ".htm"):
@@ -97,8 +87,7 @@ def _write(scene: str, common: SceneOptions, output: Path, force: bool) -> None:
         container = page_container(content, reading, threads=common.threads, progress=progress)
     say_notes(scene, container.notes, common.quiet)
     page = standalone_page(container)
-    with atomic_file(output, overwrite=force) as file:
-        file.write(page)
+    write_output(output, page, force=force)
     if not common.quiet:
         made = f", compressed by the preset balanced to {len(container.data):,} bytes" if container.converted else ""
         show(f"{output}  {len(page):,} bytes, holds {container.name}{chosen}{made}")
@@ -170,81 +159,118 @@ def _has_display() -> bool:
 FPS, QUALITY = 12, 85
 COLOURS = {"black": "#000000", "white": "#ffffff"}
 
-OutputOption = Annotated[
-    str | None,
-    typer.Option(
-        "--output",
-        "-o",
-        metavar="PATH",
-        help="Output NAME.png, NAME.webp, a folder, or '-' for a PNG on standard output. Default: a .png next "
-        "to the scene.",
-    ),
-]
-ViewOption = Annotated[
-    str | None,
-    typer.Option(
-        "--view",
-        metavar="N|NAME|FILE.json",
-        help="Camera: a view of --views, or else a virtual view, by name or by its number from 0 in order of names; "
-        "or a file of --save-camera; or FILE.json:N or FILE.json:NAME of a cameras.json of 3DGS. Default: the first "
-        "view of --views, or else the best virtual view.",
-    ),
-]
-OrbitOption = Annotated[
-    bool,
-    typer.Option(
-        "--orbit",
-        help="Render an orbit around the scene, or an arc forth and back if only one side was captured: an animation "
-        "as .webp, a contact sheet as .png.",
-    ),
-]
-SheetOption = Annotated[
-    bool, typer.Option("--sheet", help="Render a contact sheet of all views of --views, or else of the virtual views.")
-]
-SizeOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="WxH",
-        help="Size of each image, pixels. Default: that of the camera, or else 1280x960; 640x480 in an animation, "
-        "320x240 on a contact sheet.",
-    ),
-]
-BackgroundOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="COLOUR", help="Background colour: black, white or #rrggbb. Default: that of --views, or else black."
-    ),
-]
-FramesOption = Annotated[
-    int | None,
-    typer.Option(min=3, max=3600, help="Images of an --orbit. Default: 48 in an animation, 24 on a contact sheet."),
-]
-SaveCameraOption = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.json", help="Write the camera of the image as JSON, for --view and other programs."),
-]
+
+@dataclass(frozen=True, kw_only=True)
+class ImageOptions:
+    """Options of ``kissgs render`` for what is to be seen."""
+
+    view: Annotated[
+        str | None,
+        typer.Option(
+            "--view",
+            metavar="N|NAME|FILE.json",
+            help="Camera: a view of --views, or else a virtual view, by name or by its number from 0 in order of "
+            "names; or a file of --save-camera; or FILE.json:N or FILE.json:NAME of a cameras.json of 3DGS. Default: "
+            "the first view of --views, or else the best virtual view.",
+        ),
+    ] = None
+    orbit: Annotated[
+        bool,
+        typer.Option(
+            "--orbit",
+            help="Render an orbit around the scene, or an arc forth and back if only one side was captured: an "
+            "animation as .webp, a contact sheet as .png.",
+        ),
+    ] = False
+    sheet: Annotated[
+        bool,
+        typer.Option("--sheet", help="Render a contact sheet of all views of --views, or else of the virtual views."),
+    ] = False
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH",
+            help="Size of each image, pixels. Default: that of the camera, or else 1280x960; 640x480 in an animation, "
+            "320x240 on a contact sheet.",
+        ),
+    ] = None
+    background: Annotated[
+        str | None,
+        typer.Option(
+            metavar="COLOUR",
+            help="Background colour: black, white or #rrggbb. Default: that of --views, or else black.",
+        ),
+    ] = None
+    frames: Annotated[
+        int | None,
+        typer.Option(min=3, max=3600, help="Images of an --orbit. Default: 48 in an animation, 24 on a contact sheet."),
+    ] = None
+    save_camera: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.json", help="Write the camera of the image as JSON, for --view and other programs."),
+    ] = None
+
+    def refuse_contradictions(self, views: Path | None) -> None:
+        """Raise UnsupportedError for options that do not go together; ``views`` is the value of ``--views``."""
+        _refuse({"--view": self.view, "--orbit": self.orbit, "--sheet": self.sheet}, most=1, why="choose one")
+        if self.view is not None and ".json" in self.view.lower():
+            _refuse({"--views": views}, why=f"{self.view} is a camera file")
+        if self.orbit:
+            _refuse({"--views": views}, why="--orbit computes its own cameras")
+        else:
+            _refuse({"--frames": self.frames}, why="it only applies to --orbit")
+        if self.orbit or self.sheet:
+            why = "it only applies to a single image; --json prints all cameras"
+            _refuse({"--save-camera": self.save_camera}, why=why)
+
+    def pixels(self) -> tuple[int, int] | None:
+        """Parse ``--size``: width and height."""
+        if self.size is None:
+            return None
+        found = re.fullmatch(r"([1-9]\d{0,5})[xX×]([1-9]\d{0,5})", self.size.strip(), re.ASCII)
+        if found is None:
+            raise UnsupportedError(f"--size {self.size}: give WIDTHxHEIGHT in pixels, such as 1280x960")
+        return int(found[1]), int(found[2])
+
+    def colour(self) -> tuple[float, float, float] | None:
+        """Parse ``--background``: red, green and blue, 0 to 1."""
+        if self.background is None:
+            return None
+        code = COLOURS.get(self.background.lower(), self.background.lower())
+        found = re.fullmatch(r"#([0-9a-f]{2})([0-9a-f]{2})([0-9a-f]{2})", code)
+        if found is None:
+            raise UnsupportedError(f"--background {self.background}: give black, white or #rrggbb, such as '#87ceeb'")
+        red, green, blue = (int(value, 16) / 255 for value in found.groups())
+        return red, green, blue
 
 
-@reads_scenes
+def _refuse(options: dict[str, object], *, why: str, most: int = 0) -> None:
+    """Raise an error if more than ``most`` of these options are given."""
+    given = [name for name, value in options.items() if value is not None and value is not False]
+    if len(given) > most:
+        raise UnsupportedError(f"{' and '.join(given)}: {why}" if most else f"leave out {given[0]}: {why}")
+
+
+@with_option_groups
 def render(
     file: Annotated[str, typer.Argument(metavar="FILE", help="Scene to render, of any format that kissgs reads.")],
-    output: OutputOption = None,
-    view: ViewOption = None,
-    orbit: OrbitOption = False,
-    sheet: SheetOption = False,
-    size: SizeOption = None,
-    background: BackgroundOption = None,
-    frames: FramesOption = None,
-    save_camera: SaveCameraOption = None,
-    views: ViewsOption = None,
-    scale: ScaleOption = None,
-    images: ImagesOption = None,
-    device: RenderDeviceOption = "cpu",
+    output: Annotated[
+        str | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="PATH",
+            help="Output NAME.png, NAME.webp, a folder, or '-' for a PNG on standard output. Default: a .png next "
+            "to the scene.",
+        ),
+    ] = None,
+    *,
+    image: ImageOptions,
+    capture: CaptureOptions,
     force: ForceOption = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print a JSON report: the output file and the cameras.")
     ] = False,
-    *,
     common: SceneOptions,
 ) -> None:
     """Render an image of a scene, an orbit around it (animation or contact sheet), or all its views."""
@@ -255,63 +281,45 @@ def render(
     from kissgs.pipeline.scene_files import load
 
     suffix, threads, quiet = _suffix(file, output), common.threads, common.quiet or as_json
-    animated = orbit and suffix == ".webp"
-    _refuse({"--view": view, "--orbit": orbit, "--sheet": sheet}, most=1, why="choose one")
-    if view is not None and ".json" in view.lower():
-        _refuse({"--views": views}, why=f"{view} is a camera file")
-    if orbit:
-        _refuse({"--views": views}, why="--orbit computes its own cameras")
-    else:
-        _refuse({"--frames": frames}, why="it only applies to --orbit")
-    if orbit or sheet:
-        _refuse({"--save-camera": save_camera}, why="it only applies to a single image; --json prints all cameras")
-    image_size, colour, render_device = _size(size), _colour(background), device_of(device)
-    capture = open_views(views, scale=scale, images=images)
+    image.refuse_contradictions(capture.views)
+    size, background, device = image.pixels(), image.colour(), device_of(capture.device)
+    views = capture.open()
 
     def work(name: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
-        for path in ([] if piped else [target]) + ([] if save_camera is None else [save_camera]):
+        for path in ([] if piped else [target]) + ([] if image.save_camera is None else [image.save_camera]):
             refuse_existing(path, overwrite=force)
         with progress_bar(quiet) as progress:
             job = RenderJob(
                 splats=load(Path(name), threads=threads, progress=progress, **asdict(common.reading())),
-                size=image_size,
-                background=colour,
-                device=render_device,
+                size=size,
+                background=background,
+                device=device,
                 threads=threads,
                 progress=progress,
             )
             fitting = None
-            if capture is not None:
-                fitting = in_scene_frame(job.splats, capture, threads=threads, progress=progress)
-            if orbit:
-                rendered = job.animation(frames) if animated else job.orbit_sheet(frames)
+            if views is not None:
+                fitting = in_scene_frame(job.splats, views, threads=threads, progress=progress)
+            if image.orbit:
+                animated = suffix == ".webp"
+                rendered = job.animation(image.frames) if animated else job.orbit_sheet(image.frames)
             else:
-                rendered = job.view_sheet(fitting) if sheet else job.single(fitting, view)
+                rendered = job.view_sheet(fitting) if image.sheet else job.single(fitting, image.view)
             progress("write", 0.0)
             data = _encoded(rendered, suffix)
             progress("write", 1.0)
         say_notes(name, job.splats.notes, common.quiet)
-        _deliver(data, target, force=force)
-        if save_camera is not None:
-            write_camera(save_camera, rendered.views[0].camera, overwrite=force)
+        write_output(target, data, force=force)
+        if image.save_camera is not None:
+            write_camera(image.save_camera, rendered.views[0].camera, overwrite=force)
         report = _report(rendered, len(data))
         if not (quiet or piped):
-            saved = "" if save_camera is None else f"; {save_camera}"
+            saved = "" if image.save_camera is None else f"; {image.save_camera}"
             show(f"{target}  {report['width']}x{report['height']}, {rendered.description}{saved}")
         return report
 
     for_each_input([file], output, suffix, as_json, work)
-
-
-def _deliver(data: bytes, target: Path, *, force: bool) -> None:
-    from kissgs.io.files import atomic_file
-
-    if str(target) == "-":
-        write_stdout(data)
-        return
-    with atomic_file(target, overwrite=force) as file:
-        file.write(data)
 
 
 def _suffix(file: str, output: str | None) -> str:
@@ -326,32 +334,6 @@ def _suffix(file: str, output: str | None) -> str:
     if suffix not in (".png", ".webp"):
         raise UnsupportedError(f"{output}: images are written as .png or .webp")
     return suffix
-
-
-def _refuse(options: dict[str, object], *, why: str, most: int = 0) -> None:
-    """Raise an error if more than ``most`` of these options are given."""
-    given = [name for name, value in options.items() if value is not None and value is not False]
-    if len(given) > most:
-        raise UnsupportedError(f"{' and '.join(given)}: {why}" if most else f"leave out {given[0]}: {why}")
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    found = re.fullmatch(r"([1-9]\d{0,5})[xX×]([1-9]\d{0,5})", text.strip(), re.ASCII)
-    if found is None:
-        raise UnsupportedError(f"--size {text}: give WIDTHxHEIGHT in pixels, such as 1280x960")
-    return int(found[1]), int(found[2])
-
-
-def _colour(text: str | None) -> tuple[float, float, float] | None:
-    if text is None:
-        return None
-    found = re.fullmatch(r"#([0-9a-f]{2})([0-9a-f]{2})([0-9a-f]{2})", COLOURS.get(text.lower(), text.lower()))
-    if found is None:
-        raise UnsupportedError(f"--background {text}: give black, white or #rrggbb, such as '#87ceeb'")
-    red, green, blue = (int(value, 16) / 255 for value in found.groups())
-    return red, green, blue
 
 
 def _encoded(rendered: RenderedImages, suffix: str) -> bytes:

@@ -82,7 +82,7 @@ def stoppable(progress: Progress, searches: bool) -> Iterator[Progress]:
     try:
         yield receive
     except StopSearch as error:
-        say_when_interrupted(NOTHING_FOUND)
+        say_when_interrupted(lambda: NOTHING_FOUND)
         raise Interrupted(signal.SIGINT) from error
     finally:
         signal.signal(signal.SIGINT, before)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captured_scene import SCENE, write_capture
+from helpers.captured_scene import SCENE
 from helpers.command_line import KISSGS, failure, run
 from helpers.held_training import HeldTraining
 from helpers.training_scenes import same
@@ -17,22 +17,15 @@ from helpers.training_scenes import same
 import kissgs
 from kissgs.cli.options import budget_of, share_of
 
-SHORT = {"sparsify_steps": 6, "refine_steps": 4, "prune_rounds": 2, "views": 24, "view_size": 48}
+SHORT = {"sparsify_steps": 4, "refine_steps": 2, "prune_rounds": 2, "views": 16, "view_size": 48}
 OPTIONS = [word for name, value in SHORT.items() for word in ("--set", f"{name}={value}")]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("compact")
-    kissgs.save(SCENE, folder / "a.ply")
-    write_capture(folder / "capture")
-    return folder
-
-
 def test_the_output_is_that_of_the_library(folder: Path, tmp_path: Path) -> None:
-    done = run("compact", folder / "a.ply", "--ratio", "0.2", "-o", tmp_path / "b.ply", *OPTIONS, "--evaluate")
+    words = ["compact", folder / "a.ply", "--ratio", "0.2", "-p", "fast", *OPTIONS, "--evaluate"]
+    done = run(*words, "-o", tmp_path / "b.ply")
     assert done.returncode == 0, done.stderr
-    settings = kissgs.Settings.research("balanced", compact={**SHORT, "ratio": 0.2})
+    settings = kissgs.Settings.research("fast", compact={**SHORT, "ratio": 0.2})
     found = kissgs.compact(SCENE, settings=settings, evaluate=True)
     assert same(kissgs.load(tmp_path / "b.ply"), kissgs.clean(found.splats)[0])
     text = done.stdout.decode()
@@ -58,38 +51,25 @@ def test_the_preset_fast_only_prunes(folder: Path, tmp_path: Path) -> None:
 
 
 def test_merging_takes_neither_views_nor_training(folder: Path, tmp_path: Path) -> None:
-    words = ["compact", folder / "a.ply", "--ratio", "0.2", "--method", "merge"]
-    done = run(*words, "-o", tmp_path / "b.ply")
+    words = ["compact", folder / "a.ply", "--ratio", "0.2", "-p", "fast"]
+    done = run(*words, "--method", "merge", "-o", tmp_path / "b.ply")
     assert done.returncode == 0, done.stderr
-    expected = kissgs.compact(SCENE, settings=kissgs.Settings.from_preset(compact={"ratio": 0.2, "method": "merge"}))
-    assert same(kissgs.load(tmp_path / "b.ply"), expected.splats)
-    assert run(*words[:-2], "--set", "method=merge", "-o", tmp_path / "e.ply").returncode == 0
-    assert (tmp_path / "e.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    settings = kissgs.Settings.from_preset("fast", compact={"ratio": 0.2, "method": "merge"})
+    assert same(kissgs.load(tmp_path / "b.ply"), kissgs.compact(SCENE, settings=settings).splats)
     rows = [row.split()[:2] for row in done.stdout.decode().splitlines() if row.startswith(("input", "merge"))]
     assert rows == [["input", "1,500"], ["merge", "300"]]
-    report = json.loads(run(*words, "-o", tmp_path / "c.ply", "--evaluate", "--json").stdout)
-    assert [step["name"] for step in report["steps"]] == ["input", "merge"]
-    assert 15 < report["steps"][1]["psnr"] < 60
-    searched = json.loads(
-        run(
-            "compact",
-            folder / "a.ply",
-            "--max-psnr-drop",
-            "0.3",
-            "--method",
-            "merge",
-            *OPTIONS,
-            "--json",
-            "-o",
-            tmp_path / "d.ply",
-        ).stdout
-    )
+    done = run(*words, "--set", "method=merge", "-o", tmp_path / "c.ply", "--evaluate", "--json")
+    assert (tmp_path / "c.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    steps = json.loads(done.stdout)["steps"]
+    assert [step["name"] for step in steps] == ["input", "merge"]
+    assert 15 < steps[1]["psnr"] < 60
+
+
+@pytest.mark.quick(0)
+def test_a_search_may_merge(folder: Path, tmp_path: Path) -> None:
+    words = ["--max-psnr-drop", "0.3", "--method", "merge", *OPTIONS, "--json", "-o", tmp_path / "d.ply"]
+    searched = json.loads(run("compact", folder / "a.ply", *words).stdout)
     assert max(trial["drop"] for trial in searched["trials"] if trial["count"] == searched["count"]) <= 0.3
-
-
-def test_an_unknown_method_is_refused(folder: Path, tmp_path: Path) -> None:
-    words = ["compact", folder / "a.ply", "--ratio", "0.2", "-o", tmp_path / "b.ply"]
-    assert "setting method: input should be 'prune' or 'merge', not 'cluster'" in failure(*words, "--method", "cluster")
 
 
 @pytest.mark.quick(0)
@@ -166,20 +146,18 @@ MERGE = ["-n", "9", "-o", "b.ply", "--method", "merge"]
         (["-n", "9", "-o", "b.zip/"], "b.zip"),
         (["--max-psnr-drop", "1", "-o", "b.ply", "--checkpoint"], "keeps no checkpoint"),
         (["-n", "9", "-o", "b.ply", "--device", "tpu"], "--device tpu: choose cpu or cuda"),
-        (
-            [*MERGE, "--checkpoint"],
-            "--checkpoint and --device only apply to training: leave them out, the method merge",
-        ),
-        ([*MERGE, "--device", "cuda"], "--checkpoint and --device only apply to training: leave them out"),
+        ([*MERGE, "--checkpoint"], "only apply to training: leave them out, the method merge"),
         ([*FAST, "--device", "cuda"], "only apply to training: leave them out, these settings take no training steps"),
         ([*FAST, "--checkpoint"], "only apply to training: leave them out, these settings take no training steps"),
+        ([*FAST, "--method", "cluster"], "setting method: input should be 'prune' or 'merge', not 'cluster'"),
+        (["-n", "9", "-o", "there.ply"], "exists already"),
     ],
 )
 def test_impossible_requests_are_refused(folder: Path, tmp_path: Path, words: list[str], sentence: str) -> None:
-    if words[-1] == "b.zip/":
-        (tmp_path / "b.zip").write_text("in the way")
+    for name in ("b.zip", "there.ply"):
+        (tmp_path / name).write_text("mine")
     assert sentence in failure("compact", folder / "a.ply", *words, cwd=tmp_path)
-    assert not (tmp_path / "b.ply").exists()
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"b.zip": "mine", "there.ply": "mine"}
 
 
 def test_options_of_training_need_training(folder: Path, tmp_path: Path) -> None:
@@ -200,12 +178,6 @@ def test_a_pipe_leaves_no_checkpoint(folder: Path, tmp_path: Path) -> None:
     piped = run("compress", tmp_path / "s.ply", "--compact", "300", "-o", "-", "--checkpoint", "-p", "fast", *options)
     assert piped.stdout.startswith(b"PK")
     assert [path.name for path in tmp_path.iterdir()] == ["s.ply"]
-
-
-def test_nothing_is_overwritten(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "b.ply").write_text("mine")
-    assert "exists already" in failure("compact", folder / "a.ply", "-n", "9", "-o", tmp_path / "b.ply")
-    assert (tmp_path / "b.ply").read_text() == "mine"
 
 
 def test_missing_torch_is_reported(folder: Path, tmp_path: Path) -> None:

@@ -7,64 +7,44 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captured_scene import SCENE, damaged, write_capture
+from helpers.captured_scene import SCENE, write_capture
 from helpers.command_line import failure, run
 from PIL import Image
 
 import kissgs
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with a.ply, its container b.zip, a damaged c.ply, and a capture."""
-    folder = tmp_path_factory.mktemp("evaluate")
-    kissgs.save(SCENE, folder / "a.ply")
-    kissgs.compress(SCENE, folder / "b.zip")
-    kissgs.save(damaged(), folder / "c.ply")
-    write_capture(folder / "capture")
-    return folder
+def rows(text: str, *names: str) -> dict[str, list[str]]:
+    return {row.split()[0]: row.split()[1:] for row in text.splitlines() if row.startswith(names)}
 
 
-def test_json_is_the_evaluation_and_the_bytes(folder: Path) -> None:
-    capture = folder / "capture"
-    done = run("evaluate", folder / "a.ply", folder / "b.zip", "--views", capture, "--json")
-    report = json.loads(done.stdout)
-    found = kissgs.evaluate(kissgs.load(folder / "a.ply"), kissgs.load(folder / "b.zip"), kissgs.load_views(capture))
-    assert report.pop("bytes") == {
-        side: (folder / name).stat().st_size for side, name in (("reference", "a.ply"), ("candidate", "b.zip"))
-    }
-    assert report == json.loads(json.dumps(found.as_dict()))
-
-
-def test_cameras_can_be_farther_away(folder: Path) -> None:
-    done = run("evaluate", folder / "a.ply", folder / "c.ply", "--distance", "3", "--json")
+def test_the_report_is_the_evaluation_and_the_bytes(folder: Path) -> None:
+    words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture", "--split", "all"]
+    report = json.loads(run(*words, "--json").stdout)
     scenes = kissgs.load(folder / "a.ply"), kissgs.load(folder / "c.ply")
-    found = kissgs.evaluate(*scenes, distance=3.0)
-    assert json.loads(done.stdout)["mean"] == json.loads(json.dumps(found.as_dict()))["mean"]
-    assert found.mean != kissgs.evaluate(*scenes).mean
-    assert "give a number above 0" in failure("evaluate", folder / "a.ply", folder / "c.ply", "--distance", "0")
-    assert b"at 3 times the distance" in run("evaluate", folder / "a.ply", folder / "c.ply", "--distance", "3").stdout
+    found = kissgs.evaluate(*scenes, kissgs.load_views(folder / "capture"), split="all")
+    sizes = {"reference": (folder / "a.ply").stat().st_size, "candidate": (folder / "c.ply").stat().st_size}
+    assert report == {**json.loads(json.dumps(found.as_dict())), "bytes": sizes}
+    around = report["surroundings"]
+    assert [report["against"], around["against"], around["surroundings"]] == ["photos", "renderings", None]
 
-
-def test_the_table_says_what_was_compared(folder: Path) -> None:
-    done = run("evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture", "--split", "all")
-    text = done.stdout.decode()
-    found = kissgs.evaluate(SCENE, kissgs.load(folder / "c.ply"), kissgs.load_views(folder / "capture"), split="all")
-    assert "3 photographs, 60x40: " in text
-    assert "c.ply compared with a.ply" in text
-    assert "1.0x smaller" in text
-    assert "1,500 of 1,500 Gaussians" in text
-    rows = {row.split()[0]: row.split()[1:] for row in text.splitlines() if row.startswith(("images/", "mean"))}
-    assert rows["images/a.png"] == found.views[0].comparison.cells(["PSNR", "SSIM"])
-    assert rows["mean"] == found.mean.cells(["PSNR", "SSIM"])
+    text = run(*words).stdout.decode()
+    head = ("3 photographs, 60x40: ", "c.ply compared with a.ply", "1.0x smaller", "1,500 of 1,500 Gaussians")
+    assert all(part in text for part in head)
+    printed = rows(text, "images/", "mean")
+    assert printed["images/a.png"] == found.views[0].comparison.cells(["PSNR", "SSIM"])
+    assert printed["mean"] == found.mean.cells(["PSNR", "SSIM"])
     means = found.mean.reference, found.mean.candidate, found.mean.candidate_vs_reference
     titles = ("reference to photo", "candidate to photo", "candidate to reference")
     below = {row[:22].strip(): row[22:].split() for row in text.splitlines() if row.startswith(titles)}
     assert below == {title: [f"{mean.ms_ssim:.4f}"] for title, mean in zip(titles, means, strict=True)}
+    psnr = f"{around['mean']['candidate_vs_reference']['psnr']:.2f}"
+    said = f"Beyond the capture: PSNR {psnr} dB to the scene's own renderings from 24 cameras; worst view"
+    assert said in " ".join(text.split())
 
 
 def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder: Path, tmp_path: Path) -> None:
-    kissgs.compress(SCENE, tmp_path / "unpacked")
+    kissgs.compress(SCENE, tmp_path / "unpacked", settings=kissgs.Settings.from_preset("fast"))
     done = run("evaluate", folder / "b.zip", tmp_path / "unpacked")
     text = done.stdout.decode()
     assert done.returncode == 0, done.stderr
@@ -73,25 +53,18 @@ def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder: Path,
     assert "photo" not in text
 
 
-def test_the_worst_view_is_printed_and_depends_on_the_seed(folder: Path) -> None:
-    words = ["evaluate", folder / "a.ply", folder / "c.ply"]
-    found = kissgs.evaluate(SCENE, kissgs.load(folder / "c.ply"), seed=7)
-    text = " ".join(run(*words, "--seed", 7).stdout.decode().split())
+def test_the_cameras_depend_on_the_seed_and_the_distance(folder: Path) -> None:
+    scenes = kissgs.load(folder / "a.ply"), kissgs.load(folder / "c.ply")
+    words = ["evaluate", folder / "a.ply", folder / "c.ply", "--seed", 7]
+    report, far = (json.loads(run(*words, *more, "--json").stdout) for more in ([], ["--distance", 3]))
+    found = kissgs.evaluate(*scenes, seed=7, distance=3.0)
+    assert far["mean"] == json.loads(json.dumps(found.as_dict()))["mean"] != report["mean"]
+    text = " ".join(run(*words, "--distance", 3).stdout.decode().split())
+    assert "at 3 times the distance" in text
     assert f"W{found.extremes[1:]}." in text
-    report = json.loads(run(*words, "--seed", 7, "--json").stdout)
     assert report["worst"]["psnr"] == min(view["candidate_vs_reference"]["psnr"] for view in report["views"])
-    assert report["worst"]["position"] != json.loads(run(*words, "--json").stdout)["worst"]["position"]
-
-
-def test_the_scene_beyond_the_capture_is_evaluated_too(folder: Path) -> None:
-    words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture"]
-    text = " ".join(run(*words).stdout.decode().split())
-    report = json.loads(run(*words, "--json").stdout)
-    assert report["against"] == "photos"
-    assert report["surroundings"]["against"] == "renderings"
-    assert report["surroundings"]["surroundings"] is None
-    around = report["surroundings"]["mean"]["candidate_vs_reference"]["psnr"]
-    assert f"Beyond the capture: PSNR {around:.2f} dB to the scene's own renderings from 24 cameras; worst view" in text
+    other = kissgs.evaluate(*scenes, seed=0).as_dict()
+    assert report["worst"]["position"] != json.loads(json.dumps(other))["worst"]["position"]
 
 
 @pytest.mark.parametrize(("noise", "noted"), [(0.02, False), (0.2, True)])
@@ -144,22 +117,31 @@ def test_a_page_is_written_whole_and_not_over_another(folder: Path, tmp_path: Pa
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
-def test_errors_are_one_line(folder: Path, tmp_path: Path) -> None:
-    pair, capture = [folder / "a.ply", folder / "b.zip"], folder / "capture"
-    assert "no such file" in failure("evaluate", folder / "none.ply", folder / "b.zip").lower()
-    assert "no such file" in failure("evaluate", folder / "a.ply", folder / "none.zip").lower()
-    assert "name the folder of a capture" in failure("evaluate", *pair, "--views", tmp_path / "none")
-    assert "has no cameras" in failure("evaluate", *pair, "--views", tmp_path)
-    assert "choose test, train or all" in failure("evaluate", *pair, "--split", "val")
-    assert "choose cpu or cuda" in failure("evaluate", *pair, "--device", "tpu")
-    for option in ("--scale", "--images"):
-        assert f"{option} only applies to the photographs" in failure("evaluate", *pair, option, "2")
-    assert "exclude each other" in failure("evaluate", *pair, "--views", capture, "--scale", 2, "--images", tmp_path)
-    (capture / "images" / "a.png").rename(capture / "images" / "a.away")
+REFUSED = {
+    "none.ply b.zip": "no such file",
+    "a.ply none.zip": "no such file",
+    "a.ply b.zip --views none": "name the folder of a capture",
+    "a.ply b.zip --views .": "has no cameras",
+    "a.ply b.zip --split val": "choose test, train or all",
+    "a.ply b.zip --device tpu": "choose cpu or cuda",
+    "a.ply b.zip --distance 0": "give a number above 0",
+    "a.ply b.zip --scale 2": "--scale only applies to the photographs",
+    "a.ply b.zip --images 2": "--images only applies to the photographs",
+    "a.ply b.zip --views capture --scale 2 --images .": "exclude each other",
+}
+
+
+def test_errors_are_one_line(folder: Path) -> None:
+    for words, expected in REFUSED.items():
+        assert expected in failure("evaluate", *words.split(), cwd=folder), words
+    photo = folder / "capture" / "images" / "a.png"
+    photo.rename(photo.with_suffix(".away"))
     try:
-        assert "1 of 3 photographs is missing" in failure("evaluate", *pair, "--views", capture)
+        assert "1 of 3 photographs is missing" in failure(
+            "evaluate", "a.ply", "b.zip", "--views", "capture", cwd=folder
+        )
     finally:
-        (capture / "images" / "a.away").rename(capture / "images" / "a.png")
+        photo.with_suffix(".away").rename(photo)
 
 
 @pytest.mark.quick(0)
@@ -185,7 +167,9 @@ def test_cancelling_the_evaluation_writes_nothing(tmp_path: Path) -> None:
             raise kissgs.Cancelled("enough")
 
     with pytest.raises(kissgs.Cancelled, match="enough"):
-        kissgs.compress(SCENE, tmp_path / "a.zip", evaluate=True, progress=stop)
+        kissgs.compress(
+            SCENE, tmp_path / "a.zip", settings=kissgs.Settings.from_preset("fast"), evaluate=True, progress=stop
+        )
     assert list(tmp_path.iterdir()) == []
 
 

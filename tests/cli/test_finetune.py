@@ -2,63 +2,42 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
-from helpers.captured_scene import SCENE, write_capture
+from helpers.captured_scene import SCENE
 from helpers.command_line import failure, run
 
 import kissgs
-from kissgs.cli.options import with_default_values
+from kissgs.cli.options import chosen, steps_of
 
 SHORT = {"views": 24, "view_size": 48}
-OPTIONS = [word for name, value in SHORT.items() for word in ("--set", f"finetune.{name}={value}")]
 LOOK = {"sensitivity_views": 8, "sensitivity_view_size": 48}
-OPTIONS += [word for name, value in LOOK.items() for word in ("--set", f"{name}={value}")]
+CHANGES = {**{f"finetune.{name}": value for name, value in SHORT.items()}, **LOOK}
+OPTIONS = [word for name, value in CHANGES.items() for word in ("--set", f"{name}={value}")]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("finetune")
-    kissgs.save(SCENE, folder / "a.ply")
-    write_capture(folder / "capture")
-    return folder
-
-
-def settings(**changes: object) -> kissgs.Settings:
-    return kissgs.Settings.research("balanced", finetune={"enabled": True, **SHORT, **changes}, **LOOK)
-
-
-def test_output_and_report_are_those_of_the_library(folder: Path, tmp_path: Path) -> None:
-    done = run("compress", "--finetune", "6", folder / "a.ply", "-o", tmp_path / "b.zip", *OPTIONS)
+@pytest.mark.parametrize("container", ["sogxt", "sog"])
+def test_output_and_report_are_those_of_the_library(folder: Path, tmp_path: Path, container: str) -> None:
+    target = tmp_path / ("b.zip" if container == "sogxt" else "b.sog")
+    words = ["compress", "--finetune", "6", folder / "a.ply", "-o", target, *OPTIONS]
+    done = run(*words)
     assert done.returncode == 0, done.stderr
-    found = kissgs.compress(SCENE, settings=settings(steps=6))
-    assert (tmp_path / "b.zip").read_bytes() == found.to_zip()
-    assert found.report.finetuning is not None
-    assert (
-        f"{found.report.finetuning.psnr_before:.2f} -> {found.report.finetuning.psnr_after:.2f} dB"
-        in done.stdout.decode()
-    )
-    assert "fine-tuned on renderings of the scene" in done.stdout.decode()
-
-
-def test_sog_is_fine_tuned_too(folder: Path, tmp_path: Path) -> None:
-    done = run("compress", "--finetune", "6", folder / "a.ply", "-o", tmp_path / "b.sog", *OPTIONS, "--json")
-    assert done.returncode == 0, done.stderr
-    found = kissgs.compress(SCENE, settings=settings(steps=6), container="sog")
-    assert (tmp_path / "b.sog").read_bytes() == found.to_zip()
-    assert json.loads(done.stdout)["finetuning"]["steps"] == 6
-    assert len(kissgs.load(tmp_path / "b.sog")) == len(found.order)
+    settings = kissgs.Settings.research("balanced", finetune={"enabled": True, "steps": 6, **SHORT}, **LOOK)
+    found = kissgs.compress(SCENE, settings=settings, container=container)
+    assert target.read_bytes() == found.to_zip()
+    report = found.report.finetuning
+    assert report is not None
+    assert report.steps == 6
+    text = done.stdout.decode()
+    assert "fine-tuned on renderings of the scene" in text
+    assert f"{report.psnr_before:.2f} -> {report.psnr_after:.2f} dB" in text
 
 
 def test_the_default_number_of_steps_is_that_of_the_preset() -> None:
-    assert with_default_values(["compress", "a.ply", "--finetune"]) == ["compress", "a.ply", "--finetune", "auto"]
-    assert with_default_values(["--finetune", "a.ply", "-q"]) == ["--finetune", "auto", "a.ply", "-q"]
-    assert with_default_values(["--finetune", "70", "a.ply"]) == ["--finetune", "70", "a.ply"]
-    assert with_default_values(["--finetune", "auto"]) == ["--finetune", "auto"]
     for preset, steps in (("fast", 200), ("balanced", 1000), ("small", 2000), ("paper", 4000)):
-        assert kissgs.Settings.from_preset(preset, finetune={"enabled": True}).finetune.steps == steps
+        assert chosen(preset, None, finetune=steps_of("auto")).finetune.steps == steps
+    assert chosen("fast", None, finetune=steps_of("0")).finetune.enabled is False
 
 
 @pytest.mark.parametrize(

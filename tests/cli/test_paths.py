@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from helpers.captured_scene import SCENE, write_capture
-from helpers.command_line import failure
+from helpers.command_line import failure, run
 
 import kissgs
-from kissgs.cli.main import main
+
+SMALL = SCENE.select(slice(0, 40))
 
 PLACES = [  # of paths that go through one function, one
     "compress BAD",
@@ -77,33 +76,11 @@ def folder() -> Iterator[Path]:
         (path / "loop").symlink_to("loop")
         (path / "locked").mkdir(mode=0o000)
         (path / "link").symlink_to("locked/inner")
-        scene = SCENE.select(slice(0, 40))
         for ply in ("scene.ply", "other.ply"):
-            kissgs.save(scene, path / ply)
-        kissgs.compress(scene, path / "scene.zip", settings=kissgs.Settings.from_preset("fast"))
+            kissgs.save(SMALL, path / ply)
+        kissgs.compress(SMALL, path / "scene.zip", settings=kissgs.Settings.from_preset("fast"))
         write_capture(path / "capture")
         yield path
-
-
-@pytest.fixture
-def process(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Change into the folder; restore the signal handlers and hooks that the command line sets."""
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-
-
-def refusal(words: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> list[str]:
-    """Run a command that must end with exit code 2; return its lines on standard error."""
-    monkeypatch.setattr(sys, "argv", ["kissgs", *words])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    said = capfd.readouterr().err.splitlines()
-    assert ended.value.code == 2, (words, said)
-    return said
 
 
 def takes(place: str, kind: str) -> bool:
@@ -113,38 +90,33 @@ def takes(place: str, kind: str) -> bool:
     return not ("BAD." in place and kind in ("a loop", "a link to what is locked"))
 
 
+def said(words: str, kind: str, folder: Path) -> list[str]:
+    """Run a command that must end with exit code 2; return its lines on standard error."""
+    done = run(*(word.replace("BAD", KINDS.get(kind, kind)) for word in words.split()), cwd=folder)
+    assert done.returncode == 2, (words, done)
+    shutil.rmtree(folder / "out", ignore_errors=True)  # the output of another input
+    return done.stderr.decode().splitlines()
+
+
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.usefixtures("process")
 @pytest.mark.quick(2)
-def test_invalid_paths_give_one_line(
-    kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_paths_give_one_line(kind: str, folder: Path) -> None:
     if "lock" in KINDS[kind] + kind and ignores_permissions(folder / "locked"):
         pytest.skip("this user ignores permissions")
     before = sorted(folder.iterdir())
     for place in PLACES:
         if takes(place, kind):
-            said = refusal([word.replace("BAD", KINDS[kind]) for word in place.split()], monkeypatch, capfd)
-            assert 1 <= len(said) <= 2, (place, said)
-            assert all(line.startswith("kissgs: ") for line in said), (place, said)
-            if (folder / "out").exists():  # the output of the other input
-                shutil.rmtree(folder / "out")
+            lines = said(place, kind, folder)
+            assert 1 <= len(lines) <= 2, (place, lines)
+            assert all(line.startswith("kissgs: ") for line in lines), (place, lines)
             assert sorted(folder.iterdir()) == before, place
 
 
-@pytest.mark.parametrize("words", ["compress BAD", "compress BAD other.ply -o out/", "decompress BAD", "render BAD"])
 @pytest.mark.parametrize("kind", ["too long", "a folder that is too long", "within a file", "missing/inner"])
-@pytest.mark.usefixtures("process")
-@pytest.mark.quick(4)
-def test_the_error_names_the_input(
-    words: str, kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_error_names_the_input(kind: str, folder: Path) -> None:
     """Regression: the error named the output, whose path is derived from the input."""
-    name = KINDS.get(kind, kind)
-    said = refusal([word.replace("BAD", name) for word in words.split()], monkeypatch, capfd)
-    assert said[0].startswith(f"kissgs: cannot read {name[:100]}"), said
-    if (folder / "out").exists():
-        shutil.rmtree(folder / "out")
+    for words in ("compress BAD", "compress BAD other.ply -o out/", "decompress BAD", "render BAD"):
+        assert said(words, kind, folder)[0].startswith(f"kissgs: cannot read {KINDS.get(kind, kind)[:100]}"), words
 
 
 @pytest.mark.quick(0)
@@ -168,10 +140,10 @@ def test_the_library_raises_its_own_errors(name: str, folder: Path, monkeypatch:
         lambda: kissgs.decompress(name),
         lambda: kissgs.decompress("scene.zip", f"{name}.ply" if name != "loop" else "loop/x.ply"),
         lambda: kissgs.compress(name),
-        lambda: kissgs.compress(SCENE, name),
-        lambda: kissgs.compress(SCENE, cache=kept),
-        lambda: kissgs.compress(SCENE, checkpoint=kept, settings=few),
-        lambda: kissgs.save(SCENE, f"{name}/x.ply"),
+        lambda: kissgs.compress(SMALL, name),
+        lambda: kissgs.compress(SMALL, cache=kept),
+        lambda: kissgs.compress(SMALL, checkpoint=kept, settings=few),
+        lambda: kissgs.save(SMALL, f"{name}/x.ply"),
         lambda: kissgs.load_views(Path(name)),
         lambda: kissgs.read_ply_info(Path(name)),
     ):

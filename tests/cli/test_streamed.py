@@ -3,9 +3,7 @@
 import json
 import os
 import re
-import signal
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -42,13 +40,13 @@ def test_the_command_writes_what_the_library_writes(scene, tmp_path, name):
     assert sorted(path.name for path in tmp_path.iterdir()) == [folder, "own"]
 
 
-@pytest.mark.parametrize("name", ["city/lod-meta.json", "city.sogxt"])
-def test_options_that_do_not_fit_are_refused(scene, tmp_path, name):
-    target = tmp_path / name
-    for words in (["--evaluate"], ["--cache"], ["--container", "sog"], ["--unpacked"]):
-        said = failure("compress", scene, "-o", target, *words)
-        assert "levels of detail (l" in said
-        assert f"are made without {words[0]}" in said
+def test_options_that_do_not_fit_are_refused(scene, tmp_path):
+    for name in ("city/lod-meta.json", "city.sogxt"):
+        for words in (["--evaluate"], ["--cache"], ["--container", "sog"], ["--unpacked"]):
+            said = failure("compress", scene, "-o", tmp_path / name, *words)
+            assert "levels of detail (l" in said
+            assert f"are made without {words[0]}" in said
+    target = tmp_path / "city.sogxt"
     assert "without goals" in failure("compress", scene, "-o", target, "--target-size", "1MB")
     assert "become" in (said := failure("compress", scene, scene, "-o", target))
     assert said.endswith("; compress one scene at a time")
@@ -56,91 +54,76 @@ def test_options_that_do_not_fit_are_refused(scene, tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_interrupted_work_says_that_it_goes_on_and_does(tmp_path):
-    kissgs.save(kissgs.sample_scene(150_000, sh_degree=0), tmp_path / "scene.ply")
-    target = tmp_path / "city" / "lod-meta.json"
-    call = [str(KISSGS), "compress", str(tmp_path / "scene.ply"), "-o", str(target), "-p", "fast"]
-    process = subprocess.Popen(call, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
-    work = tmp_path / "city.partial"
-    while not any(work.glob("chunk_*_level_*")):  # written by the first stage that is not repeated
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert errors.endswith(b"kissgs: interrupted; the same command goes on where it was\n")
-    assert not Path(target.parent).exists()
-    assert (work / "partition.json").exists()
-    subprocess.run(call, check=True, capture_output=True)
-    assert len(kissgs.load(target)) > 100_000
-    assert not work.exists()
+HOOKS = {
+    "while the scene is partitioned": """
+from kissgs.streaming import build
+def partition(*arguments):
+    (work / "chunk_0.f32").write_bytes(b"1234")
+    os.kill(os.getpid(), signal.SIGINT)
+build.partition = partition
+""",
+    "and once more while that is removed": """
+unlink = pathlib.Path.unlink
+def interrupted(path, *arguments, **options):
+    if path.name == "chunk_0.f32":
+        os.kill(os.getpid(), signal.SIGINT)
+    unlink(path, *arguments, **options)
+pathlib.Path.unlink = interrupted
+""",
+    "after the partition": """
+import kissgs.streaming.compress as module
+keep = module.keep_layout
+def kept(*arguments):
+    keep(*arguments)
+    os.kill(os.getpid(), signal.SIGINT)
+module.keep_layout = kept
+""",
+    "in the next run while modules are imported": """
+class Finder:
+    def find_spec(self, name, *rest):
+        if name == "kissgs.streaming.build": os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder())
+""",
+    "in the next run before it has read the layout": """
+import kissgs.streaming.compress as module
+module.read_layout = lambda work: os.kill(os.getpid(), signal.SIGINT)
+""",
+}
+"""Code of a ``sitecustomize`` that interrupts the command, by the moment."""
+
+FIRST, SECOND, PARTITIONED, *LATER = HOOKS
 
 
-@pytest.mark.parametrize("again", [False, True])
-def test_the_message_of_an_interruption_says_whether_something_is_left(scene, tmp_path, again):
-    # A sitecustomize that interrupts the partition once it has written a file, and perhaps the removal of that, too.
-    (tmp_path / "sitecustomize.py").write_text(
-        "import os, pathlib, signal\n"
-        "from kissgs.streaming import build, items\n"
-        f"work, again = pathlib.Path('city.partial'), {again}\n"
-        "def partition(*arguments):\n"
-        "    (work / 'chunk_0.f32').write_bytes(b'1234')\n"
-        "    os.kill(os.getpid(), signal.SIGINT)\n"
-        "unlink = pathlib.Path.unlink\n"
-        "def interrupted(path, *arguments, **options):\n"
-        "    if again and path.name == 'chunk_0.f32':\n"
-        "        os.kill(os.getpid(), signal.SIGINT)\n"
-        "    unlink(path, *arguments, **options)\n"
-        "build.partition, pathlib.Path.unlink = partition, interrupted\n"
-    )
-    call = [str(KISSGS), "compress", str(scene), "-o", "city/lod-meta.json", "-p", "fast"]
-    paths = f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"
-    environment = {**os.environ, "PYTHONPATH": paths}
-    done = subprocess.run(call, check=False, cwd=tmp_path, env=environment, capture_output=True)
-    left = b"the same command begins anew" if again else b"no partial file is left"
-    assert done.returncode == 130
-    assert done.stderr.endswith(b"kissgs: interrupted; " + left + b"\n")
-    assert (tmp_path / "city.partial").exists() == again
-    subprocess.run(call, cwd=tmp_path, check=True, capture_output=True)
-    assert not (tmp_path / "city.partial").exists()
-
-
-@pytest.mark.parametrize("early", ["kissgs.streaming.build", "kissgs.streaming.compress"])
-def test_a_resumed_run_that_is_interrupted_early_says_that_it_goes_on(scene, tmp_path, early):
-    """The signal arrives before any new work: while the modules are imported, or when the layout is read."""
-
-    class Stop(Exception):
-        pass
-
-    def stop(stage, fraction, note=""):
-        if stage == "merge":
-            raise Stop
-
-    with pytest.raises(Stop):
-        kissgs.compress_streamed(
-            scene, tmp_path / "city/lod-meta.json", settings=Settings.from_preset("fast"), progress=stop
-        )
-    if early == "kissgs.streaming.build":
-        hook = (
-            "import os, signal, sys\n"
-            "class Finder:\n"
-            "    def find_spec(self, name, *rest):\n"
-            f"        if name == '{early}': os.kill(os.getpid(), signal.SIGINT)\n"
-            "sys.meta_path.insert(0, Finder())\n"
-        )
-    else:
-        hook = (
-            "import os, signal\n"
-            f"import {early} as module\n"
-            "module.read_layout = lambda work: os.kill(os.getpid(), signal.SIGINT)\n"
-        )
-    (tmp_path / "sitecustomize.py").write_text(hook)
+@pytest.mark.parametrize(
+    ("moments", "left"),
+    [
+        ([FIRST], "no partial file is left"),
+        ([FIRST, SECOND], "the same command begins anew"),
+        ([PARTITIONED], "the same command goes on where it was"),
+        *(([PARTITIONED, moment], "the same command goes on where it was") for moment in LATER),
+    ],
+)
+def test_an_interruption_says_what_is_left_and_the_same_command_completes_it(scene, tmp_path, moments, left):
     call = [str(KISSGS), "compress", str(scene), "-o", "city/lod-meta.json", "-p", "fast"]
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
-    done = subprocess.run(call, check=False, cwd=tmp_path, env=environment, capture_output=True)
-    assert done.returncode == 130
-    assert done.stderr.endswith(b"kissgs: interrupted; the same command goes on where it was\n")
-    assert (tmp_path / "city.partial" / "partition.json").exists()
+    starts = [[moment] for moment in moments] if PARTITIONED in moments else [moments]
+    for hooks in starts:
+        lines = [
+            "import os, pathlib, signal, sys",
+            "work = pathlib.Path('city.partial')",
+            *(HOOKS[hook] for hook in hooks),
+        ]
+        (tmp_path / "sitecustomize.py").write_text("\n".join(lines))
+        done = subprocess.run(call, check=False, cwd=tmp_path, env=environment, capture_output=True)
+        assert done.returncode == 130, done.stderr
+        assert done.stderr.decode().endswith(f"kissgs: interrupted; {left}\n")
+    assert (tmp_path / "city.partial").exists() == (left != "no partial file is left")
+    assert (tmp_path / "city.partial" / "partition.json").exists() == (PARTITIONED in moments)
+    assert not (tmp_path / "city").exists()
+    assert run(*call[1:], cwd=tmp_path).returncode == 0
+    kissgs.compress_streamed(scene, tmp_path / "own/lod-meta.json", settings=Settings.from_preset("fast"))
+    assert files_of(tmp_path / "city") == files_of(tmp_path / "own")
+    assert not (tmp_path / "city.partial").exists()
 
 
 def test_numbers_say_what_they_count(tmp_path):

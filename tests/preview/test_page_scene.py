@@ -18,14 +18,13 @@ def splats():
     return kissgs.sample_scene(65, sh_degree=2)
 
 
-@pytest.mark.parametrize("name", ["scene.zip", "scene.sog"])
-def test_a_container_is_taken_as_it_is(tmp_path, splats, name):
-    path = tmp_path / name
-    kissgs.compress(splats, path, settings=FAST)
-    for prepare in (page_scene, page_container):
-        found = prepare(path)
-        assert (found.name, found.data, found.converted) == (name, path.read_bytes(), False)
-        assert prepare(path.read_bytes()).data == path.read_bytes()
+def test_a_container_is_taken_as_it_is(tmp_path, splats):
+    for path in (tmp_path / "scene.zip", tmp_path / "scene.sog"):
+        kissgs.compress(splats, path, settings=FAST)
+        for prepare in (page_scene, page_container):
+            found = prepare(path)
+            assert (found.name, found.data, found.converted) == (path.name, path.read_bytes(), False)
+            assert prepare(path.read_bytes()).data == path.read_bytes()
 
 
 def test_a_folder_is_packed(tmp_path, splats):
@@ -40,24 +39,18 @@ def test_a_folder_is_packed(tmp_path, splats):
             assert {name: archive.read(name) for name in archive.namelist()} == expected
 
 
-@pytest.mark.parametrize("ending", ["ply", "spz"])
-def test_other_formats_become_an_exact_ply(tmp_path, splats, ending):
-    path = tmp_path / f"scene.{ending}"
-    kissgs.save(splats, path)
-    found = page_scene(path)
-    assert found.name == f"{path.stem}.ply"
-    (tmp_path / "page.ply").write_bytes(found.data)
-    expected, decoded = kissgs.load(path), kissgs.load(tmp_path / "page.ply")
-    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-        np.testing.assert_array_equal(getattr(decoded, name), getattr(expected, name), err_msg=name)
-
-
-def test_other_formats_become_a_container(tmp_path, splats):
-    path = tmp_path / "scene.ply"
-    kissgs.save(splats, path)
-    found = page_container(path)
-    assert (found.name, found.converted) == ("scene.zip", True)
-    assert found.data == kissgs.compress(path).to_zip()
+def test_other_formats_become_an_exact_ply_or_a_container(tmp_path, splats):
+    for path in (tmp_path / "scene.ply", tmp_path / "scene.spz"):
+        kissgs.save(splats, path)
+        found = page_scene(path)
+        assert (found.name, found.converted) == ("scene.ply", path.suffix != ".ply")
+        (tmp_path / "page.ply").write_bytes(found.data)
+        expected, decoded = kissgs.load(path), kissgs.load(tmp_path / "page.ply")
+        for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+            np.testing.assert_array_equal(getattr(decoded, name), getattr(expected, name), err_msg=name)
+    packed = page_container(tmp_path / "scene.ply")
+    assert (packed.name, packed.converted) == ("scene.zip", True)
+    assert packed.data == kissgs.compress(tmp_path / "scene.ply").to_zip()
 
 
 def test_unreadable_scenes(tmp_path, splats):

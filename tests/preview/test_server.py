@@ -1,12 +1,11 @@
 """The server of ``kissgs view``, by requests over TCP; oracle: the files of its folder."""
 
-import http.client
 import re
 import socket
-import threading
 import time
 
 import pytest
+from helpers.page_server import ask, serving
 from helpers.small_page import FILES, UNSERVED
 
 from kissgs import preview as server_module
@@ -18,42 +17,29 @@ NAME = "two words % & ü?.zip"
 
 @pytest.fixture
 def server(page_folder):
-    with PageServer(PageScene(NAME, b"content", converted=False)) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
+    with serving(PageScene(NAME, b"content", converted=False)) as server:
         yield server
-        server.shutdown()
-        thread.join()
 
 
-def ask(server, path, method="GET", **headers):
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
-    connection.request(method, path, headers=headers)
-    answer = connection.getresponse()
-    body = answer.read()
-    connection.close()
-    return answer, body
+MEDIA_TYPES = {
+    "": "text/html; charset=utf-8",
+    "preview.html": "text/html; charset=utf-8",
+    "preview.css": "text/css; charset=utf-8",
+    "preview/sum.js": "text/javascript; charset=utf-8",
+    "vendor/three/addons/Pass.js": "text/javascript; charset=utf-8",
+    "vendor/three/LICENSE": "text/plain; charset=utf-8",
+}
 
 
-@pytest.mark.parametrize(
-    ("name", "media_type"),
-    [
-        ("", "text/html; charset=utf-8"),
-        ("preview.html", "text/html; charset=utf-8"),
-        ("preview.css", "text/css; charset=utf-8"),
-        ("preview/sum.js", "text/javascript; charset=utf-8"),
-        ("vendor/three/addons/Pass.js", "text/javascript; charset=utf-8"),
-        ("vendor/three/LICENSE", "text/plain; charset=utf-8"),
-    ],
-)
-def test_files_of_the_page(server, name, media_type):
-    answer, body = ask(server, f"/{name}")
-    assert (answer.status, body.decode()) == (200, FILES[name or "preview.html"])
-    assert answer.headers["Content-Type"] == media_type
-    assert answer.headers["X-Content-Type-Options"] == "nosniff"
-    assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
-    head, nothing = ask(server, f"/{name}", "HEAD")
-    assert (head.status, head.headers["Content-Length"], nothing) == (200, str(len(body)), b"")
+def test_files_of_the_page(server):
+    for name, media_type in MEDIA_TYPES.items():
+        answer, body = ask(server, f"/{name}")
+        assert (answer.status, body.decode()) == (200, FILES[name or "preview.html"])
+        assert answer.headers["Content-Type"] == media_type
+        assert answer.headers["X-Content-Type-Options"] == "nosniff"
+        assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+        head, nothing = ask(server, f"/{name}", "HEAD")
+        assert (head.status, head.headers["Content-Length"], nothing) == (200, str(len(body)), b"")
 
 
 def test_the_scene_at_the_address_that_the_page_is_given(server):
@@ -71,36 +57,29 @@ def test_the_policy_allows_the_import_map_and_no_other_origin(server):
     assert set(" ".join(policy.values()).split()) <= {"'none'", "'self'", "data:", "blob:"}
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        *(*UNSERVED, "../secret.js", "%2e%2e/secret.js", "preview/../../secret.js", "..%2Fsecret.js", "%00"),
-        *("vendor", "vendor/", "preview/", "scene/", "scene", "vendor/versions.json", "scene/other.zip", "/etc/passwd"),
-    ],
+OTHER_PATHS = (
+    *(*UNSERVED, "../secret.js", "%2e%2e/secret.js", "preview/../../secret.js", "..%2Fsecret.js", "%00"),
+    *("vendor", "vendor/", "preview/", "scene/", "scene", "vendor/versions.json", "scene/other.zip", "/etc/passwd"),
 )
-def test_nothing_else_is_served(server, path):
-    answer, body = ask(server, f"/{path}")
-    assert (answer.status, body) == (404, b"there is no such file\n")
+OTHER_HOSTS = ("evil.example", "evil.example:PORT", "127.0.0.1", "127.0.0.1:1", "localhost.evil:PORT", "")
 
 
-@pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:PORT", "127.0.0.1", "127.0.0.1:1", "localhost.evil:PORT", ""]
-)
-def test_other_hosts_are_refused(server, host):
+def test_nothing_else_is_served(server):
+    for path in OTHER_PATHS:
+        answer, body = ask(server, f"/{path}")
+        assert (answer.status, body) == (404, b"there is no such file\n"), path
+    for method in ("POST", "OPTIONS"):
+        assert ask(server, "/", method)[0].status == 501
+
+
+def test_other_hosts_are_refused(server):
     """A name that resolves to 127.0.0.1 would otherwise let a web site read the scene."""
-    for path in ("/", "/scene/x.zip", "/preview.js"):
-        answer, body = ask(server, path, Host=host.replace("PORT", str(server.port)))
-        assert answer.status == 403
-        assert b"content" not in body
-
-
-def test_localhost_is_this_machine(server):
+    for host in OTHER_HOSTS:
+        for path in ("/", "/scene/x.zip", "/preview.js"):
+            answer, body = ask(server, path, Host=host.replace("PORT", str(server.port)))
+            assert answer.status == 403, host
+            assert b"content" not in body
     assert ask(server, "/", Host=f"localhost:{server.port}")[0].status == 200
-
-
-@pytest.mark.parametrize("method", ["POST", "OPTIONS"])
-def test_other_methods_are_refused(server, method):
-    assert ask(server, "/", method)[0].status == 501
 
 
 def test_only_this_machine_can_connect(server):

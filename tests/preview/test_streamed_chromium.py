@@ -1,6 +1,5 @@
 """``kissgs view`` of a streamed scene in Chromium: what is loaded when, and what the page says about it."""
 
-import contextlib
 import json
 import re
 import threading
@@ -9,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.page_server import serving
 from helpers.preview_browser import colours, preview, psnr, software_browser  # noqa: F401  fixtures
 from helpers.streamed_scenes import small_sizes
 from helpers.viewers import scattered
@@ -16,7 +16,7 @@ from helpers.viewers import scattered
 import kissgs
 from kissgs import preview as server_module
 from kissgs.core.splats import concatenate
-from kissgs.preview import PageServer, streamed_folder
+from kissgs.preview import streamed_folder
 from kissgs.streaming import levels as environment
 
 NAME = "city 100%41 \N{SNOWMAN}"
@@ -45,22 +45,10 @@ def server(city, monkeypatch):
         return find(handler)
 
     monkeypatch.setattr(server_module._Handler, "_find", held)
-    with serving(city) as server:
+    with serving(streamed_folder(city)) as server:
         server.gate = threading.Event()
         yield server
         server.gate.set()
-
-
-@contextlib.contextmanager
-def serving(folder):
-    with PageServer(streamed_folder(folder)) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield server
-        finally:
-            server.shutdown()
-            thread.join()
 
 
 @pytest.fixture
@@ -212,7 +200,7 @@ def test_the_first_camera_is_within_the_sky(preview, tmp_path, apart):  # noqa: 
     coarsest = kissgs.load(tmp_path / "city", level=3)
     assert np.mean(np.linalg.norm(coarsest.means, axis=1) > 8) > 0.3
     assert (tmp_path / "city" / "environment").exists() == apart
-    with serving(tmp_path / "city") as server:
+    with serving(streamed_folder(tmp_path / "city")) as server:
         tab = preview()
         tab.origin = server.url.partition("?")[0]
         tab.page.goto(server.url)

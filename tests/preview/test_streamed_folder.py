@@ -2,10 +2,10 @@
 
 import json
 import shutil
-import threading
 from pathlib import Path
 
 import pytest
+from helpers.page_server import ask, serving
 from helpers.reference_sog import write_folder
 from helpers.small_page import FILES
 from helpers.streamed_scenes import SOG, small_sizes
@@ -14,10 +14,8 @@ from helpers.viewers import scattered
 import kissgs
 from kissgs import preview as module
 from kissgs.core.errors import InvalidContainerError
-from kissgs.preview import PageServer, fitting_level, is_streamed_folder, streamed_folder
+from kissgs.preview import fitting_level, is_streamed_folder, streamed_folder
 from kissgs.streaming.compress import compress_streamed
-
-from .test_server import ask
 
 NAME = "two words % & ü"
 
@@ -56,21 +54,12 @@ def test_the_files_of_the_manifest_and_no_others(made, city):
     assert streamed_folder(city).missing == ()
 
 
-def test_links_out_of_the_folder_are_left_out(city):
-    (city / "0_0" / "quats.webp").unlink()
-    (city / "0_0" / "quats.webp").symlink_to(city.parent / "secret.webp")
-    (city / "0_1" / "quats.webp").unlink()
-    found = served(city)
-    assert (streamed_folder(city).missing, streamed_folder(city).unusable) == (("0_1/quats.webp",), ("0_0/quats.webp",))
-    assert "0_0/quats.webp" not in found
-    assert "0_1/quats.webp" not in found
-    assert "0_0/sh0.webp" in found
-
-
 def test_files_out_of_reach_are_left_out(city, monkeypatch):
-    """One is a link to itself, another one in a closed folder, which is simulated, because root may read those."""
-    (city / "0_0" / "quats.webp").unlink()
-    (city / "0_0" / "quats.webp").symlink_to("quats.webp")
+    """A link out of the folder, one to itself, and one in a closed folder, which root could read."""
+    for name, target in (("0_0/quats.webp", city.parent / "secret.webp"), ("0_0/scales.webp", "scales.webp")):
+        (city / name).unlink()
+        (city / name).symlink_to(target)
+    (city / "0_1" / "quats.webp").unlink()
     is_file = Path.is_file
 
     def closed(path):
@@ -79,10 +68,11 @@ def test_files_out_of_reach_are_left_out(city, monkeypatch):
         return is_file(path)
 
     monkeypatch.setattr(Path, "is_file", closed)
-    found = streamed_folder(city).files
-    assert "0_0/quats.webp" not in found
-    assert "0_1/sh0.webp" not in found
-    assert {"0_0/sh0.webp", "0_1/quats.webp"} <= set(found)
+    found = streamed_folder(city)
+    assert found.missing == ("0_1/quats.webp",)
+    assert set(found.unusable) == {"0_0/quats.webp", "0_0/scales.webp", "0_1/sh0.webp"}
+    assert not {*found.missing, *found.unusable} & found.files.keys()
+    assert {"0_0/sh0.webp", "0_1/scales.webp"} <= found.files.keys()
 
 
 def test_damaged_metadata(city):
@@ -94,13 +84,13 @@ def test_damaged_metadata(city):
         streamed_folder(city)
 
 
-@pytest.mark.parametrize("name", ["../secret.webp", "/etc/passwd", "https://other/meta.json", "a/../../secret.webp"])
-def test_manifests_that_name_other_files(city, name):
-    document = json.loads((city / "lod-meta.json").read_bytes())
-    document["filenames"][0] = name
-    (city / "lod-meta.json").write_text(json.dumps(document))
-    with pytest.raises(kissgs.KissgsError):
-        streamed_folder(city)
+def test_manifests_that_name_other_files(city):
+    for name in ("../secret.webp", "/etc/passwd", "https://other/meta.json", "a/../../secret.webp"):
+        document = json.loads((city / "lod-meta.json").read_bytes())
+        document["filenames"][0] = name
+        (city / "lod-meta.json").write_text(json.dumps(document))
+        with pytest.raises(kissgs.KissgsError):
+            streamed_folder(city)
 
 
 def test_containers_that_are_one_file(city):
@@ -116,12 +106,8 @@ def test_containers_that_are_one_file(city):
 
 @pytest.fixture
 def server(page_folder, city):
-    with PageServer(streamed_folder(city)) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
+    with serving(streamed_folder(city)) as server:
         yield server
-        server.shutdown()
-        thread.join()
 
 
 def test_the_server(server, city):

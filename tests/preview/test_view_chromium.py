@@ -1,13 +1,13 @@
 """``kissgs view`` in Chromium, served and from disk; reference: a ``.ply`` of equal values that Spark itself reads."""
 
 import json
-import threading
 
 import pytest
+from helpers.page_server import serving
 from helpers.preview_browser import colours, preview, psnr, software_browser  # noqa: F401  fixtures
 
 import kissgs
-from kissgs.preview import PageScene, PageServer, page_scene, standalone_page
+from kissgs.preview import PageScene, page_scene, standalone_page
 
 NAME = "a 'b' <i>&amp; 100%41 \N{SNOWMAN}"
 
@@ -24,16 +24,12 @@ def shown(preview):  # noqa: F811
     """``shown(scene, count)`` serves a scene and returns the page's image of it."""
 
     def show(scene, count):
-        with PageServer(scene) as server:
-            thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-            thread.start()
+        with serving(scene) as server:
             tab = preview()
             tab.origin = server.url.partition("?")[0]
             tab.page.goto(server.url)
             image = tab.shown(count)
             assert tab.page.locator("#title").inner_text() == scene.name
-            server.shutdown()
-            thread.join()
         return image
 
     return show

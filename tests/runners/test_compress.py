@@ -157,20 +157,16 @@ def test_one_sentence_for_what_a_cluster_cannot_do(whole_cluster, scenes, words,
     assert not list(scenes.glob("*.zip"))
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
+def test_a_machine_without_the_shared_storage(scenes, tmp_path):
+    scene = scenes / "a.ply"
+    arguments = {"scene": str(scene), "bytes": scene.stat().st_size, "work": str(tmp_path)}
+    for change, expected in (
         ({"scene": "/nowhere/a.ply"}, "does not see /nowhere/a.ply; --ray needs storage"),
         ({"bytes": 7}, "sees another file as"),
         ({"work": "/nowhere/x"}, "does not see what this machine writes to /nowhere"),
-    ],
-)
-def test_a_machine_without_the_shared_storage(scenes, tmp_path, change, expected):
-    scene = scenes / "a.ply"
-    arguments = {"scene": str(scene), "bytes": scene.stat().st_size, "work": str(tmp_path)} | change
-    with pytest.raises(kissgs.UnsupportedError) as raised:
-        compress_scene(arguments, lambda *event: None)
-    assert expected in str(raised.value)
+    ):
+        with pytest.raises(kissgs.UnsupportedError, match=expected):
+            compress_scene(arguments | change, lambda *event: None)
 
 
 @pytest.mark.quick(0)
@@ -188,23 +184,27 @@ def test_a_cluster_of_this_machine_is_started_where_there_is_none(scenes, tmp_pa
     assert list(home.iterdir()) == []
 
 
-def test_the_default_address_is_auto():
+def test_values_that_may_be_left_out(tmp_path):
     for words, meant in (
         (["a.ply", "--ray"], ["a.ply", "--ray", "auto"]),
         (["--ray", "a.ply"], ["--ray", "auto", "a.ply"]),
         (["--ray", "head:6379", "a.ply"], ["--ray", "head:6379", "a.ply"]),
         (["--ray", "[::1]:6379"], ["--ray", "[::1]:6379"]),
+        (["--ray", str(tmp_path)], ["--ray", "auto", str(tmp_path)]),  # a container or a streamed scene
         *((["--ray", scene], ["--ray", "auto", scene]) for scene in ("*.ply", "missing.zip", "dir/x", "-q", "a.sog")),
+        (["a.ply", "--finetune"], ["a.ply", "--finetune", "auto"]),
+        (["--finetune", "a.ply", "-q"], ["--finetune", "auto", "a.ply", "-q"]),
+        (["--finetune", "70", "a.ply"], ["--finetune", "70", "a.ply"]),
+        (["--finetune", "auto"], ["--finetune", "auto"]),
+        (["--", "--ray"], ["--", "--ray"]),
     ):
         assert with_default_values(["compress", *words]) == ["compress", *meant]
 
 
-@pytest.mark.parametrize("address", ["127.0.0.1", "http://127.0.0.1:6379", "head", "head.example.com", "h:port"])
-def test_an_address_without_a_port_is_not_taken_for_a_scene(scenes, tmp_path, address):
-    said = failure("compress", "--ray", address, scenes / "a.ply", "-o", tmp_path)
-    assert said == f"kissgs: --ray takes HOST:PORT, such as head:6379, not {address}"
-    (tmp_path / "head").mkdir()  # a container or a streamed scene
-    assert with_default_values(["compress", "--ray", str(tmp_path / "head")])[2] == "auto"
+def test_an_address_without_a_port_is_not_taken_for_a_scene(scenes, tmp_path):
+    for address in ("127.0.0.1", "http://127.0.0.1:6379", "head", "head.example.com", "h:port"):
+        said = failure("compress", "--ray", address, scenes / "a.ply", "-o", tmp_path)
+        assert said == f"kissgs: --ray takes HOST:PORT, such as head:6379, not {address}"
 
 
 def test_an_address_is_not_asked_for_where_there_is_no_cluster(scenes):

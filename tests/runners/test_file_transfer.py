@@ -76,13 +76,15 @@ def work(tmp_path):
 
 def test_an_item_whose_node_is_killed_leaves_its_checkpoint(whole_cluster, ray_runner, work):
     folder, submitted = work
-    handle = ray_runner.submit(submitted)
+    stages = []
+    handle = ray_runner.submit(submitted, lambda *event: stages.append(event))
     wait_until((folder / "checkpoint").exists)
     assert {path.name for path in folder.iterdir()} == {"scene", "checkpoint"}
     (pid,) = whole_cluster.items()
     whole_cluster.kill_node_of(pid)
     outcome = handle.outcome.result(120)
     assert outcome.kind == "done"
+    assert stages[0] == stages[-1] == ("digest", 0.0, "")
     assert outcome.result["folder"].startswith(str(whole_cluster.folder))
     digest = hashlib.sha256((folder / "scene").read_bytes()).hexdigest()
     assert contents(folder / "made") == {"digest": digest.encode()}

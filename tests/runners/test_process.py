@@ -10,7 +10,7 @@ import pytest
 from helpers.running import MB, item
 
 import kissgs
-from kissgs.cli.compress_scenes import ClusterCompression
+from kissgs.cli.compress_scenes import with_memory
 from kissgs.runners import Resources, WorkItem
 from kissgs.runners.contract import refusal_of
 from kissgs.runners.process import ItemProcess, json_lines
@@ -108,8 +108,7 @@ def test_a_request_is_that_of_a_node_which_has_all_of_it():
         def refusal(self, resources):
             return refusal_of(resources, self.nodes)
 
-    chosen = ClusterCompression._with_memory
-    assert chosen(None, Cluster(), Resources(4, gpus=1), 120) == Resources(4, 20, 1)
-    assert chosen(None, Cluster(), Resources(4), 120) == Resources(4, 120, 0)
+    assert with_memory(Cluster(), Resources(4, gpus=1), 120) == Resources(4, 20, 1)
+    assert with_memory(Cluster(), Resources(4), 120) == Resources(4, 120, 0)
     with pytest.raises(kissgs.UnsupportedError, match="no node has 32 CPUs"):
-        chosen(None, Cluster(), Resources(32), 120)
+        with_memory(Cluster(), Resources(32), 120)

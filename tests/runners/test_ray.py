@@ -25,22 +25,6 @@ runner.submit(item("write_slowly", starts=sys.argv[2], output=sys.argv[3], text=
 """
 
 
-@pytest.mark.quick(0)  # with files, in test_file_transfer.py
-def test_an_item_whose_node_is_killed_runs_elsewhere(whole_cluster, ray_runner, tmp_path):
-    starts, output, notes = tmp_path / "starts", tmp_path / "output", []
-    work = item("write_slowly", starts=str(starts), output=str(output), text="the same bytes")
-    handle = ray_runner.submit(work, lambda stage, fraction, note: notes.append(note))
-    first = pid_in(starts)
-    wait_until(lambda: notes == ["first"])
-    whole_cluster.kill_node_of(first)
-    outcome = handle.outcome.result(120)
-    assert outcome.kind == "done"
-    assert notes == ["first", "again"]
-    assert output.read_text() == "the same bytes"
-    assert len(starts.read_text().splitlines()) == 2
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["output", "starts"]
-
-
 @pytest.mark.quick(0)
 def test_an_item_that_loses_all_of_its_nodes_is_lost(whole_cluster, ray_runner, tmp_path):
     work = item("write_slowly", starts=str(tmp_path / "starts"), output=str(tmp_path / "output"), text="", retries=0)
