@@ -12,9 +12,8 @@ from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.constants import ALPHA_MIN
-from kissgs.rendering.cpu import blending
-from kissgs.rendering.cpu.backward import differentiate_footprints
-from kissgs.rendering.cpu.frame import Frame, draw
+from kissgs.rendering.cpu.frame import differentiate_footprints, draw, sums_of_slots
+from kissgs.rendering.cpu.records import Frame
 
 # Prominence of Gaussians, and a sampler that draws them by it so that every part of a scene is considered.
 
@@ -259,9 +258,7 @@ def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     ones, zeros = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     ones[:, :, 0] = 1  # so the gradient with respect to a red value is the sum of weights
     v_slots, slots, _ = differentiate_footprints(frame, ones, zeros, pool)
-    weights = np.zeros(len(frame.footprints.visible), np.float64)
-    blending.sum_errors(np.ascontiguousarray(v_slots[:, 6]), slots, frame.footprints.visible, weights)
-    return weights
+    return sums_of_slots(frame, slots, np.ascontiguousarray(v_slots[:, 6]))
 
 
 def share_shown(splats: Splats, cameras: Sequence[Camera], *, threads: int = 0) -> float:

@@ -13,8 +13,8 @@ from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.constants import DILATION
-from kissgs.rendering.cpu.backward import Gradients, differentiate
-from kissgs.rendering.cpu.frame import Frame, draw
+from kissgs.rendering.cpu.frame import Gradients, differentiate, draw
+from kissgs.rendering.cpu.records import Frame
 from kissgs.rendering.metrics import differences_and_ssim
 from kissgs.rendering.tensors import Parameters
 

@@ -20,7 +20,7 @@ from kissgs.rendering.constants import DILATION
 from kissgs.rendering.cpu.tiles import each_part, even
 
 if TYPE_CHECKING:
-    from kissgs.rendering.cpu.frame import Frame
+    from kissgs.rendering.cpu.records import Frame
 
 
 LEAF = 512
@@ -104,9 +104,8 @@ class Coverage:
         """
         from kissgs.rendering.cpu.sensitivity import raise_coverage
 
-        limits = np.array([VISIBLE, RESOLVED / finer, frame.camera.dilation / DILATION])
-        scene = frame.gaussians, frame.projection, self._scale, frame.footprints.visible
-        pool.map(lambda rows: raise_coverage(*scene, *rows, seen, limits, self.share), frame.parts)
+        limits = np.array([VISIBLE, RESOLVED / finer, frame.projection.dilation / DILATION])
+        pool.map(lambda rows: raise_coverage(frame, self._scale, *rows, seen, limits, self.share), frame.parts)
 
 
 # Measurement of the sensitivity of a scene, exactly to first order, with one backward pass per image.
@@ -314,8 +313,7 @@ class _LeastSquares:
 
     def negative_gradient(self, sh0: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
         """Return minus half the gradient by the base colours; renders all images once."""
-        from kissgs.rendering.cpu.backward import add_color_gradients
-        from kissgs.rendering.cpu.frame import draw
+        from kissgs.rendering.cpu.frame import add_color_gradients, draw
 
         total = np.zeros(sh0.shape, np.float32)
         scene, count = replace(self.decoded, sh0=sh0.astype(np.float32)), len(self.cameras.cameras)

@@ -1,13 +1,14 @@
-"""One image on the CPU: rendering, removal scores and sensitivity, independent of the number of threads."""
+"""One image on the CPU: rendering, removal scores, sensitivity and gradients, independent of the number of threads."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Int64, Shaped
+from kissgs.core.array_types import Bool, Float32, Float64, Int32, Int64, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
@@ -15,7 +16,8 @@ from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending, sensitivity
-from kissgs.rendering.cpu.records import Blended, Footprints, Gaussians, Projection, TileLists
+from kissgs.rendering.cpu.projection import add_colors, project_backward, shade_backward
+from kissgs.rendering.cpu.records import Blended, Frame, Gaussians, Projection, Slots, TileLists
 from kissgs.rendering.cpu.tiles import (
     Part,
     each_part,
@@ -28,34 +30,6 @@ from kissgs.rendering.cpu.tiles import (
 
 BAND = 1 << 19
 """Number of members of tiles whose moments are in memory at once."""
-
-
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """A rendered image, with the intermediate results that its derivatives and scores need."""
-
-    gaussians: Gaussians
-    camera: Camera
-    projection: Projection
-    footprints: Footprints
-    parts: list[Part]
-    """Ranges of rows that hold footprints; other rows are not set."""
-    lists: TileLists
-    blended: Blended
-
-    @property
-    def image(self) -> Float32[np.ndarray, "H W 3"]:
-        """RGB, 0 and up, not clamped to 1."""
-        return self.blended.image
-
-    @property
-    def transmittance(self) -> Float32[np.ndarray, "H W"]:
-        """Share of the background that is visible, 1 - alpha."""
-        return self.blended.transmittance
-
-    def rows(self) -> Int64[np.ndarray, " M"]:
-        """Return the rows that hold footprints, ascending."""
-        return np.concatenate([np.arange(first, last) for first, last in self.parts])
 
 
 def draw(
@@ -91,12 +65,9 @@ def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], 
         background,
         np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, end], np.float32),
     )
-    each_part(
-        lambda first, last: blending.blend(footprints.records, lists, first, last, blended),
-        even_tiles(lists, pool),
-        pool,
-    )
-    return Frame(gaussians, camera, projection, footprints, parts, lists, blended)
+    frame = Frame(gaussians, projection, footprints, parts, lists, blended)
+    each_part(lambda first, last: blending.blend(frame, first, last), even_tiles(lists, pool), pool)
+    return frame
 
 
 def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
@@ -105,16 +76,23 @@ def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     A sum over pixels and RGB (GaussianPOP, section 3), exact except for Gaussians behind the end of a pixel's list,
     which a removal may reveal; 0 for Gaussians outside the image.
     """
-    lists, records = frame.lists, frame.footprints.records
-    slots, errors = number_slots(lists, len(records)), np.empty(len(lists.members), np.float32)
+    slots, errors = (
+        number_slots(frame.lists, len(frame.gaussians.means)),
+        np.zeros(len(frame.lists.members), np.float32),
+    )
     each_part(
-        lambda first, last: blending.removal_errors(records, lists, slots, first, last, frame.blended, errors),
-        even_tiles(lists, pool),
+        lambda first, last: blending.removal_errors(frame, slots, first, last, errors),
+        even_tiles(frame.lists, pool),
         pool,
     )
-    scores = np.zeros(len(records), np.float64)
-    blending.sum_errors(errors, slots, frame.footprints.visible, scores)
-    return scores
+    return sums_of_slots(frame, slots, errors)
+
+
+def sums_of_slots(frame: Frame, slots: Slots, values: Float32[np.ndarray, " slots"]) -> Float64[np.ndarray, " N"]:
+    """Return, for each Gaussian of the scene, the sum of the values in its slots."""
+    sums = np.zeros(len(frame.footprints.records), np.float64)
+    blending.sum_slots(values, slots, frame.footprints.visible, sums)
+    return sums
 
 
 def add_sensitivities(
@@ -148,20 +126,15 @@ def add_sensitivities(
 
 def _add_band(frame: Frame, band: Part, weight: float, spread: float, sums: sensitivity.Sums, pool: Workers) -> None:
     """Add the sensitivity in a band of tiles."""
-    lists, footprints = frame.lists, frame.footprints
-    slots = number_slots(lists, len(footprints.records), band)
-    moments = np.empty((len(slots.of), sensitivity.MOMENTS), np.float32)
+    slots = number_slots(frame.lists, len(frame.footprints.records), band)
+    moments = np.zeros((len(slots.of), blending.MOMENTS), np.float32)
     each_part(
-        lambda first, last: sensitivity.moments(
-            footprints.records, lists, slots, first, last, frame.blended, spread, moments
-        ),
-        even_tiles(lists, pool, band),
+        lambda first, last: blending.moments(frame, slots, first, last, spread, moments),
+        even_tiles(frame.lists, pool, band),
         pool,
     )
     each_part(
-        lambda first, last: sensitivity.add_to_parameters(
-            frame.gaussians, frame.projection, footprints.visible, slots, moments, first, last, weight, sums
-        ),
+        lambda first, last: sensitivity.add_to_parameters(frame, slots, moments, first, last, weight, sums),
         even(len(slots.rows), pool),
         pool,
     )
@@ -179,3 +152,85 @@ def for_kernels(splats: Splats) -> Splats:
     return (
         splats if all(array is getattr(splats, name) for name, array in arrays.items()) else replace(splats, **arrays)
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Gradients:
+    """Gradients of a loss by the stored parameters of the R Gaussians that have any; those of all others are 0."""
+
+    gaussians: Int32[np.ndarray, " R"]
+    """Indices of these Gaussians, ascending."""
+    means: Float32[np.ndarray, "R 3"]
+    quats: Float32[np.ndarray, "R 4"]
+    scales: Float32[np.ndarray, "R 3"]
+    opacities: Float32[np.ndarray, " R"]
+    sh0: Float32[np.ndarray, "R 3"]
+    shN: Float32[np.ndarray, "R K 3"]
+
+    def add_to(self, name: str, total: Shaped[np.ndarray, "N ..."]) -> None:
+        """Add the gradients by the attribute ``name`` to those of all Gaussians."""
+        total[self.gaussians] += getattr(self, name)
+
+    @classmethod
+    def sum(cls, parts: Sequence[Gradients]) -> Gradients:
+        """Return the sum of one or more gradients, added in order."""
+        if len(parts) == 1:
+            return parts[0]
+        gaussians = np.unique(np.concatenate([part.gaussians for part in parts]))
+        totals = []
+        for field in fields(cls)[1:]:
+            total = np.zeros((len(gaussians), *getattr(parts[0], field.name).shape[1:]), np.float32)
+            for part in parts:
+                total[np.searchsorted(gaussians, part.gaussians)] += getattr(part, field.name)
+            totals.append(total)
+        return cls(gaussians, *totals)
+
+
+def differentiate(
+    frame: Frame, v_image: Float32[np.ndarray, "H W 3"], v_alpha: Float32[np.ndarray, "H W"], pool: Workers
+) -> Gradients:
+    """Return the gradients of a loss by the stored parameters, given those by the image and by its alpha.
+
+    Only Gaussians that contribute to the image have any: of many Gaussians, most lie outside it, or behind others.
+    """
+    v_slots, slots, any_gradient = differentiate_footprints(frame, v_image, v_alpha, pool)
+    changed = slots.rows[any_gradient[slots.rows]]
+    count = len(changed)
+    gradients = Gaussians(*(np.empty((count, *array.shape[1:]), np.float32) for array in frame.gaussians))
+    indices, v_colors = np.empty(count, np.int32), np.empty((count, 3), np.float64)
+
+    def part(first: int, last: int) -> None:
+        project_backward(frame, slots, v_slots, changed, first, last, indices, gradients, v_colors)
+        shade_backward(frame, indices, first, last, v_colors, gradients)
+
+    each_part(part, even(count, pool), pool)
+    return Gradients(indices, *gradients)
+
+
+def differentiate_footprints(
+    frame: Frame, v_image: Float32[np.ndarray, "H W 3"], v_alpha: Float32[np.ndarray, "H W"], pool: Workers
+) -> tuple[Float32[np.ndarray, "slots 9"], Slots, Bool[np.ndarray, " N"]]:
+    """Return what :func:`blending.blend_backward` finds: sums by slot, the slots, and which rows have any gradient."""
+    count = len(frame.footprints.records)
+    slots, changed = number_slots(frame.lists, count), np.zeros(count, bool)
+    v_slots = np.zeros((len(frame.lists.members), 9), np.float32)
+    each_part(
+        lambda a, b: blending.blend_backward(frame, slots, a, b, v_image, v_alpha, v_slots, changed),
+        even_tiles(frame.lists, pool),
+        pool,
+    )
+    return v_slots, slots, changed
+
+
+def add_color_gradients(
+    frame: Frame, v_image: Float32[np.ndarray, "H W 3"], into: Float32[np.ndarray, "N 3"], pool: Workers
+) -> None:
+    """Add the gradients of a loss by ``sh0`` alone, given its gradient by the image, ``v_image``, to ``into``."""
+    slots = number_slots(frame.lists, len(frame.footprints.records))
+    v_slots = np.zeros((len(frame.lists.members), 3), np.float32)
+    each_part(
+        lambda a, b: blending.blend_colors_backward(frame, slots, a, b, v_image, v_slots),
+        even_tiles(frame.lists, pool),
+        pool,
+    )
+    each_part(lambda a, b: add_colors(frame, slots, a, b, v_slots, into), even(len(slots.rows), pool), pool)

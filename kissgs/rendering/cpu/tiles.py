@@ -239,7 +239,9 @@ PARTS_PER_THREAD = 4
 """Number of parts per thread; parts differ in cost, and smaller ones balance the load."""
 
 
-def find_footprints(gaussians: Gaussians, projection: Projection, pool: Workers) -> tuple[Footprints, list[Part]]:
+def find_footprints(
+    gaussians: Gaussians, projection: Projection, pool: Workers
+) -> tuple[Footprints, Int64[np.ndarray, "parts 2"]]:
     """Project and shade all Gaussians; return those that touch the image, and the ranges of rows that hold them."""
     count = len(gaussians.means)
     found = Footprints(np.empty(count, np.int32), np.empty(count, np.float32), np.empty((count, 11), np.float32))
@@ -249,10 +251,12 @@ def find_footprints(gaussians: Gaussians, projection: Projection, pool: Workers)
         shade(gaussians, projection, first, end, found)
         return first, end
 
-    return found, each_part(part, even(count, pool), pool)
+    return found, np.array(each_part(part, even(count, pool), pool))
 
 
-def sort_into_tiles(footprints: Footprints, parts: list[Part], projection: Projection, pool: Workers) -> TileLists:
+def sort_into_tiles(
+    footprints: Footprints, parts: Int64[np.ndarray, "parts 2"], projection: Projection, pool: Workers
+) -> TileLists:
     """Return lists of the footprints that touch each tile, nearest first; they do not depend on the parts."""
     rows, columns = -(-projection.height // constants.TILE), -(-projection.width // constants.TILE)
     per_part = np.zeros((len(parts), rows, columns), np.int64)
