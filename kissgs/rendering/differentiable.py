@@ -39,16 +39,12 @@ def rasterize(
     threads: int = 0,
     receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Render images of a scene, with gradients by all of its parameters.
+    """Render images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``, with gradients by all parameters.
 
     On the CPU by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``), both with the image model of
-    :mod:`kissgs.rendering.constants`. Parameters are float32 and finite, on one device, as from
-    :func:`kissgs.rendering.tensors.tensors_of`; cameras ``(C, 4, 4)`` and ``(C, 3, 3)``, and backgrounds ``(C, 3)``,
-    have no gradient. ``receive`` is called in the backward pass on the CPU with the gradients of each image, in place
-    of autograd: most Gaussians have none, and arrays for all of them take longer to fill than to compute.
-
-    Returns:
-        Images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``.
+    :mod:`kissgs.rendering.constants`. Cameras ``(C, 4, 4)`` and ``(C, 3, 3)``, and backgrounds ``(C, 3)``, have no
+    gradient. ``receive`` is called in the backward pass on the CPU with the gradients of each image, in place of
+    autograd: most Gaussians have none, and arrays for all of them take longer to fill than to compute.
     """
     tensors, device = [parameters[name] for name in ATTRIBUTES], parameters["means"].device
     if backgrounds is None:
@@ -197,11 +193,7 @@ def plain_photometric_loss(
     ssim_weight: float,
     mse_weight: float = 0.0,
 ) -> Float[torch.Tensor, ""]:
-    """Return the loss of :func:`photometric_loss` by plain torch operations, on any device and in any dtype.
-
-    As in the kernels, the sum, the difference and their squares are blurred, so that 1 - SSIM of nearly equal images is
-    accurate in float32.
-    """
+    """Return the loss of :func:`photometric_loss` by plain torch operations, on any device and in any dtype."""
     x, y = (images.reshape(-1, *images.shape[-3:]).clamp(-1e9, 1e9) for images in (image, target))
     s, d = x + y, x - y
     S, D, SS, DD = _blur(torch.cat([s, d, s * s, d * d], dim=-1).permute(0, 3, 1, 2)).chunk(4, dim=1)

@@ -16,7 +16,6 @@ from kissgs.core.resources import Workers, return_free_memory
 from kissgs.core.sensitivity import BLOCK, LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import SH_C0, Splats
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.constants import DILATION
 from kissgs.rendering.cpu.tiles import each_part, even
 
 if TYPE_CHECKING:
@@ -26,44 +25,26 @@ if TYPE_CHECKING:
 LEAF = 512
 """Largest number of Gaussians in a leaf of the tree, among which neighbours are searched."""
 
-NEIGHBOURS = 4
-"""The local scale is the distance within which 1 / NEIGHBOURS of the leaf's Gaussians lie."""
-
-SAMPLED = 4
-"""Stride of the leaf's Gaussians to which distances are measured."""
-
-GAP = 0.2
-"""Share of the distance expected on a surface of uniform density: if the nearest half, quarter or eighth of the
-neighbours is nearer than that, the object has no more Gaussians, and their distance is used."""
-
 
 def local_scale(splats: Splats, *, threads: int = 0) -> Float32[np.ndarray, " N"]:
-    """Return the distance from each Gaussian to about its 128th neighbour, ``(N,)``, world units, positive.
+    """Return the distance from each Gaussian to about its 128th neighbour, at least its own size, world units.
 
     Distances are measured within the leaves of a k-d tree of equal counts, which adapts to parts of any size. For an
-    object of fewer Gaussians, the distance is extrapolated as if its surface continued. The result is at least the
-    Gaussian's own size.
+    object of fewer Gaussians, the distance is extrapolated as if its surface continued.
     """
     from kissgs.rendering.cpu.neighbours import leaf_scales, leaves_of
 
     means, found = np.array(splats.means, order="C"), np.empty(len(splats), np.float32)
     order, edges = leaves_of(means, LEAF)
     with Workers(threads) as pool:
-        each_part(
-            lambda first, last: leaf_scales(means, order, edges, first, last, SAMPLED, NEIGHBOURS, GAP, found),
-            even(len(edges) - 1, pool),
-            pool,
-        )
+        leaves = even(len(edges) - 1, pool)
+        each_part(lambda first, last: leaf_scales(means, order, edges, first, last, found), leaves, pool)
     sizes = np.exp(np.median(splats.scales, axis=1))
     least = np.maximum(1e-6 * np.abs(splats.means).max(axis=1, initial=0), 1e-12)  # about float32's resolution
     return np.maximum(np.maximum(found, sizes), least).astype(np.float32)
 
 
 # Coverage: how well the best camera has seen each Gaussian, by visibility and resolution.
-
-VISIBLE = 0.003
-"""Share of a Gaussian's squared alpha in an image from which on it counts as seen; with less than a twentieth of its
-opacity unobstructed, it is hidden."""
 
 RESOLVED = 3.0
 """Length in the image of the distance to the 128th neighbour from which on a Gaussian counts as resolved, pixels."""
@@ -104,8 +85,8 @@ class Coverage:
         """
         from kissgs.rendering.cpu.sensitivity import raise_coverage
 
-        limits = np.array([VISIBLE, RESOLVED / finer, frame.projection.dilation / DILATION])
-        pool.map(lambda rows: raise_coverage(frame, self._scale, *rows, seen, limits, self.share), frame.parts)
+        length = RESOLVED / finer
+        pool.map(lambda part: raise_coverage(frame, self._scale, *part, seen, length, self.share), frame.parts.tolist())
 
 
 # Measurement of the sensitivity of a scene, exactly to first order, with one backward pass per image.

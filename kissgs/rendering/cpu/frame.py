@@ -41,8 +41,7 @@ def draw(
 ) -> Frame:
     """Render an image of a finite scene (:func:`kissgs.clean`) by the image model of :mod:`kissgs.rendering.constants`.
 
-    The list of a pixel ends at the transmittance ``end``. A larger one than that of the image model takes less time,
-    and shows the background instead of what is behind.
+    Beyond the transmittance ``end``, the background is shown instead of what is behind.
     """
     colour = np.array(background, np.float32, order="C")
     if colour.shape != (3,) or not np.isfinite(colour).all():
@@ -65,17 +64,13 @@ def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], 
         background,
         np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, end], np.float32),
     )
-    frame = Frame(gaussians, projection, footprints, parts, lists, blended)
+    frame = Frame(gaussians, projection, footprints, np.array(parts), lists, blended)
     each_part(lambda first, last: blending.blend(frame, first, last), even_tiles(lists, pool), pool)
     return frame
 
 
 def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
-    """Return, for each Gaussian of the scene, the squared change of the image by its removal alone, ``(N,)``.
-
-    A sum over pixels and RGB (GaussianPOP, section 3), exact except for Gaussians behind the end of a pixel's list,
-    which a removal may reveal; 0 for Gaussians outside the image.
-    """
+    """Return the squared change of the image by each Gaussian's removal; see :func:`rasterizer.removal_scores`."""
     slots, errors = (
         number_slots(frame.lists, len(frame.gaussians.means)),
         np.zeros(len(frame.lists.members), np.float32),
@@ -98,15 +93,11 @@ def sums_of_slots(frame: Frame, slots: Slots, values: Float32[np.ndarray, " slot
 def add_sensitivities(
     frame: Frame, weight: float, spread: float, into: Sensitivity, pool: Workers
 ) -> Float32[np.ndarray, " N"]:
-    """Add the sensitivity in this image to sums over images, ``into``; ``weight``: of a single value's squared error.
+    """Add the sensitivity in this image to ``into``, and return the sum of (alpha T)² over its pixels by footprint.
 
-    ``spread`` is the standard deviation of each channel of the background. ``shape_hessian`` receives moments, to be
-    converted by :func:`kissgs.rendering.cpu.sensitivity.moments_to_hessians` in the end; both fields of harmonics
-    receive sums of (alpha T)² times the spherical harmonics, to be divided by ``color_weight``.
-
-    Returns:
-        Sum of (alpha T)² over the pixels of this image, by row of the frame's footprints; rows without a footprint are
-        not set.
+    ``weight`` is that of a single value's squared error, ``spread`` the standard deviation of the background.
+    ``shape_hessian`` receives moments, which :func:`sensitivity.moments_to_hessians` converts in the end; harmonics are
+    weighted by (alpha T)², and to be divided by ``color_weight``.
     """
     seen = np.empty(len(frame.footprints.records), np.float32)
     for first, last in frame.parts:

@@ -35,25 +35,25 @@ from kissgs.rendering.cpu.records import FRAME, SLOTS, Frame, Slots, named_tuple
 # Numba kernel of coverage: how well an image shows each Gaussian, by visibility and resolution.
 
 
-@compiled(void(FRAME, float32[::1], int64, int64, float32[::1], float64[::1], float32[::1]))
+@compiled(void(FRAME, float32[::1], int64, int64, float32[::1], float64, float32[::1]))
 def raise_coverage(
     frame: Frame,
     local_scale: np.ndarray,
     first: int,
     last: int,
     seen: np.ndarray,
-    limits: np.ndarray,
+    resolved_length: float,
     share: np.ndarray,
 ) -> None:
     """Raise the coverage, ``share``, of the Gaussians of footprints ``first`` to ``last`` (exclusive) by one image.
 
-    ``seen`` is the sum of (alpha T)² over the pixels of each footprint. ``limits``: share of the squared alpha from
-    which a Gaussian counts as seen; length in the image of the local scale from which it counts as resolved, pixels;
-    area of a squared Gaussian that is a dilated point, pixels.
+    ``seen`` is the sum of (alpha T)² over the pixels of each footprint; ``resolved_length`` the length in the image of
+    the local scale from which a Gaussian counts as resolved, pixels. It counts as seen from 0.003 of its squared alpha
+    on; with less than a twentieth of its opacity unobstructed, it is hidden.
     """
     gaussians, projection = frame.gaussians, frame.projection
     means, scales, K, eye = gaussians.means, gaussians.scales, projection.K, projection.eye
-    seen_share, resolved_length, dilated_area = limits[0], limits[1], limits[2]
+    dilated_area = projection.dilation / 0.3  # of a squared point, pixels
     focal, pixels = np.sqrt(K[0, 0] * K[1, 1]), np.float64(projection.width * projection.height)
     for row in range(first, last):
         n = frame.footprints.visible[row]
@@ -66,7 +66,7 @@ def raise_coverage(
         if projection.antialiased:
             opacity *= (area - dilated_area) / area
         shown = max(opacity * opacity * min(area, pixels), 1e-300)
-        visibility = min(seen[row] / (seen_share * shown), 1.0)
+        visibility = min(seen[row] / (0.003 * shown), 1.0)
         resolution = min(np.float64(local_scale[n]) * per_unit / resolved_length, 1.0)
         share[n] = max(share[n], np.float32(visibility * resolution * resolution))
 

@@ -239,9 +239,7 @@ PARTS_PER_THREAD = 4
 """Number of parts per thread; parts differ in cost, and smaller ones balance the load."""
 
 
-def find_footprints(
-    gaussians: Gaussians, projection: Projection, pool: Workers
-) -> tuple[Footprints, Int64[np.ndarray, "parts 2"]]:
+def find_footprints(gaussians: Gaussians, projection: Projection, pool: Workers) -> tuple[Footprints, list[Part]]:
     """Project and shade all Gaussians; return those that touch the image, and the ranges of rows that hold them."""
     count = len(gaussians.means)
     found = Footprints(np.empty(count, np.int32), np.empty(count, np.float32), np.empty((count, 11), np.float32))
@@ -251,12 +249,10 @@ def find_footprints(
         shade(gaussians, projection, first, end, found)
         return first, end
 
-    return found, np.array(each_part(part, even(count, pool), pool))
+    return found, each_part(part, even(count, pool), pool)
 
 
-def sort_into_tiles(
-    footprints: Footprints, parts: Int64[np.ndarray, "parts 2"], projection: Projection, pool: Workers
-) -> TileLists:
+def sort_into_tiles(footprints: Footprints, parts: list[Part], projection: Projection, pool: Workers) -> TileLists:
     """Return lists of the footprints that touch each tile, nearest first; they do not depend on the parts."""
     rows, columns = -(-projection.height // constants.TILE), -(-projection.width // constants.TILE)
     per_part = np.zeros((len(parts), rows, columns), np.int64)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from kissgs.cameras.render import Orbit
-from kissgs.core.errors import InvalidViewsError
 
 UP = np.array([0.0, -1, 0])
 ARC = Orbit(target=np.array([1.0, 2, 3]), radius=4.0, elevation=0.3, up=UP, mid_azimuth=1.0, sweep=1.2)
@@ -57,10 +56,3 @@ def test_cameras_of_a_sheet_go_once_from_end_to_end():
     assert len(FULL.sheet_cameras(6, 40, 30)) == 6
     (only,) = ARC.sheet_cameras(1, 40, 30)
     assert only.position == pytest.approx(ARC.camera(1.0, 4, 3).position)
-
-
-@pytest.mark.parametrize("wrong", [(0, 9, 9), (3, 0, 9), (3, 9, -1)])
-def test_numbers_below_one_are_refused(wrong):
-    for cameras in (ARC.loop_cameras, ARC.sheet_cameras):
-        with pytest.raises(InvalidViewsError, match="at least 1 frame"):
-            cameras(*wrong)

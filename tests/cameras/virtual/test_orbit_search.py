@@ -11,8 +11,7 @@ from kissgs import sample_scene
 from kissgs.cameras import render as camera_paths
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.render import MIN_SWEEP, Orbit, _longest_run, _with_arc, find_orbit
-from kissgs.core.errors import Cancelled, InvalidViewsError
-from kissgs.core.splats import Splats, clean
+from kissgs.core.splats import clean
 from kissgs.io.ply import read_ply
 from kissgs.rendering.rasterizer import render
 
@@ -57,13 +56,6 @@ def test_an_object_is_seen_whole_from_all_sides(tall_box, around_box, size):
         pixels = seen[:, :2] / seen[:, 2:]
         assert ((pixels > 0) & (pixels < size)).all()
         assert render(tall_box, camera)[1].mean() > 0.04
-
-
-@pytest.mark.usefixtures("fewer")
-def test_the_result_is_the_same_for_any_number_of_threads(tall_box, around_box):
-    again = find_orbit(tall_box, width=96, height=72, threads=3)
-    for one, other in zip(around_box.loop_cameras(3, 96, 72), again.loop_cameras(3, 96, 72), strict=True):
-        assert np.array_equal(one.viewmat, other.viewmat)
 
 
 @pytest.mark.usefixtures("fewer")
@@ -118,29 +110,3 @@ def test_an_arc_has_a_minimum_length_and_a_full_circle_may_have_weaker_views():
     assert (none.sweep, none.mid_azimuth) == (pytest.approx(MIN_SWEEP), single.mid_azimuth)
     assert _with_arc(FULL, np.full(72, 0.8), 0.9).full
     assert not _with_arc(FULL, np.array([1.0] * 71 + [0.7]), 0.9).full
-
-
-@pytest.mark.usefixtures("fewer")
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_any_scene_has_an_orbit(count):
-    splats = Splats(
-        means=np.full((count, 3), 1e5, np.float32),
-        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        scales=np.full((count, 3), -20, np.float32),
-        opacities=np.zeros(count, np.float32),
-        sh0=np.zeros((count, 3), np.float32),
-        shN=np.empty((count, 0, 3), np.float32),
-    )
-    for camera in find_orbit(splats, width=40, height=30).loop_cameras(4, 40, 30):
-        assert np.isfinite(render(splats, camera)[0]).all()
-
-
-def test_images_without_pixels_are_refused_and_the_work_can_be_stopped(tall_box):
-    with pytest.raises(InvalidViewsError, match="at least 1x1 pixels, not 0x9"):
-        find_orbit(tall_box, width=0, height=9)
-
-    def stop(stage, fraction):
-        raise Cancelled("stopped")
-
-    with pytest.raises(Cancelled):
-        find_orbit(tall_box, progress=stop)

@@ -56,15 +56,3 @@ def test_random_poses_are_divided_among_both_objects():
     cameras = [view.camera for view in views.all]
     assert count_near(cameras, (0, 0, 0), 40) >= 12
     assert count_near(cameras, (1000, 0, 0), 40) >= 12
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 7])
-def test_scenes_of_few_gaussians_have_cameras(count: int):
-    assert len(cameras_of(sample_scene(count), count=3)) == 3
-
-
-def test_the_result_is_the_same_for_any_number_of_threads():
-    scene = clean(joined(sample_scene(700), moved(sample_scene(700, seed=1), by=(300, 0, 0))))[0]
-    one, many = (scene_views(scene, width=48, height=48, count=8, threads=threads) for threads in (1, 3))
-    for a, b in zip(one.all, many.all, strict=True):
-        assert np.array_equal(a.camera.viewmat, b.camera.viewmat)
