@@ -9,7 +9,14 @@ import numpy as np
 
 from kissgs.cameras.captures.transforms_json import is_camera_file, pick_view, view_of_file
 from kissgs.cameras.views import Vec3, View, Views, check_images
-from kissgs.cameras.virtual.candidates import FIELD_OF_VIEW, SceneBounds, horizontal_axes, opacity, weighted_quantiles
+from kissgs.cameras.virtual.candidates import (
+    FIELD_OF_VIEW,
+    SceneBounds,
+    direction_at,
+    horizontal_axes,
+    opacity,
+    weighted_quantiles,
+)
 from kissgs.cameras.virtual.select import (
     SCORE_MARGIN,
     ScoredCandidates,
@@ -56,13 +63,8 @@ class Orbit:
         return "a full circle" if self.full else f"{np.degrees(self.sweep):.0f}° to and fro"
 
     def camera(self, azimuth: float, width: int, height: int) -> Camera:
-        """Return the camera at ``azimuth``, radians, with an image of ``width`` x ``height`` pixels.
-
-        It looks at the target; at radius 0, from the target in the direction that it would have on a larger circle.
-        """
-        east, north = horizontal_axes(self.up)
-        horizontal = np.cos(azimuth) * east + np.sin(azimuth) * north
-        direction = np.cos(self.elevation) * horizontal + np.sin(self.elevation) * self.up
+        """Return the camera at ``azimuth``, radians; at radius 0, it looks from the target as on a larger circle."""
+        direction = direction_at(self.up, self.elevation, azimuth)
         position = self.target + self.radius * direction
         return look_at(position, position - direction, self.up, fov=FIELD_OF_VIEW, width=width, height=height)
 

@@ -1,7 +1,4 @@
-"""Results of an evaluation: metrics of each view and their means, as text and as JSON; losses as goals define them.
-
-They are apart from the evaluation, so that a command prints its report without loading it.
-"""
+"""Results of an evaluation, which a command prints without loading what computes them; losses as goals define them."""
 
 from __future__ import annotations
 

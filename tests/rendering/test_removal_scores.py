@@ -26,12 +26,12 @@ def test_scores_agree_with_removal(seed):
 
 @pytest.mark.quick(0)
 def test_scores_of_a_real_scene_have_the_ranks_of_removals(shared_data):
-    """Each of 150 Gaussians of fox is removed, and two views of the capture are rendered without it."""
+    """Each of 60 Gaussians of fox is removed, and two views of the capture are rendered without it."""
     scene = kissgs.load(shared_data / "fox" / "point_cloud.ply")
     views = [view.camera.at_most(240) for view in kissgs.load_views(shared_data / "fox").train[::20]]
     scores = removal_scores(scene, views)
     seen = np.flatnonzero(scores > 1e-9)
-    chosen = seen[np.argsort(scores[seen])][np.linspace(0, len(seen) - 1, 150).astype(int)]
+    chosen = seen[np.argsort(scores[seen])][np.linspace(0, len(seen) - 1, 60).astype(int)]
     whole = [render(scene, view)[0].astype(np.float64) for view in views]
     expected = []
     for n in chosen:

@@ -327,13 +327,11 @@ def _is_model(folder: Path, suffix: str) -> bool:
 def _root(folder: Path) -> Path:
     """Return the capture's folder: the first from ``folder`` upwards with photographs or without a model's name."""
     root = folder.resolve()
-    while not _has_photos(root) and _MODEL_FOLDER_NAMES.fullmatch(root.name):
+    while _MODEL_FOLDER_NAMES.fullmatch(root.name):
+        if any(found.is_dir() for found in [*root.glob("images*"), root / INPUT]):
+            break
         root = root.parent
     return root
-
-
-def _has_photos(folder: Path) -> bool:
-    return any(found.is_dir() for found in [*folder.glob("images*"), folder / INPUT])
 
 
 def _intrinsics(camera: CameraRecord, where: str) -> Intrinsics:

@@ -168,10 +168,7 @@ def view_of_file(which: str) -> View:
 
 
 def pick_view(views: Sequence[View], which: str, source: str) -> View:
-    """Return the view with this name, else the one with this index, else the one with this file name or stem.
-
-    For example, ``a.png`` and ``a`` select ``images/a.png`` if no other view matches.
-    """
+    """Return the view with this name, else the one with this index, else the one with this file name or stem."""
     found = [view for view in views if view.name == which]
     if not found and which.isascii() and which.isdigit() and len(which) < 10:
         if int(which) >= len(views):
@@ -292,8 +289,7 @@ def read_split_transforms(folder: Path) -> Capture:
 def similarities(folders: Iterable[Path], applied: Float64[np.ndarray, "4 4"] | None) -> tuple[Similarity, ...]:
     """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have.
 
-    nerfstudio writes its ``dataparser_transforms.json`` beside its checkpoints; the first of ``folders`` that has one
-    counts.
+    The first of ``folders`` that has a ``dataparser_transforms.json`` counts.
     """
     found = []
     path = next((path for folder in folders if (path := folder / DATAPARSER_TRANSFORMS).is_file()), None)

@@ -95,7 +95,8 @@ def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.
     area = np.exp(log_scales[:, 1] + log_scales[:, 2])
     flatness = np.clip(log_scales[:, 1] - log_scales[:, 0], 0, 1)
     flat_weights = flatness * np.minimum(area, np.quantile(area, 0.95)) * weights
-    normals = _short_axes(splats)
+    rotations = rotation_matrices(splats.quats.astype(np.float64))
+    normals = rotations[np.arange(len(splats)), :, splats.scales.argmin(axis=1)]
     level = [float(flat_weights @ (np.abs(normals @ each) > np.cos(np.radians(15)))) for each in UP_AXES]
     if level[1] > 2 * level[0] + 0.1 * flat_weights.sum():
         axis = UP_AXES[1]
@@ -117,12 +118,6 @@ def _ground_normal(axis: Vec3, normals: Float64[np.ndarray, "N 3"], weights: Flo
         mean = (near * np.sign(cosines)) @ normals
         axis = mean / np.linalg.norm(mean)
     return axis
-
-
-def _short_axes(splats: Splats) -> Float64[np.ndarray, "N 3"]:
-    """Return the unit vector of each Gaussian's smallest scale."""
-    rotations = rotation_matrices(splats.quats.astype(np.float64))
-    return np.asarray(rotations[np.arange(len(splats)), :, splats.scales.argmin(axis=1)])
 
 
 # View scores: how useful a camera is, from a thumbnail of what it sees.
@@ -272,13 +267,18 @@ def horizontal_axes(up: Vec3) -> tuple[Vec3, Vec3]:
     return first, np.cross(up, first)
 
 
+def direction_at(up: Vec3, elevation: float, azimuth: float) -> Vec3:
+    """Return the unit vector at an elevation above the horizontal plane and an azimuth, radians."""
+    east, north = horizontal_axes(up)
+    horizontal = np.cos(azimuth) * east + np.sin(azimuth) * north
+    return np.asarray(np.cos(elevation) * horizontal + np.sin(elevation) * up)
+
+
 def directions(up: Vec3, elevations: tuple[float, ...], azimuths: int) -> Iterator[Vec3]:
     """Yield unit vectors at evenly spaced azimuths, for each elevation above the horizontal plane, degrees."""
-    east, north = horizontal_axes(up)
     for elevation in np.radians(elevations):
         for azimuth in np.arange(azimuths) * (2 * np.pi / azimuths):
-            horizontal = np.cos(azimuth) * east + np.sin(azimuth) * north
-            yield np.cos(elevation) * horizontal + np.sin(elevation) * up
+            yield direction_at(up, elevation, azimuth)
 
 
 def orbit_cameras(bounds: SceneBounds, size: tuple[int, int]) -> Iterator[Camera]:

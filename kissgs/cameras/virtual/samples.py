@@ -13,7 +13,7 @@ from kissgs.cameras.virtual.candidates import (
     PROXY_GAUSSIANS,
     SceneBounds,
     ViewScorer,
-    horizontal_axes,
+    direction_at,
     opacity,
     proxy_scene,
     scene_bounds,
@@ -321,7 +321,6 @@ class _PoseSampler:
 
     def __init__(self, candidates: ScoredCandidates, rng: np.random.Generator) -> None:
         self._bounds, self._candidates, self._rng = candidates.bounds, candidates, rng
-        self._east, self._north = horizontal_axes(candidates.bounds.up)
         samplers = {"enclosed": self._inside, "background": self._in_front, "object": self._around_object}
         self.draw = samplers[candidates.kind]
 
@@ -347,9 +346,7 @@ class _PoseSampler:
 
     def _direction(self, elevation: float) -> Vec3:
         """Draw a unit vector at this elevation, radians, and a uniform azimuth."""
-        azimuth = self._rng.uniform(0, 2 * np.pi)
-        horizontal = np.cos(azimuth) * self._east + np.sin(azimuth) * self._north
-        return np.asarray(np.cos(elevation) * horizontal + np.sin(elevation) * self._bounds.up)
+        return direction_at(self._bounds.up, elevation, self._rng.uniform(0, 2 * np.pi))
 
     def _elevation(self, low: float = MIN_ELEVATION, high: float = MAX_ELEVATION) -> float:
         """Draw an elevation, radians, so that directions are uniform on the sphere between the limits."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float32, Float64, Int32, Int64, Shaped
+from kissgs.core.array_types import Bool, Float32, Float64, Int32, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
@@ -17,7 +17,7 @@ from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending, sensitivity
 from kissgs.rendering.cpu.projection import add_colors, project_backward, shade_backward
-from kissgs.rendering.cpu.records import Blended, Frame, Gaussians, Projection, Slots, TileLists
+from kissgs.rendering.cpu.records import Blended, Frame, Gaussians, Projection, Slots
 from kissgs.rendering.cpu.tiles import (
     Part,
     each_part,
@@ -69,17 +69,27 @@ def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], 
     return frame
 
 
+def _each_tile(
+    kernel: Callable[..., None], frame: Frame, slots: Slots, pool: Workers, *arguments: object, band: Part | None = None
+) -> None:
+    """Call a kernel for all tiles, or for a band of them, in threads."""
+    tiles = even_tiles(frame.lists, pool, band)
+    each_part(lambda first, last: kernel(frame, slots, first, last, *arguments), tiles, pool)
+
+
+def _each_footprint(kernel: Callable[..., None], frame: Frame, slots: Slots, pool: Workers, *arguments: object) -> None:
+    """Call a kernel for all footprints with slots, in threads."""
+    rows = even(len(slots.rows), pool)
+    each_part(lambda first, last: kernel(frame, slots, first, last, *arguments), rows, pool)
+
+
 def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     """Return the squared change of the image by each Gaussian's removal; see :func:`rasterizer.removal_scores`."""
     slots, errors = (
         number_slots(frame.lists, len(frame.gaussians.means)),
         np.zeros(len(frame.lists.members), np.float32),
     )
-    each_part(
-        lambda first, last: blending.removal_errors(frame, slots, first, last, errors),
-        even_tiles(frame.lists, pool),
-        pool,
-    )
+    _each_tile(blending.removal_errors, frame, slots, pool, errors)
     return sums_of_slots(frame, slots, errors)
 
 
@@ -110,31 +120,14 @@ def add_sensitivities(
         into.higher_harmonics,
         seen,
     )
-    for band in itertools.pairwise(_bands(frame.lists)):
-        _add_band(frame, (int(band[0]), int(band[1])), weight, spread, sums, pool)
+    starts = frame.lists.starts
+    edges = np.searchsorted(starts, np.arange(0, starts[-1], BAND))
+    for first, last in itertools.pairwise(np.unique(np.append(edges, [0, len(starts) - 1])).tolist()):
+        slots = number_slots(frame.lists, len(frame.footprints.records), (first, last))
+        moments = np.zeros((len(slots.of), blending.MOMENTS), np.float32)
+        _each_tile(blending.moments, frame, slots, pool, spread, moments, band=(first, last))
+        _each_footprint(sensitivity.add_to_parameters, frame, slots, pool, moments, weight, sums)
     return seen
-
-
-def _add_band(frame: Frame, band: Part, weight: float, spread: float, sums: sensitivity.Sums, pool: Workers) -> None:
-    """Add the sensitivity in a band of tiles."""
-    slots = number_slots(frame.lists, len(frame.footprints.records), band)
-    moments = np.zeros((len(slots.of), blending.MOMENTS), np.float32)
-    each_part(
-        lambda first, last: blending.moments(frame, slots, first, last, spread, moments),
-        even_tiles(frame.lists, pool, band),
-        pool,
-    )
-    each_part(
-        lambda first, last: sensitivity.add_to_parameters(frame, slots, moments, first, last, weight, sums),
-        even(len(slots.rows), pool),
-        pool,
-    )
-
-
-def _bands(lists: TileLists) -> Int64[np.ndarray, " edges"]:
-    """Return the edges of bands of tiles of about :data:`BAND` members each."""
-    edges = np.searchsorted(lists.starts, np.arange(0, lists.starts[-1], BAND))
-    return np.unique(np.append(edges, [0, len(lists.starts) - 1]))
 
 
 def for_kernels(splats: Splats) -> Splats:
@@ -205,11 +198,7 @@ def differentiate_footprints(
     count = len(frame.footprints.records)
     slots, changed = number_slots(frame.lists, count), np.zeros(count, bool)
     v_slots = np.zeros((len(frame.lists.members), 9), np.float32)
-    each_part(
-        lambda a, b: blending.blend_backward(frame, slots, a, b, v_image, v_alpha, v_slots, changed),
-        even_tiles(frame.lists, pool),
-        pool,
-    )
+    _each_tile(blending.blend_backward, frame, slots, pool, v_image, v_alpha, v_slots, changed)
     return v_slots, slots, changed
 
 
@@ -219,9 +208,5 @@ def add_color_gradients(
     """Add the gradients of a loss by ``sh0`` alone, given its gradient by the image, ``v_image``, to ``into``."""
     slots = number_slots(frame.lists, len(frame.footprints.records))
     v_slots = np.zeros((len(frame.lists.members), 3), np.float32)
-    each_part(
-        lambda a, b: blending.blend_colors_backward(frame, slots, a, b, v_image, v_slots),
-        even_tiles(frame.lists, pool),
-        pool,
-    )
-    each_part(lambda a, b: add_colors(frame, slots, a, b, v_slots, into), even(len(slots.rows), pool), pool)
+    _each_tile(blending.blend_colors_backward, frame, slots, pool, v_image, v_slots)
+    _each_footprint(add_colors, frame, slots, pool, v_slots, into)

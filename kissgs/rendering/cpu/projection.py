@@ -441,13 +441,6 @@ def _by_axes(
 
 
 @_helper
-def _by_rotation(p: Vector, q: Vector, by_w: Vector, by_v: Vector, quat: Quat) -> Quat:
-    """Return the gradient by the unit quaternion, given those by the rows of W over the scales."""
-    e0, e1, e2 = _mix(p[0], by_w, q[0], by_v), _mix(p[1], by_w, q[1], by_v), _mix(p[2], by_w, q[2], by_v)
-    return _by_quat(quat, (e0, e1, e2))
-
-
-@_helper
 def _by_position(
     K: np.ndarray,
     rotation: Matrix,
@@ -506,7 +499,8 @@ def project_backward(
         position, J, (p, q), (quat, shrink, R, s), (w, v) = _in_image(gaussians, projection, pose, frustum, n)
         by_w, by_v = _by_axes(sums, w, v, projection.dilation, projection.antialiased, gradients.scales, i)
         by_w, by_v = _scaled(by_w, s), _scaled(by_v, s)
-        by_quat = _by_rotation(p, q, by_w, by_v, quat)
+        by_rotation = _mix(p[0], by_w, q[0], by_v), _mix(p[1], by_w, q[1], by_v), _mix(p[2], by_w, q[2], by_v)
+        by_quat = _by_quat(quat, by_rotation)
         for c in range(4):
             gradients.quats[i, c] = by_quat[c] * shrink
         l0, l1, l2 = _cholesky(w, v, projection.dilation)

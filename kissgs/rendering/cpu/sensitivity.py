@@ -176,9 +176,9 @@ def _write_basis(mean: Vector, eye: np.ndarray, own: int, basis: np.ndarray) -> 
         _harmonics(dx, dy, dz, own, basis)
 
 
-@compiled(void(FRAME, SLOTS, float32[:, ::1], int64, int64, float64, SUMS))
+@compiled(void(FRAME, SLOTS, int64, int64, float32[:, ::1], float64, SUMS))
 def add_to_parameters(
-    frame: Frame, slots: Slots, moments: np.ndarray, first: int, last: int, weight: float, out: Sums
+    frame: Frame, slots: Slots, first: int, last: int, moments: np.ndarray, weight: float, out: Sums
 ) -> None:
     """Add the moments of some tiles of an image to those of the Gaussians of footprints ``slots.rows[first:last]``."""
     gaussians, projection, dilation = frame.gaussians, frame.projection, frame.projection.dilation

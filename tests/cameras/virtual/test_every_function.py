@@ -1,4 +1,4 @@
-"""What all functions that place cameras have in common. Oracle: images are finite, arguments that make no sense."""
+"""Properties of all functions that place cameras. Oracle: finite images, arguments that make no sense."""
 
 import numpy as np
 import pytest

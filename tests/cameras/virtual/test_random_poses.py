@@ -17,6 +17,11 @@ def tall_box():
     return box((0.5, 1.5, 0.3), 3000, 0.1)
 
 
+@pytest.fixture(autouse=True)
+def fewer(monkeypatch):
+    try_fewer(monkeypatch)
+
+
 def positions_of(views):
     return np.array([view.camera.position for view in views.all])
 
@@ -34,8 +39,7 @@ def test_views_are_split_named_square_and_of_several_fields_of_view(tall_box):
     assert (len(single.train), len(single.test)) == (1, 0)
 
 
-def test_another_seed_gives_other_views(tall_box, monkeypatch):
-    try_fewer(monkeypatch)
+def test_another_seed_gives_other_views(tall_box):
     one, other = (set(map(tuple, positions_of(random_poses(tall_box, side=32, count=9, seed=n)))) for n in (3, 4))
     assert not one & other
 

@@ -104,6 +104,7 @@ def test_a_room_is_seen_from_inside():
         assert alpha.mean() > 0.9
 
 
+@pytest.mark.quick(0)
 def test_the_photographed_side_is_found(shared_data):
     """Behind the fox is a wall: no photograph was taken from there, so no virtual camera should be there."""
     splats, _ = clean(read_ply(shared_data / "fox" / "point_cloud.ply"))
@@ -114,6 +115,7 @@ def test_the_photographed_side_is_found(shared_data):
         assert nearest > np.cos(np.radians(50)), f"{view.name} looks {np.degrees(np.arccos(nearest)):.0f}° off"
 
 
+@pytest.mark.quick(0)
 @pytest.mark.usefixtures("fewer")
 def test_cameras_are_not_next_to_opaque_gaussians(shared_data):
     splats, _ = clean(read_ply(shared_data / "guitar" / "guitar.ply"))
