@@ -97,11 +97,7 @@ class _Rasterize(torch.autograd.Function):
         frames: list[Frame] = ctx.frames
         image_gradients, alpha_gradients = v_images.contiguous().numpy(), v_alphas.contiguous().numpy()
         receive: Callable[[Gradients], None] | None = ctx.receive
-        totals: list[np.ndarray] = []
-        if receive is None:
-            totals = [np.empty(tuple(parameter.shape), np.float32) for parameter in parameters]
-            for total in totals:
-                total.fill(0)
+        totals = [np.zeros(tuple(each.shape), np.float32) for each in (parameters if receive is None else ())]
         with Workers(ctx.threads) as pool:
             for frame, v_image, v_alpha in zip(frames, image_gradients, alpha_gradients, strict=True):
                 found = differentiate(frame, v_image, v_alpha, pool)
