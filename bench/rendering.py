@@ -20,8 +20,7 @@ from kissgs.core.progress import Pace, load_kernels
 from kissgs.core.resources import Workers, keep_free_memory
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.cpu.backward import Gradients
-from kissgs.rendering.cpu.frame import draw
+from kissgs.rendering.cpu.frame import Gradients, draw
 from kissgs.rendering.differentiable import photometric_loss, rasterize
 from kissgs.rendering.rasterizer import removal_scores, render
 from kissgs.training.loop import TrainingPlan, torch_threads, train

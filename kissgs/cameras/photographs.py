@@ -18,8 +18,6 @@ from PIL.ExifTags import Base
 from kissgs.core.array_types import Bool, Float32, Float64, UInt8
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
-# Reader of photographs as 8-bit RGB arrays.
-#
 # EXIF orientation is ignored, as by COLMAP and 3DGS trainers: cameras refer to the pixels as stored.
 
 FORMATS = tuple(
@@ -92,11 +90,7 @@ def orientation(path: Path) -> int:
 def read_photo(
     path: Path, width: int, height: int, background: Float32[np.ndarray, "3"]
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Read a photograph, resize it bicubically to this size, and composite it over ``background`` (RGB, 0 to 1).
-
-    Returns:
-        uint8 array ``(height, width, 3)``.
-    """
+    """Read a photograph, resize it bicubically to this size, and composite it over ``background`` (RGB, 0 to 1)."""
     with _opened(path) as image:
         if image.mode in ("I", "F"):
             raise UnsupportedError(f"{path} has 32 bits per channel, which is not supported; save it with 8 or 16")
@@ -243,34 +237,32 @@ class Lens:
 class Window:
     """Part of the undistorted image that is kept, in pixels of the photograph; ``left``, ``top`` is its first pixel."""
 
+    lens: Lens
     left: int
     top: int
     width: int
     height: int
 
-    def K(self, lens: Lens) -> Float64[np.ndarray, "3 3"]:
-        """Return the ``(3, 3)`` pinhole intrinsics of the cropped image: only the principal point moves."""
-        return lens.K - [[0, 0, self.left], [0, 0, self.top], [0, 0, 0]]
+    @property
+    def K(self) -> Float64[np.ndarray, "3 3"]:
+        """``(3, 3)`` pinhole intrinsics of the cropped image: only the principal point moves."""
+        return self.lens.K - [[0, 0, self.left], [0, 0, self.top], [0, 0, 0]]
 
 
 @lru_cache(maxsize=256)  # most captures have hundreds of photographs of one lens
 def full_window(lens: Lens) -> Window:
-    """Return the largest window that the photograph covers completely, so that no border is black.
-
-    The window is the photograph's rectangle shrunk towards the principal point, so its aspect ratio stays, and barrel
-    distortion loses nothing.
-    """
+    """Return the largest window that the photograph covers completely: it is shrunk towards the principal point."""
     if not (0 < lens.cx < lens.width and 0 < lens.cy < lens.height):
         raise InvalidViewsError(
             f"the principal point ({lens.cx:.6g}, {lens.cy:.6g}) of a distorting lens is outside its "
             f"{lens.width}x{lens.height} photograph; calibrate again"
         )
     low, high = 0.0, 1.0
-    if _is_covered(lens, _shrunk(lens, 1.0)):
+    if _is_covered(_shrunk(lens, 1.0)):
         return _shrunk(lens, 1.0)
     while high - low > 1e-5:  # windows are nested: if one is covered, all smaller ones are
         middle = (low + high) / 2
-        low, high = (middle, high) if _is_covered(lens, _shrunk(lens, middle)) else (low, middle)
+        low, high = (middle, high) if _is_covered(_shrunk(lens, middle)) else (low, middle)
     window = _shrunk(lens, low)
     if window.width * window.height < MIN_AREA * lens.width * lens.height:
         raise InvalidViewsError(
@@ -281,14 +273,14 @@ def full_window(lens: Lens) -> Window:
 
 
 def undistort(
-    photo: UInt8[np.ndarray, "H W 3"], lens: Lens, window: Window, stride: int = 1, first: tuple[int, int] = (0, 0)
+    photo: UInt8[np.ndarray, "H W 3"], window: Window, stride: int = 1, first: tuple[int, int] = (0, 0)
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the image that a pinhole with the focal lengths and principal point of ``lens`` would take of ``window``.
+    """Return every ``stride``-th pixel of every ``stride``-th row of the image that a pinhole would take of ``window``.
 
     Each pixel's ray is projected through the lens, and the photograph is sampled there, bicubically (Catmull-Rom).
-    Of that image, every ``stride``-th pixel of every ``stride``-th row is returned, from column and row ``first``.
     """
-    planes = np.ascontiguousarray(photo.transpose(2, 0, 1))
+    lens = window.lens
+    planes = np.ascontiguousarray(photo.transpose(2, 0, 1))  # NumPy gathers single bytes faster than triples
     x = (window.left + np.arange(first[0], window.width, stride) + 0.5 - lens.cx) / lens.fx
     y = (window.top + np.arange(first[1], window.height, stride) + 0.5 - lens.cy) / lens.fy
     result = np.empty((len(y), len(x), 3), dtype=np.uint8)
@@ -302,14 +294,14 @@ def undistort(
 def _shrunk(lens: Lens, share: float) -> Window:
     left, right = np.ceil(lens.cx - share * lens.cx), np.floor(lens.cx + share * (lens.width - lens.cx))
     top, bottom = np.ceil(lens.cy - share * lens.cy), np.floor(lens.cy + share * (lens.height - lens.cy))
-    return Window(int(left), int(top), max(0, int(right - left)), max(0, int(bottom - top)))
+    return Window(lens, int(left), int(top), max(0, int(right - left)), max(0, int(bottom - top)))
 
 
-def _is_covered(lens: Lens, window: Window) -> bool:
+def _is_covered(window: Window) -> bool:
     """Whether the rays of all pixels hit the photograph, in the range in which the distortion is invertible."""
     if window.width == 0 or window.height == 0:
         return True
-    first_x, first_y = window.left + 0.5, window.top + 0.5
+    lens, first_x, first_y = window.lens, window.left + 0.5, window.top + 0.5
     last_x, last_y = first_x + window.width - 1, first_y + window.height - 1
     xs, ys = np.arange(first_x, last_x + 1), np.arange(first_y, last_y + 1)
     inside = np.meshgrid(np.linspace(first_x, last_x, _GRID), np.linspace(first_y, last_y, _GRID))
@@ -338,10 +330,7 @@ def _project(
 def _sample(
     planes: UInt8[np.ndarray, "3 H W"], u: Float64[np.ndarray, "h w"], v: Float64[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Sample a photograph bicubically; (0, 0) is the centre of the first pixel, and border pixels are repeated.
-
-    The planes are separate, because numpy gathers single bytes several times faster than triples.
-    """
+    """Sample a photograph bicubically; (0, 0) is the centre of the first pixel, and border pixels are repeated."""
     height, width = planes.shape[1:]
     flat = planes.reshape(3, height * width)
     column, row = np.floor(u).astype(np.int32), np.floor(v).astype(np.int32)

@@ -1,4 +1,4 @@
-"""``RenderJob``: the work of ``kissgs render``, an image, a path around the scene, or a sheet of all views."""
+"""The work of ``kissgs render``: an image, a path around the scene, or a sheet of all views."""
 
 from __future__ import annotations
 
@@ -8,8 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kissgs.cameras.captures.transforms_json import is_camera_file, pick_view, view_of_file
-from kissgs.cameras.views import Vec3, View, Views
-from kissgs.cameras.virtual.candidates import FIELD_OF_VIEW, SceneBounds, horizontal_axes, opacity, weighted_quantile
+from kissgs.cameras.views import Vec3, View, Views, check_images
+from kissgs.cameras.virtual.candidates import (
+    FIELD_OF_VIEW,
+    SceneBounds,
+    direction_at,
+    horizontal_axes,
+    opacity,
+    weighted_quantiles,
+)
 from kissgs.cameras.virtual.select import (
     SCORE_MARGIN,
     ScoredCandidates,
@@ -27,8 +34,6 @@ from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.constants import NEAR
 from kissgs.rendering.images import Label, contact_sheet, reframed, render_all
 from kissgs.rendering.rasterizer import BLACK, Colour, Device
-
-# ``Orbit``: a camera path around a scene, a full circle or an arc that is travelled to and fro.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,13 +63,8 @@ class Orbit:
         return "a full circle" if self.full else f"{np.degrees(self.sweep):.0f}° to and fro"
 
     def camera(self, azimuth: float, width: int, height: int) -> Camera:
-        """Return the camera at ``azimuth``, radians, with an image of ``width`` x ``height`` pixels.
-
-        It looks at the target; at radius 0, from the target in the direction that it would have on a larger circle.
-        """
-        east, north = horizontal_axes(self.up)
-        horizontal = np.cos(azimuth) * east + np.sin(azimuth) * north
-        direction = np.cos(self.elevation) * horizontal + np.sin(self.elevation) * self.up
+        """Return the camera at ``azimuth``, radians; at radius 0, it looks from the target as on a larger circle."""
+        direction = direction_at(self.up, self.elevation, azimuth)
         position = self.target + self.radius * direction
         return look_at(position, position - direction, self.up, fov=FIELD_OF_VIEW, width=width, height=height)
 
@@ -74,7 +74,7 @@ class Orbit:
         On an arc, the azimuth is a sine of time, slow at the ends. Frames that show the same view share one camera
         object, so that a caller can render it once.
         """
-        _check(frames, width, height)
+        check_images(frames, width, height)
         if self.full:
             azimuths = self.mid_azimuth + np.arange(frames) * (2 * np.pi / frames)
             return [self.camera(float(azimuth), width, height) for azimuth in azimuths]
@@ -89,7 +89,7 @@ class Orbit:
 
     def sheet_cameras(self, frames: int, width: int, height: int) -> list[Camera]:
         """Return the cameras of a contact sheet: evenly spaced, once along the path."""
-        _check(frames, width, height)
+        check_images(frames, width, height)
         if self.full or frames == 1:
             return self.loop_cameras(frames, width, height)
         azimuths = self.mid_azimuth + np.linspace(-0.5, 0.5, frames) * self.sweep
@@ -109,14 +109,7 @@ def _swing_phase(frame: int, frames: int) -> int:
     return 2 * frame - 2 * frames
 
 
-def _check(frames: int, width: int, height: int) -> None:
-    if min(frames, width, height) < 1:
-        raise InvalidViewsError(
-            f"there must be at least 1 frame of at least 1x1 pixels, not {frames} of {width}x{height}"
-        )
-
-
-# ``find_orbit``: the orbit with the longest arc of good views.
+# The orbit with the longest arc of good views.
 #
 # Horizontal circles of several radii and elevations are scored by thumbnails all along them, like virtual cameras. A
 # scene that was captured from one side dissolves towards the ends of the arc, where the path turns back.
@@ -197,11 +190,11 @@ def _circles_around_object(splats: Splats, bounds: SceneBounds, aspect: float) -
     weights = opacity(splats)
     axes = np.stack([*horizontal_axes(bounds.up), bounds.up])
     offsets = (splats.means.astype(np.float64) - bounds.centre) @ axes.T
-    low, high = ([weighted_quantile(values, weights, quantile) for values in offsets.T] for quantile in (0.01, 0.99))
-    middle, half_extents = 0.5 * np.add(high, low), 0.5 * np.subtract(high, low)
+    low, high = np.transpose([weighted_quantiles(values, weights, 0.01, 0.99) for values in offsets.T])
+    middle, half_extents = 0.5 * (high + low), 0.5 * (high - low)
     from_axis = np.linalg.norm((offsets - middle)[:, :2], axis=1)
     min_size = 0.1 * bounds.radius
-    radius = max(weighted_quantile(from_axis, weights, 0.98), min_size)
+    radius = max(*weighted_quantiles(from_axis, weights, 0.98), min_size)
     half_height = max(half_extents[2], min_size)
     target = bounds.centre + middle @ axes
     slopes = np.tan(0.5 * FIELD_OF_VIEW) * np.array([min(1.0, aspect), min(1.0, 1 / aspect)])
@@ -260,8 +253,6 @@ def _with_arc(circle: Orbit, scores: Float64[np.ndarray, " steps"], min_score: f
     return replace(circle, mid_azimuth=0.5 * step * float(steps[0] + steps[-1]), sweep=sweep)
 
 
-# ``RenderJob``: the work of ``kissgs render``, an image, an orbit around the scene, or a sheet of all views.
-
 IMAGE_SIZE, FRAME_SIZE, CELL_SIZE = (1280, 960), (640, 480), (320, 240)
 """Default (width, height), pixels: of a single image, of an animation's frames, of the images on a contact sheet."""
 
@@ -317,21 +308,19 @@ class RenderJob:
 
     def animation(self, frames: int | None = None) -> RenderedImages:
         """Render an orbit around the scene, as the frames of an animation that loops."""
-        load_kernels(self.progress)
-        width, height = self.size or FRAME_SIZE
-        orbit = find_orbit(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
-        cameras = orbit.loop_cameras(frames or ANIMATION_FRAMES, width, height)
+        size = self.size or FRAME_SIZE
+        orbit = self._orbit(size)
+        cameras = orbit.loop_cameras(frames or ANIMATION_FRAMES, *size)
         views = self._in_world(_numbered(cameras))
         return RenderedImages(self._render(cameras, None), views, f"{len(cameras)} frames, {orbit.description}")
 
     def orbit_sheet(self, frames: int | None = None) -> RenderedImages:
         """Render an orbit around the scene, as one contact sheet."""
-        load_kernels(self.progress)
-        width, height = self.size or CELL_SIZE
-        orbit = find_orbit(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
-        cameras = orbit.sheet_cameras(frames or SHEET_FRAMES, width, height)
-        sheet = contact_sheet(self._render(cameras, None))
+        size = self.size or CELL_SIZE
+        orbit = self._orbit(size)
+        cameras = orbit.sheet_cameras(frames or SHEET_FRAMES, *size)
         views = self._in_world(_numbered(cameras))
+        sheet = contact_sheet(self._render(cameras, None))
         return RenderedImages([sheet], views, f"{len(cameras)} images, {orbit.description}")
 
     def view_sheet(self, capture: Views | None) -> RenderedImages:
@@ -351,6 +340,11 @@ class RenderJob:
     def _in_world(self, views: Sequence[View]) -> list[View]:
         x, y, z = self.splats.origin
         return [view.relative_to((-x, -y, -z)) for view in views]
+
+    def _orbit(self, size: tuple[int, int]) -> Orbit:
+        load_kernels(self.progress)
+        width, height = size
+        return find_orbit(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
 
     def _virtual(self, size: tuple[int, int]) -> Views:
         return virtual_views(self.splats, width=size[0], height=size[1], threads=self.threads, progress=self.progress)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kissgs.cameras.photographs import Lens, Window, read_photo, undistort
+from kissgs.cameras.photographs import Window, read_photo, undistort
 from kissgs.core.array_types import Float32, Float64, UInt8
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.positions import WORLD, Origin
@@ -30,6 +30,14 @@ MIN_FIELD_OF_VIEW = 1e-9
 """Smallest angle of view of such a lens, radians."""
 
 
+def check_images(count: int, width: int, height: int) -> None:
+    """Check the number of images to be rendered, and their size in pixels."""
+    if min(count, width, height) < 1:
+        raise InvalidViewsError(
+            f"there must be at least 1 image of at least 1x1 pixels, not {count} of {width}x{height}"
+        )
+
+
 def random_direction(rng: np.random.Generator) -> Vec3:
     """Return a unit vector, uniformly distributed over the sphere."""
     direction = rng.standard_normal(3)
@@ -42,10 +50,7 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def camera_facing(target: Vec3, direction: Vec3, distance: float, fov: float, size: tuple[int, int]) -> Camera:
-    """Return a camera with ``target`` in the centre of its image, seen from ``direction``.
-
-    ``fov`` in radians along the longer side of an image of ``size``, (width, height).
-    """
+    """Return a camera with ``target`` in the centre of its image, seen from ``direction``; ``size``: width, height."""
     possible = max(distance, MIN_DISTANCE)
     narrow = max(2 * float(np.arctan(np.tan(fov / 2) * distance / possible)), MIN_FIELD_OF_VIEW)
     return look_at(target + possible * direction, target, UP, fov=narrow, width=size[0], height=size[1])
@@ -59,20 +64,23 @@ def camera_at(position: Vec3, target: Vec3, fov: float, size: tuple[int, int]) -
     return camera_facing(target, (position - target) / distance if distance > 0 else -UP, distance, fov, size)
 
 
+def rotation_matrices(quats: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n 3 3"]:
+    """Return the rotations of unit quaternions w, x, y, z."""
+    w, x, y, z = np.moveaxis(quats, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
 # ``View`` and ``Views``: cameras with their photographs, for training and for evaluation.
 
 
 def black() -> Float32[np.ndarray, "3"]:
-    """Return black, the default background, as ``(3,)`` float32."""
+    """Return black, the default background."""
     return np.zeros(3, dtype=np.float32)
-
-
-@dataclass(frozen=True, slots=True)
-class UndistortionSpec:
-    """Steps from a photograph to the image of a view: resize to the lens' size, undistort, crop to the window."""
-
-    lens: Lens
-    window: Window
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +106,7 @@ class View:
         photo: file of the photograph; None if there is only a camera.
         background: ``(3,)`` float32 RGB, 0 to 1, behind transparent pixels of the photograph and behind renderings in
             comparisons; None: black for the photograph, that of ``Views`` for renderings.
-        undistortion: how to undistort the photograph; None if its lens does not distort.
+        undistortion: part of the undistorted photograph that is the image; None if the lens does not distort.
         target: ``(3,)`` float64 point, world units, that the camera looks at in the centre of its image; None if
             unknown.
         sampling: the pixels of the whole image that the view has; None for all.
@@ -109,7 +117,7 @@ class View:
     camera: Camera
     photo: Path | None = None
     background: Float32[np.ndarray, "3"] | None = None
-    undistortion: UndistortionSpec | None = None
+    undistortion: Window | None = None
     target: Float64[np.ndarray, "3"] | None = None
     sampling: Sampling | None = None
     added: bool = False
@@ -149,10 +157,9 @@ class View:
         if self.undistortion is None:
             whole = read_photo(self.photo, sampling.width, sampling.height, background)
             return np.ascontiguousarray(whole[row::stride, column::stride])
-        lens, window = self.undistortion.lens, self.undistortion.window
-        return undistort(
-            read_photo(self.photo, lens.width, lens.height, background), lens, window, stride, (column, row)
-        )
+        lens = self.undistortion.lens
+        whole = read_photo(self.photo, lens.width, lens.height, background)
+        return undistort(whole, self.undistortion, stride, (column, row))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

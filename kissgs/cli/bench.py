@@ -76,7 +76,7 @@ def warmup() -> None:
     from kissgs.core import numba_kernels
     from kissgs.planning import kernels, kmeans_kernels, rdo_kernels  # noqa: F401
     from kissgs.rendering import ssim_kernels  # noqa: F401
-    from kissgs.rendering.cpu import backward, neighbours, sensitivity  # noqa: F401
+    from kissgs.rendering.cpu import frame, neighbours  # noqa: F401
 
     if find_spec("torch"):  # without it nothing is trained
         from kissgs.finetuning import planes  # noqa: F401

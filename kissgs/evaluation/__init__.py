@@ -1,5 +1,1 @@
-"""Evaluation: two scenes, and optionally views with photographs -> metrics of images and errors of stored values.
-
-Evaluation cameras are drawn at random and share nothing with the encoder's cameras. Results can be written as JSON or
-as one HTML page.
-"""
+"""Evaluation: renderings of two scenes, and photographs, to metrics, JSON and HTML; its cameras are its own."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 
@@ -20,13 +19,13 @@ from kissgs.evaluation.scene_parts import (
     Part,
     base_colors_only,
     blending_weights,
-    drawn_opacities,
     find_parts,
     mahalanobis_distances,
     prominence,
 )
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
+from kissgs.rendering.rasterizer import drawn_opacities
 
 BACKGROUNDS = (0.0, 0.5, 1.0)
 """Grey levels of the views' backgrounds, in turn: on black, missing parts of a dark scene would not show."""
@@ -55,72 +54,54 @@ into the image."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AddedCamera:
-    """A camera that was added for a part."""
-
-    camera: Camera
-    target: Vec3
-    """Centre of the part."""
-    background: float
-    """Grey level of :data:`BACKGROUNDS` over which the loss of the part is most visible."""
-    psnr: float
-    """Between thumbnails with and without the part, decibels."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """Separate parts of a scene."""
+    """Separate parts of a scene (:func:`kissgs.evaluation.scene_parts.find_parts`)."""
 
     splats: Splats
     parts: list[Part]
     part_of: Int[np.ndarray, " N"]
-    """Index of each Gaussian's part, -1 for none."""
-
-    @classmethod
-    def of(cls, splats: Splats, counts: Float64[np.ndarray, " N"]) -> Parts:
-        """Find the parts of a scene, see :func:`kissgs.evaluation.scene_parts.find_parts`."""
-        return cls(splats, *find_parts(splats, counts))
 
     def shares(self, weights: Float64[np.ndarray, " N"], pixels: int) -> Float64[np.ndarray, " P"]:
         """Return the share of an image that each part covers, given the blending weights of all Gaussians in it."""
         return np.bincount(self.part_of + 1, weights, minlength=len(self.parts) + 1)[1:] / pixels
 
-    def overlooked(
-        self, shares: Float64[np.ndarray, "V P"], views: Sequence[tuple[Camera, float]], pool: Workers
-    ) -> list[int]:
+    def overlooked(self, shares: Float64[np.ndarray, "V P"], views: Sequence[View], pool: Workers) -> list[int]:
         """Return the parts whose loss hardly changes the view that shows them best, least visible parts first."""
 
         def psnr(part: int) -> float:
-            camera, background = views[int(shares[:, part].argmax())]
-            return self._psnrs_without(part, camera, (background,))[0]
+            view = views[int(shares[:, part].argmax())]
+            assert view.background is not None  # noqa: S101  every drawn view has one
+            return self._psnrs_without(part, view.camera, (float(view.background[0]),))[0]
 
         order = [int(part) for part in np.argsort(shares.max(axis=0), kind="stable")]
         return [part for part, without in zip(order, pool.map(psnr, order), strict=True) if without > VISIBLE_PSNR]
 
-    def cameras_for(
-        self, parts: Sequence[int], size: tuple[int, int], rng: np.random.Generator, pool: Workers
-    ) -> list[AddedCamera]:
+    def cameras_for(self, parts: Sequence[int], rng: np.random.Generator, pool: Workers) -> list[View]:
         """Draw a camera for each part until its loss is visible; after the last attempt, return the best one."""
-        best: dict[int, AddedCamera] = {}
+        best: dict[int, tuple[float, View]] = {}
         remaining = list(parts)
         for _ in range(MAX_DRAWS):
-            drawn = [(part, self._draw_camera(self.parts[part], size, rng)) for part in remaining]
-            for part, added in zip(remaining, pool.map(lambda each: self._added(*each), drawn), strict=True):
-                if part not in best or added.psnr < best[part].psnr:
-                    best[part] = added
-            remaining = [part for part in remaining if best[part].psnr > VISIBLE_PSNR]
-        return [best[part] for part in parts]
+            drawn = [(part, self._draw_camera(self.parts[part], rng)) for part in remaining]
+            for part, found in zip(
+                remaining, pool.map(lambda each: self._over_best_background(*each), drawn), strict=True
+            ):
+                if part not in best or found[0] < best[part][0]:
+                    best[part] = found
+            remaining = [part for part in remaining if best[part][0] > VISIBLE_PSNR]
+        return [best[part][1] for part in parts]
 
-    def _draw_camera(self, part: Part, size: tuple[int, int], rng: np.random.Generator) -> Camera:
+    def _draw_camera(self, part: Part, rng: np.random.Generator) -> Camera:
         fov = float(rng.uniform(*FIELDS_OF_VIEW))
-        narrow = np.arctan(np.tan(fov / 2) * min(size) / max(size))
+        narrow = np.arctan(np.tan(fov / 2) * HEIGHT / WIDTH)
         distance = part.radius / np.sin(narrow) * log_uniform(rng, *DISTANCES)
-        return camera_at(part.center + distance * random_direction(rng), part.center, fov, size)
+        return camera_at(part.center + distance * random_direction(rng), part.center, fov, (WIDTH, HEIGHT))
 
-    def _added(self, part: int, camera: Camera) -> AddedCamera:
+    def _over_best_background(self, part: int, camera: Camera) -> tuple[float, View]:
+        """Return the view over the grey on which the part's loss is most visible, and its PSNR without the part."""
         psnrs = self._psnrs_without(part, camera, BACKGROUNDS)
         least = int(np.argmin(psnrs))
-        return AddedCamera(camera, self.parts[part].center, BACKGROUNDS[least], psnrs[least])
+        background = _grey(BACKGROUNDS[least])
+        return psnrs[least], View("part", camera, background=background, target=self.parts[part].center, added=True)
 
     def _psnrs_without(self, part: int, camera: Camera, backgrounds: Sequence[float]) -> list[float]:
         """Return the PSNR between thumbnails with and without a part, over each of these grey backgrounds."""
@@ -140,20 +121,17 @@ def _psnr(one: Float32[np.ndarray, "H W 3"], other: Float32[np.ndarray, "H W 3"]
     return -10 * float(np.log10(max(float(np.mean(np.square(one - other), dtype=np.float64)), 1e-12)))
 
 
-# Evaluation cameras: drawn at random over a whole scene, at all scales, from a seed.
-#
 # The encoder has cameras of its own (:mod:`kissgs.cameras.virtual`) and stores coarsely what these do not see;
 # evaluated with the same cameras, these errors would not show. So evaluation chooses its own: cameras are
 # drawn at random instead of optimised, and every Gaussian that can be visible may become a target.
 
 COUNT = 24
-"""Default number of evaluation views, without those added for overlooked parts."""
+"""Number of evaluation views, without those added for overlooked parts."""
 
 WIDTH, HEIGHT = 320, 240
-"""Default image size, pixels."""
+"""Size of the images, pixels."""
 
-Kind = Literal["far", "around", "close-up", "across"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+KINDS = ("far", "around", "close-up", "across")
 """Kinds of poses, in turn: outside of the scene; around a part of random size; close to a surface; from one part of the
 scene towards another."""
 
@@ -176,45 +154,24 @@ MAX_INSIDE_SHARE, MAX_SINGLE_SHARE = 0.5, 0.3
 """Largest shares of an image that Gaussians around the camera, and that a single Gaussian, may cover."""
 
 
-def evaluation_views(
-    splats: Splats,
-    *,
-    count: int = COUNT,
-    width: int = WIDTH,
-    height: int = HEIGHT,
-    seed: int = 0,
-    threads: int = 0,
-    progress: Progress = silent,
-) -> Views:
+def evaluation_views(splats: Splats, *, seed: int = 0, threads: int = 0, progress: Progress = silent) -> Views:
     """Draw evaluation cameras over a whole scene; all of them are test views.
 
     Four kinds alternate, see :data:`KINDS`. A camera is drawn again only if its image is empty, or mostly covered by
     Gaussians that contain the camera or by a single one. Cameras are added for separate parts of the scene whose loss
-    would hardly change any of these images (:mod:`kissgs.evaluation.cameras`). The cameras depend on the scene and
-    the seed only, not on the number of threads.
+    would hardly change any of these images. The cameras depend on the scene and the seed only, not on the threads.
     """
-    if min(width, height, count) < 1:
-        raise InvalidViewsError(f"cannot draw {count} views of {width}x{height} pixels; ask for at least 1 view of 1x1")
     if seed < 0:
         raise InvalidViewsError(f"the seed of evaluation cameras is {seed}; give a whole number from 0")
     rng, counts = np.random.Generator(np.random.PCG64(seed)), prominence(splats)
-    sampler = _PoseSampler.of(splats, counts, (width, height))
-    parts = Parts.of(base_colors_only(splats), counts)
+    sampler = _PoseSampler.of(splats, counts)
+    parts = Parts(base_colors_only(splats), *find_parts(splats, counts))
     with Workers(threads) as pool:
-        poses, shares = _draw_poses(sampler, parts, count, rng, pool, progress)
-        drawn = [(pose.camera, BACKGROUNDS[n % len(BACKGROUNDS)]) for n, pose in enumerate(poses)]
-        overlooked = parts.overlooked(shares, drawn, pool)[:MAX_ADDED]
-        added = parts.cameras_for(overlooked, (width, height), rng, pool)
+        drawn, shares = _draw_views(sampler, parts, rng, pool, progress)
+        added = parts.cameras_for(parts.overlooked(shares, drawn, pool)[:MAX_ADDED], rng, pool)
     progress("cameras", 1.0)
-    digits = len(str(count + len(added) - 1))
-    views = [
-        View(f"{n:0{digits}} {pose.kind}", camera, background=_grey(level), target=pose.target)
-        for n, (pose, (camera, level)) in enumerate(zip(poses, drawn, strict=True))
-    ]
-    views += [
-        View(f"{n:0{digits}} part", one.camera, background=_grey(one.background), target=one.target, added=True)
-        for n, one in enumerate(added, count)
-    ]
+    digits = len(str(len(drawn) + len(added) - 1))
+    views = [replace(view, name=f"{n:0{digits}} {view.name}") for n, view in enumerate([*drawn, *added])]
     return Views((), tuple(views), _grey(0.5), f"drawn over the whole scene, seed {seed}", origin=splats.origin)
 
 
@@ -236,45 +193,38 @@ def _farther(view: View, distance: float) -> View:
     return replace(view, camera=replace(view.camera, viewmat=viewmat))
 
 
-def _draw_poses(
-    sampler: _PoseSampler, parts: Parts, count: int, rng: np.random.Generator, pool: Workers, progress: Progress
-) -> tuple[list[_Pose], Float64[np.ndarray, "V P"]]:
-    """Draw each view until it is accepted; return the poses and the share of each image that each part covers."""
-    quantiles = _target_quantiles(count, rng)
-    poses: list[_Pose] = [sampler.pose(n, 0, float(quantiles[n]), rng) for n in range(count)]
+def _draw_views(
+    sampler: _PoseSampler, parts: Parts, rng: np.random.Generator, pool: Workers, progress: Progress
+) -> tuple[list[View], Float64[np.ndarray, "V P"]]:
+    """Draw each view until it is accepted; return them and the share of each image that each part covers."""
+    count, quantiles = COUNT, _target_quantiles(rng)
+    views = [sampler.view(n, 0, float(quantiles[n]), rng) for n in range(count)]
     shares = np.zeros((count, len(parts.parts)))
     rejected = list(range(count)) if sampler.any_visible else []
     for attempt in range(1, MAX_DRAWS):
         progress("cameras", (count - len(rejected)) / count)
         if not rejected:
             break
-        checked = pool.map(lambda n: _check_camera(parts, poses[n].camera.at_most(THUMBNAIL)), rejected)
+        checked = pool.map(lambda n: _check_camera(parts, views[n].camera.at_most(THUMBNAIL)), rejected)
         shares[rejected] = [share if accepted else 0 * share for accepted, share in checked]
         rejected = [n for n, (accepted, _) in zip(rejected, checked, strict=True) if not accepted]
         for n in rejected:
-            poses[n] = sampler.pose(n, attempt, float(quantiles[n]), rng)
-    return poses, shares
+            views[n] = sampler.view(n, attempt, float(quantiles[n]), rng)
+    return views, shares
 
 
-def _target_quantiles(count: int, rng: np.random.Generator) -> Float64[np.ndarray, " count"]:
+def _target_quantiles(rng: np.random.Generator) -> Float64[np.ndarray, " count"]:
     """Return one number from 0 to 1 per view, stratified over the near kinds and over the other kinds."""
-    near = np.array([KINDS[n % len(KINDS)] in ("around", "close-up") for n in range(count)])
-    numbers = np.empty(count)
+    near = np.array([KINDS[n % len(KINDS)] in ("around", "close-up") for n in range(COUNT)])
+    numbers = np.empty(COUNT)
     for group in (near, ~near):
         size = int(group.sum())
-        numbers[group] = rng.permutation((np.arange(size) + rng.random(size)) / max(size, 1))
+        numbers[group] = rng.permutation((np.arange(size) + rng.random(size)) / size)
     return numbers
 
 
 def _grey(level: float) -> Float32[np.ndarray, "3"]:
     return np.full(3, level, np.float32)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pose:
-    kind: Kind
-    camera: Camera
-    target: Vec3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -288,21 +238,19 @@ class _PoseSampler:
     sizes: Float64[np.ndarray, " n"]
     """Standard deviations along the middle axis."""
     gaussians: GaussianSampler
-    size: tuple[int, int]
-    """Width and height of the images, pixels."""
 
     @classmethod
-    def of(cls, splats: Splats, counts: Float64[np.ndarray, " N"], size: tuple[int, int]) -> _PoseSampler:
+    def of(cls, splats: Splats, counts: Float64[np.ndarray, " N"]) -> _PoseSampler:
         visible = np.flatnonzero(drawn_opacities(splats) > 0)
         if not len(visible):
             single = GaussianSampler(np.zeros(1, np.int64), np.ones(1))
-            return cls(False, np.zeros((3, 1), np.float32), np.ones(1), single, size)
+            return cls(False, np.zeros((3, 1), np.float32), np.ones(1), single)
         means = splats.means[visible].astype(np.float64)
         sizes = np.exp(np.median(splats.scales[visible].astype(np.float64), axis=1))
         gaussians = GaussianSampler.of(means, counts[visible])
-        return cls(True, np.ascontiguousarray(splats.means[visible].T), sizes, gaussians, size)
+        return cls(True, np.ascontiguousarray(splats.means[visible].T), sizes, gaussians)
 
-    def pose(self, number: int, attempt: int, quantile: float, rng: np.random.Generator) -> _Pose:
+    def view(self, number: int, attempt: int, quantile: float, rng: np.random.Generator) -> View:
         """Return the ``attempt``-th camera for a view; ``quantile``, 0 to 1, selects the target of the first ones."""
         kind = KINDS[number % len(KINDS)] if 2 * attempt < MAX_DRAWS else "around"  # the kind that fails least
         target_index = self.gaussians.at(quantile if 2 * attempt < MAX_DRAWS else rng.random())
@@ -311,23 +259,19 @@ class _PoseSampler:
         shift = 2 * attempt * (attempt % 2)  # every other attempt: an isolated cluster may have fewer Gaussians
         fewest, most = (max(1, min(limit, self.columns.shape[1]) >> shift) for limit in CLOSE_UP_RANKS)
         close_rank = _whole_log_uniform(rng, fewest, most)
+        target = self._position(target_index)
         if kind == "far":
             target, radius = self._bounding_sphere(EXTENT_SHARES[(number // len(KINDS) + attempt) % len(EXTENT_SHARES)])
-            narrow = np.tan(fov / 2) * min(self.size) / max(self.size)
-            return self._looking(kind, target + direction * radius / np.sin(np.arctan(narrow)), target, fov)
-        target = self._position(target_index)
-        if kind == "across":
+            narrow = np.tan(fov / 2) * HEIGHT / WIDTH
+            position = target + direction * radius / np.sin(np.arctan(narrow))
+        elif kind == "across":
             position = self._position(origin_index) + direction * self._distance(origin_index, close_rank)
-            return self._looking(kind, position, target, fov)
-        rank = (
-            close_rank
-            if kind == "close-up"
-            else _whole_log_uniform(rng, fewest, max(fewest, self.columns.shape[1] >> shift))
-        )
-        return self._looking(kind, target + direction * self._distance(target_index, rank), target, fov)
-
-    def _looking(self, kind: Kind, position: Vec3, target: Vec3, fov: float) -> _Pose:
-        return _Pose(kind, camera_at(position, target, fov, self.size), target)
+        else:
+            widest = max(fewest, self.columns.shape[1] >> shift)
+            rank = close_rank if kind == "close-up" else _whole_log_uniform(rng, fewest, widest)
+            position = target + direction * self._distance(target_index, rank)
+        background = _grey(BACKGROUNDS[number % len(BACKGROUNDS)])
+        return View(kind, camera_at(position, target, fov, (WIDTH, HEIGHT)), background=background, target=target)
 
     def _position(self, index: int) -> Vec3:
         return self.columns[:, index].astype(np.float64)

@@ -19,14 +19,13 @@ from kissgs.core.progress import Progress, load_kernels, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison
-from kissgs.evaluation.scene_parts import drawn_opacities, share_shown
+from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.metrics import Flip, Lpips, ms_ssim, psnr, ssim
-from kissgs.rendering.rasterizer import Device, render
+from kissgs.rendering.rasterizer import Device, drawn_opacities, render
 
-# Whether a capture belongs to a scene: renderings of the scene are compared with some of its photographs.
-#
-# A capture of another scene, or one whose cameras have other coordinates, would let an encoder remove what matters.
+# Whether a capture belongs to a scene: renderings are compared with some photographs, since a capture of another scene,
+# or one whose cameras have other coordinates, would let an encoder remove what matters.
 
 LEAST_PSNR, USUAL_PSNR = 12.0, 18.0
 """Median PSNR, decibels, below which a capture is refused, and below which a note says so. Images of different scenes
@@ -52,16 +51,14 @@ _Sample = tuple[View, Float32[np.ndarray, "h w 3"]]
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """How well a capture fits a scene.
-
-    ``psnr_inside`` is that where the scene is opaque, with the best exposure of each photograph: scenes that were
-    trained with masks or on white have another background than the photographs, or than is known here.
-    """
+    """How well a capture fits a scene."""
 
     seen: bool  # whether any rendering shows any of the scene
-    psnr: float  # median of renderings to photographs, decibels; NaN if there are none
-    psnr_inside: float
-    shown: float  # share of the scene that the cameras show, 0 to 1; NaN if there are photographs
+    psnr: float = math.nan  # median of renderings to photographs, decibels; NaN if there are none
+    # Where the scene is opaque, with the best exposure of each photograph: scenes that were trained with masks or on
+    # white have another background than the photographs, or than is known here.
+    psnr_inside: float = math.nan
+    shown: float = math.nan  # share of the scene that the cameras show, 0 to 1; NaN if there are photographs
 
     @property
     def quality(self) -> float:
@@ -131,12 +128,13 @@ def _problem(fit: _Fit, source: str, samples: Sequence[_Sample]) -> str:
 
 def _best(splats: Splats, views: Views, samples: Sequence[_Sample], threads: int) -> tuple[Views, _Fit, str]:
     """Return the views in the coordinates that fit best, how well they fit, and a note if there was a choice."""
-    shown = tuple(view for view, _ in samples) or _spread(views.train or views.test, CAMERAS)
+    tried = tuple(view for view, _ in samples) or tuple(_spread(views.train or views.test, CAMERAS))
 
     def fit(similarity: Similarity | None) -> _Fit:
-        moved = _moved(replace(views, train=tuple(shown), test=()), similarity, splats.origin).train
+        moved = _moved(replace(views, train=tried, test=()), similarity, splats.origin).train
         if not samples:
-            return _fit_of_cameras(splats, moved, threads)
+            shown = share_shown(splats, [view.camera for view in moved], threads=threads)
+            return _Fit(shown > 0, shown=shown)
         return _fit_to_photos(splats, [(view, photo) for view, (_, photo) in zip(moved, samples, strict=True)], threads)
 
     given = best = fit(None)
@@ -170,7 +168,7 @@ def _fit_to_photos(splats: Splats, samples: Sequence[_Sample], threads: int) -> 
         seen |= bool(alpha.any())
         whole.append(psnr(np.clip(colour + (1 - alpha[:, :, None]) * view.background, 0, 1), photo))
         inside.append(_psnr_inside(np.clip(colour, 0, 1), alpha[:, :, None], photo))
-    return _Fit(seen, float(np.median(whole)), float(np.median(inside)), math.nan)
+    return _Fit(seen, float(np.median(whole)), float(np.median(inside)))
 
 
 def _psnr_inside(
@@ -183,11 +181,6 @@ def _psnr_inside(
     gain = np.clip((colour * target).sum() / max(float(np.square(target).sum()), 1e-12), *GAINS)
     error = np.square(colour - gain * target).sum() / (3 * np.square(alpha).sum())
     return float(-10 * np.log10(max(error, 1e-12)))
-
-
-def _fit_of_cameras(splats: Splats, views: Sequence[View], threads: int) -> _Fit:
-    shown = share_shown(splats, [view.camera for view in views], threads=threads)
-    return _Fit(shown > 0, math.nan, math.nan, shown)
 
 
 def _samples(views: Views) -> list[_Sample]:
@@ -208,16 +201,14 @@ def _spread(views: Sequence[View], most: int) -> list[View]:
     return [views[n] for n in chosen]
 
 
-# Image metrics of a candidate scene's renderings against photographs and against the reference's renderings.
-#
-# Rounded to 8 bits, as published values often are, PSNR would end at about 59 dB; near 30 dB it hardly differs.
+# Image metrics. Rounded to 8 bits, as published values often are, PSNR would end at about 59 dB; near 30 dB it hardly
+# differs.
 
 NOTHING_VISIBLE = "no rendering shows any of the reference, so these values mean nothing; choose other views"
 """Note of an evaluation whose views all miss the reference."""
 
 Rendering = Float32[np.ndarray, "H W 3"]
 Measure = Callable[[np.ndarray, np.ndarray], ImageMetrics]
-"""Measures an image against a target, both from 0 to 1."""
 
 
 def evaluate(
@@ -264,31 +255,24 @@ def evaluate(
     """
     reference, candidate = clean(reference)[0], with_origin(clean(candidate)[0], reference.origin)
     measure = _measure(flip, lpips, device)
-    groups = list[tuple[Views, Split]]()
+    given = 0 if views is None else len(_select_split(views, split)[1])  # an empty split is refused before any work
     if views is not None:
-        _select_split(views, split)  # refused before any work
-        groups.append((in_scene_frame(reference, views, threads=threads, progress=progress), split))
+        views = in_scene_frame(reference, views, threads=threads, progress=progress)
     load_kernels(progress)
     drawn = farther(evaluation_views(reference, seed=seed, threads=threads, progress=progress), distance)
-    groups.append((drawn, "all"))
-    counts = [len(_select_split(*group)[1]) for group in groups]
-    found = list[Evaluation]()
-    for (chosen, wanted), count in zip(groups, counts, strict=True):
-        begin, share = sum(len(each.views) for each in found) / sum(counts), count / sum(counts)
-        evaluation = _compare_views(
-            reference,
-            candidate,
-            chosen,
-            wanted,
-            measure,
-            device,
-            threads,
-            progress=lambda stage, fraction, begin=begin, share=share: progress(stage, begin + share * fraction),
-        )
-        shown = share_shown(reference, [each.view.camera for each in evaluation.views], threads=threads)
-        found.append(replace(evaluation, shown=shown))
+    total = given + len(drawn.test)
+
+    def compared(views: Views, split: Split, before: int, count: int) -> Evaluation:
+        def advance(stage: str, fraction: float, note: str = "", /) -> None:
+            progress(stage, (before + fraction * count) / total)
+
+        found = _compare_views(reference, candidate, views, split, measure, device, threads, progress=advance)
+        return replace(found, shown=share_shown(reference, [each.view.camera for each in found.views], threads=threads))
+
+    evaluation = None if views is None else compared(views, split, 0, given)
+    surroundings = compared(drawn, "all", given, len(drawn.test))
     progress("evaluate", 1.0)
-    return found[0] if len(found) == 1 else replace(found[0], surroundings=found[1])
+    return surroundings if evaluation is None else replace(evaluation, surroundings=surroundings)
 
 
 def compare_images(

@@ -48,19 +48,14 @@ WINDOW = 32
 def rms_difference(
     image: Float32[np.ndarray, "H W 3"], other: Float32[np.ndarray, "H W 3"]
 ) -> Float32[np.ndarray, "H W"]:
-    """Return the root mean square error over RGB of each pixel, in levels of an 8-bit image, 0 to 255.
-
-    The images are float32 from 0 to 1.
-    """
-    squares = np.square(image - other).mean(axis=2)
-    return np.asarray(255 * np.sqrt(squares), np.float32)
+    """Return the root mean square error over RGB of each pixel, in levels of an 8-bit image, 0 to 255."""
+    return np.asarray(255 * np.sqrt(np.square(image - other).mean(axis=2)), np.float32)
 
 
 def full_scale(psnr: float) -> int:
     """Return the error, in levels, of the brightest colour for an image with this PSNR in decibels.
 
-    It is the next of :data:`FULL_SCALES` above four times the root mean square error, which itself would leave most of
-    the image bright; with the largest error, most would be black.
+    It is the next of :data:`FULL_SCALES` above four times the root mean square error.
     """
     wanted = 4 * 255 * 10 ** (-psnr / 20) if math.isfinite(psnr) else 0.0
     return next((scale for scale in FULL_SCALES if scale >= wanted), FULL_SCALES[-1])
@@ -75,11 +70,7 @@ def heat_map(levels: Float32[np.ndarray, "H W"], full: float) -> UInt8[np.ndarra
 
 
 def worst_crop(levels: Float32[np.ndarray, "H W"], side: int) -> tuple[slice, slice]:
-    """Return rows and columns of a square of ``side`` pixels around the largest error, clipped to the image.
-
-    The largest error is the window of :data:`WINDOW` pixels with the largest mean square; without any error, the
-    middle.
-    """
+    """Return rows and columns of a square of ``side`` pixels around the :data:`WINDOW` of the largest mean square."""
     height, width = levels.shape
     down, across = min(WINDOW, height), min(WINDOW, width)
     sums = _sums(np.square(np.nan_to_num(levels.astype(np.float64), nan=255.0)), down, across)

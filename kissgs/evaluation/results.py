@@ -1,4 +1,4 @@
-"""Metrics as text, apart from the evaluation, so that a command prints its report without loading it."""
+"""Results of an evaluation, which a command prints without loading what computes them; losses as goals define them."""
 
 from __future__ import annotations
 
@@ -23,8 +23,6 @@ def format_metric(value: float, digits: int, *, signed: bool = False) -> str:
     return f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # -0.0 + 0.0 is 0.0
 
 
-# Results of an evaluation: metrics per view and their means, as text and as JSON.
-
 Split = Literal["test", "train", "all"]
 
 MAX_VIEW_PSNR = 60.0
@@ -36,8 +34,7 @@ single unchanged view, at 120 dB or infinite, would hide damage in others."""
 class ImageMetrics:
     """Metrics of an image against a target, or their means over views.
 
-    NaN in an image gives NaN in the metrics and their means, so that no mean hides a failed rendering. In a mean of
-    PSNR, each view counts for at most :data:`MAX_VIEW_PSNR`; it is infinite only if all images are equal.
+    NaN in an image gives NaN in the metrics and their means, so that no mean hides a failed rendering.
     """
 
     psnr: float  # decibels; infinite for equal images
@@ -47,7 +44,7 @@ class ImageMetrics:
     lpips: float | None = None  # 0 for equal images, up to about 1; None if not requested
 
     def as_dict(self) -> dict[str, float | str | None]:
-        """Return the metrics for JSON: an infinite value is None (null), NaN the string ``"NaN"``."""
+        """Return the metrics for JSON (:func:`as_json`)."""
         return {name: as_json(value) for name, value in asdict(self).items() if value is not None}
 
     def texts(self) -> dict[str, str]:
@@ -86,7 +83,7 @@ class Comparison:
     def cells(self, names: Sequence[str] | None = None) -> list[str]:
         """Return a table row: reference, candidate, change, candidate to reference; without photographs the last.
 
-        ``names`` are the metrics to take, of those that :meth:`ImageMetrics.texts` returns, by default all.
+        ``names`` are metrics as :meth:`ImageMetrics.texts` names them, by default all.
         """
         names = list(self.candidate.texts()) if names is None else names
         to_reference = [self.candidate_vs_reference.texts()[name] for name in names]
@@ -119,10 +116,7 @@ class ViewComparison:
         return f"at {_point(pose['position'])} looking at {_point(pose['target'])}"
 
     def pose_as_dict(self) -> dict[str, Any]:
-        """Return the view's name, its PSNR of the candidate to the reference, and the camera's pose, for JSON.
-
-        ``position``, ``target`` (None if unknown) and the unit vector ``direction`` are in the world's coordinates.
-        """
+        """Return the view's name, its PSNR of the candidate to the reference, and the camera's pose in the world."""
         camera, target = self.view.camera, self.view.target
         return {
             "name": self.view.name,
@@ -303,10 +297,8 @@ MAX_ERROR_RATIO = 20.0
 that few views show: there the ratio is in the hundreds, in views that are merely difficult below ten."""
 
 MAX_SSIM_RATIO = 5.0
-"""Largest ratio of the worst views' loss of SSIM to that of the goal.
-
-No loss to renderings is negative, so that the mean of all views already limits the worst twentieth to 20 times itself.
-"""
+"""Largest ratio of the worst views' loss of SSIM to that of the goal; the mean alone limits it to 20, as no loss to
+renderings is negative."""
 
 
 def over_scene(evaluation: Evaluation) -> Evaluation:
@@ -337,10 +329,9 @@ def drop_of(evaluation: Evaluation) -> float:
     """Return the drop of PSNR from reference to candidate as goals define it, decibels; NaN if a rendering failed.
 
     With photographs it is the drop of the mean PSNR to them. Without, the reference is assumed to have
-    :data:`ASSUMED_PSNR` to photographs, with errors independent of the new ones, so that squared errors add up.
-
-    The worst views limit it, those of the surroundings apart: it is at least the drop that their additional squared
-    error, divided by :data:`MAX_ERROR_RATIO`, would cause in all views.
+    :data:`ASSUMED_PSNR` to photographs, with errors independent of the new ones, so that squared errors add up. It is
+    at least the drop that the squared error that the worst views add, divided by :data:`MAX_ERROR_RATIO`, would cause
+    in all views.
     """
     mean = evaluation.mean
     if mean.change is None:
@@ -358,8 +349,7 @@ def ssim_drop_of(evaluation: Evaluation) -> float:
     """Return the drop of SSIM from reference to candidate as goals define it; NaN if a rendering failed.
 
     With photographs it is the drop of the mean SSIM to them, without photographs 1 - SSIM to the renderings of the
-    reference. The worst views limit it, those of the surroundings apart: it is at least their mean drop divided by
-    :data:`MAX_SSIM_RATIO`.
+    reference; at least the mean drop of the worst views divided by :data:`MAX_SSIM_RATIO`.
     """
     groups = [_ssim_drops(evaluation), _ssim_drops(over_scene(evaluation))]
     mean, worst = sum(groups[0]) / len(groups[0]), _worst(groups) / MAX_SSIM_RATIO

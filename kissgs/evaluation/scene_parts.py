@@ -10,13 +10,11 @@ import numpy as np
 from kissgs.core.array_types import Float64, Int
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
+from kissgs.io.conventions import spread_bits
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.constants import ALPHA_MIN
-from kissgs.rendering.cpu import blending
-from kissgs.rendering.cpu.backward import differentiate_footprints
-from kissgs.rendering.cpu.frame import Frame, draw
-
-# Prominence of Gaussians, and a sampler that draws them by it so that every part of a scene is considered.
+from kissgs.rendering.cpu.frame import differentiate_footprints, draw, sums_of_slots
+from kissgs.rendering.cpu.records import Frame
+from kissgs.rendering.rasterizer import drawn_opacities
 
 MORTON_BITS = 21
 """Bits per axis of a Morton code: as many as 64 bits hold."""
@@ -28,14 +26,8 @@ FAIRNESS = 0.25
 """Exponent of prominence when octree cells share a probability: 1 is proportional, 0 gives all cells the same."""
 
 
-def drawn_opacities(splats: Splats) -> Float64[np.ndarray, " N"]:
-    """Return opacities from 0 to 1; 0 for Gaussians that no renderer draws."""
-    opacities = 1 / (1 + np.exp(-splats.opacities.astype(np.float64)))
-    return np.where(opacities > ALPHA_MIN, opacities, 0.0)
-
-
 def prominence(splats: Splats) -> Float64[np.ndarray, " N"]:
-    """Return the prominence of each Gaussian, ``(N,)``, 0 to 1: opacity times its area relative to its neighbourhood.
+    """Return the prominence of each Gaussian, 0 to 1: opacity times its area relative to its neighbourhood.
 
     The relative area is a / (a + median of the neighbourhood). So the details of a small object count as much as the
     large Gaussians of a background, and one immense Gaussian at most twice as much as an ordinary one.
@@ -54,7 +46,7 @@ def prominence(splats: Splats) -> Float64[np.ndarray, " N"]:
 
 
 def mahalanobis_distances(splats: Splats, point: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, " N"]:
-    """Return the Mahalanobis distance of a point to each Gaussian: the distance in its standard deviations."""
+    """Return the distance of a point to each Gaussian in its standard deviations."""
     offsets = point - splats.means.astype(np.float64)
     w, axis = splats.quats[:, :1].astype(np.float64), -splats.quats[:, 1:].astype(np.float64)
     rotated = offsets + 2 * np.cross(axis, np.cross(axis, offsets) + w * offsets)
@@ -106,27 +98,12 @@ def _fair_probabilities(codes: Int[np.ndarray, " N"], weights: Float64[np.ndarra
 
 
 def morton_codes(means: Float64[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
-    """Return Morton codes, ``(N,)``: positions along a space-filling curve, the interleaved bits of the coordinates."""
+    """Return positions along a space-filling curve: the interleaved bits of the coordinates."""
     low = means.min(axis=0)
     extent = max(float((means.max(axis=0) - low).max()), 1e-300)
-    steps = np.minimum((means - low) / extent * 2**MORTON_BITS, 2**MORTON_BITS - 1).astype(np.int64)
-    codes = np.zeros(len(means), np.int64)
-    for axis in range(3):
-        codes |= _spread_bits(steps[:, axis]) << axis
-    return codes
-
-
-def _spread_bits(values: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
-    """Insert two zeros before each of the lowest 21 bits."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        values = (values | (values << shift)) & mask
-    return values
+    steps = np.minimum((means - low) / extent * 2**MORTON_BITS, 2**MORTON_BITS - 1).astype(np.uint64)
+    x, y, z = (spread_bits(axis) << np.uint64(n) for n, axis in enumerate(steps.T))
+    return (x | y | z).astype(np.int64)
 
 
 # Separate parts of a scene: each may be lost as a whole, and randomly drawn cameras may miss it.
@@ -250,25 +227,18 @@ MAX_SIDE = 160
 
 
 def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
-    """Return the blending weight of each Gaussian, ``(N,)``, summed over all pixels.
-
-    The weight in a pixel is alpha times the transmittance in front of the Gaussian; with the background's weights, the
-    total is the number of pixels.
-    """
+    """Return the blending weight of each Gaussian, alpha times the transmittance in front of it, summed over pixels."""
     height, width = frame.transmittance.shape
     ones, zeros = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     ones[:, :, 0] = 1  # so the gradient with respect to a red value is the sum of weights
     v_slots, slots, _ = differentiate_footprints(frame, ones, zeros, pool)
-    weights = np.zeros(len(frame.footprints.visible), np.float64)
-    blending.sum_errors(np.ascontiguousarray(v_slots[:, 6]), slots, frame.footprints.visible, weights)
-    return weights
+    return sums_of_slots(frame, slots, np.ascontiguousarray(v_slots[:, 6]))
 
 
 def share_shown(splats: Splats, cameras: Sequence[Camera], *, threads: int = 0) -> float:
     """Return the share of a scene, 0 to 1, that some cameras show; 1 for a scene without visible Gaussians.
 
-    A Gaussian is shown if it covers more than :data:`SHOWN_SHARE` of an image, and counts by its prominence
-    (:func:`kissgs.evaluation.scene_parts.prominence`). Gaussians hidden behind others in all images are not shown.
+    A Gaussian is shown if it covers more than :data:`SHOWN_SHARE` of an image, and counts by its prominence.
     """
     counts, plain = prominence(splats), base_colors_only(splats)
     if not counts.any():

@@ -220,12 +220,12 @@ def morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     codes = np.zeros(len(means), np.uint64)
     for axis in range(3):
         cells = np.clip((means[:, axis].astype(np.float64) - ends[0, axis]) / extent, 0, 1) * (2**_BITS - 1)
-        codes |= _spread(cells.astype(np.uint64)) << np.uint64(axis)
+        codes |= spread_bits(cells.astype(np.uint64)) << np.uint64(axis)
     return np.argsort(codes, kind="stable").astype(np.int64)
 
 
-def _spread(cells: Shaped[np.ndarray, " N"]) -> Shaped[np.ndarray, " N"]:
-    """Return numbers whose bits are two bits apart."""
+def spread_bits(cells: Shaped[np.ndarray, " N"]) -> Shaped[np.ndarray, " N"]:
+    """Return uint64 numbers of at most 21 bits with two zeros before each bit."""
     for shift, mask in _SPREAD:
         cells = (cells | cells << np.uint64(shift)) & np.uint64(mask)
     return cells

@@ -13,8 +13,8 @@ from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.constants import DILATION
-from kissgs.rendering.cpu.backward import Gradients, differentiate
-from kissgs.rendering.cpu.frame import Frame, draw
+from kissgs.rendering.cpu.frame import Gradients, differentiate, draw
+from kissgs.rendering.cpu.records import Frame
 from kissgs.rendering.metrics import differences_and_ssim
 from kissgs.rendering.tensors import Parameters
 
@@ -39,16 +39,12 @@ def rasterize(
     threads: int = 0,
     receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Render images of a scene, with gradients by all of its parameters.
+    """Render images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``, with gradients by all parameters.
 
     On the CPU by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``), both with the image model of
-    :mod:`kissgs.rendering.constants`. Parameters are float32 and finite, on one device, as from
-    :func:`kissgs.rendering.tensors.tensors_of`; cameras ``(C, 4, 4)`` and ``(C, 3, 3)``, and backgrounds ``(C, 3)``,
-    have no gradient. ``receive`` is called in the backward pass on the CPU with the gradients of each image, in place
-    of autograd: most Gaussians have none, and arrays for all of them take longer to fill than to compute.
-
-    Returns:
-        Images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``.
+    :mod:`kissgs.rendering.constants`. Cameras ``(C, 4, 4)`` and ``(C, 3, 3)``, and backgrounds ``(C, 3)``, have no
+    gradient. ``receive`` is called in the backward pass on the CPU with the gradients of each image, in place of
+    autograd: most Gaussians have none, and arrays for all of them take longer to fill than to compute.
     """
     tensors, device = [parameters[name] for name in ATTRIBUTES], parameters["means"].device
     if backgrounds is None:
@@ -101,11 +97,7 @@ class _Rasterize(torch.autograd.Function):
         frames: list[Frame] = ctx.frames
         image_gradients, alpha_gradients = v_images.contiguous().numpy(), v_alphas.contiguous().numpy()
         receive: Callable[[Gradients], None] | None = ctx.receive
-        totals: list[np.ndarray] = []
-        if receive is None:
-            totals = [np.empty(tuple(parameter.shape), np.float32) for parameter in parameters]
-            for total in totals:
-                total.fill(0)
+        totals = [np.zeros(tuple(each.shape), np.float32) for each in (parameters if receive is None else ())]
         with Workers(ctx.threads) as pool:
             for frame, v_image, v_alpha in zip(frames, image_gradients, alpha_gradients, strict=True):
                 found = differentiate(frame, v_image, v_alpha, pool)
@@ -197,11 +189,7 @@ def plain_photometric_loss(
     ssim_weight: float,
     mse_weight: float = 0.0,
 ) -> Float[torch.Tensor, ""]:
-    """Return the loss of :func:`photometric_loss` by plain torch operations, on any device and in any dtype.
-
-    As in the kernels, the sum, the difference and their squares are blurred, so that 1 - SSIM of nearly equal images is
-    accurate in float32.
-    """
+    """Return the loss of :func:`photometric_loss` by plain torch operations, on any device and in any dtype."""
     x, y = (images.reshape(-1, *images.shape[-3:]).clamp(-1e9, 1e9) for images in (image, target))
     s, d = x + y, x - y
     S, D, SS, DD = _blur(torch.cat([s, d, s * s, d * d], dim=-1).permute(0, 3, 1, 2)).chunk(4, dim=1)

@@ -14,8 +14,8 @@ from kissgs.core.array_types import Float32, Float64, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.resources import Workers
 
-# Images are ``(H, W, 3)``, floats in [0, 1] or uint8. Values outside [0, 1] are not clamped here; clamp renderings
-# first. A NaN in either image makes the result NaN, so that no average hides a failed rendering.
+# Images are floats in [0, 1] or uint8. Values outside [0, 1] are not clamped here; clamp renderings first. A NaN in
+# either image makes the result NaN, so that no average hides a failed rendering.
 
 WINDOW = 11
 """Side of the Gaussian window of SSIM and MS-SSIM, pixels."""
@@ -42,9 +42,8 @@ def ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."])
     """Return the structural similarity, from -1 to 1; exactly 1 for equal images.
 
     The mean over all pixels and channels, as in 3DGS: a Gaussian window of 11x11 pixels and standard deviation 1.5,
-    padding with zeros (so that images may have any size), C1 = 0.01², C2 = 0.03². Values beyond ±1e9 are clamped. Wang
-    et al., "Image Quality Assessment: From Error Visibility to Structural Similarity", IEEE Transactions
-    on Image Processing 13 (2004).
+    padding with zeros, C1 = 0.01², C2 = 0.03². Wang et al., "Image Quality Assessment: From Error Visibility to
+    Structural Similarity", IEEE Transactions on Image Processing 13 (2004).
     """
     a, b = image_pair(image, reference)
     with Workers(1) as pool:
@@ -160,17 +159,12 @@ def _tiles(height: int, width: int) -> list[np.ndarray]:
     ]
 
 
-# LDR-FLIP, a perceptual difference of images, by the package ``flip-evaluator`` (extra ``kissgs[flip]``).
-
-
 class Flip:
-    """FLIP: from 0 for equal images to 1. Construct it once and call it often.
+    """LDR-FLIP by the package ``flip-evaluator``: from 0 for equal images to 1. Construct it once and call it often.
 
     It estimates the difference that an observer sees who flips between two images on a display with 67 pixels per
-    degree of visual angle: a monitor of 3840 pixels and 0.7 m width, 0.7 m away.
-
-    Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", Proceedings of the ACM on Computer Graphics
-    and Interactive Techniques 3 (2020).
+    degree of visual angle. Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", Proceedings of the
+    ACM on Computer Graphics and Interactive Techniques 3 (2020).
     """
 
     def __init__(self) -> None:
@@ -183,10 +177,7 @@ class Flip:
             ) from error
 
     def __call__(self, image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
-        """Return the mean over all pixels of two sRGB images ``(H, W, 3)``, floats or uint8; NaN if either has a NaN.
-
-        Values are clamped to [0, 1].
-        """
+        """Return the mean over all pixels of two sRGB images, clamped to [0, 1]; NaN if either has a NaN."""
         first, second = (np.clip(pixels, 0, 1) for pixels in image_pair(image, reference))
         if np.isnan(first).any() or np.isnan(second).any():  # the package takes NaN for a value
             return float("nan")
@@ -194,19 +185,12 @@ class Flip:
         return float(errors.mean(dtype=np.float64))  # the package adds them up in float32
 
 
-# LPIPS, a perceptual distance of images, by the package ``lpips`` (extra ``kissgs[lpips]``).
-
-MIN_SIDE = 16
-"""Smallest side of an image, pixels: the network halves its input four times."""
-
-
 class Lpips:
     """LPIPS with VGG-16: from 0 for equal images up to about 1. Construct it once and call it often.
 
     This is the LPIPS of papers on Gaussian splatting: like the evaluation script of 3DGS, it passes images in [0, 1] to
-    the network, which was calibrated on [-1, 1].
-
-    Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018.
+    the network, which was calibrated on [-1, 1]. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a
+    Perceptual Metric", CVPR 2018.
     """
 
     def __init__(self, device: str = "cpu") -> None:
@@ -230,13 +214,13 @@ class Lpips:
         self._device = device
 
     def __call__(self, image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
-        """Return the distance of two images ``(H, W, 3)``, floats in [0, 1] or uint8; NaN if either has a NaN."""
+        """Return the distance of two images; NaN if either has a NaN."""
         import torch
 
         pair = image_pair(image, reference)
         height, width, _ = pair[0].shape
-        if min(height, width) < MIN_SIDE:
-            raise UnsupportedError(f"LPIPS needs images of at least {MIN_SIDE}x{MIN_SIDE} pixels, not {width}x{height}")
+        if min(height, width) < 16:  # the network halves its input four times
+            raise UnsupportedError(f"LPIPS needs images of at least 16x16 pixels, not {width}x{height}")
         first, second = (torch.from_numpy(array).to(self._device).permute(2, 0, 1)[None] for array in pair)
         with torch.no_grad():
             return float(self._network(first, second).item())

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,54 +17,35 @@ from kissgs.core.resources import Workers, return_free_memory
 from kissgs.core.sensitivity import BLOCK, LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import SH_C0, Splats
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.constants import DILATION
 from kissgs.rendering.cpu.tiles import each_part, even
 
 if TYPE_CHECKING:
-    from kissgs.rendering.cpu.frame import Frame
+    from kissgs.rendering.cpu.records import Frame
 
 
 LEAF = 512
 """Largest number of Gaussians in a leaf of the tree, among which neighbours are searched."""
 
-NEIGHBOURS = 4
-"""The local scale is the distance within which 1 / NEIGHBOURS of the leaf's Gaussians lie."""
-
-SAMPLED = 4
-"""Stride of the leaf's Gaussians to which distances are measured."""
-
-GAP = 0.2
-"""Share of the distance expected on a surface of uniform density: if the nearest half, quarter or eighth of the
-neighbours is nearer than that, the object has no more Gaussians, and their distance is used."""
-
 
 def local_scale(splats: Splats, *, threads: int = 0) -> Float32[np.ndarray, " N"]:
-    """Return the distance from each Gaussian to about its 128th neighbour, ``(N,)``, world units, positive.
+    """Return the distance from each Gaussian to about its 128th neighbour, at least its own size, world units.
 
     Distances are measured within the leaves of a k-d tree of equal counts, which adapts to parts of any size. For an
-    object of fewer Gaussians, the distance is extrapolated as if its surface continued. The result is at least the
-    Gaussian's own size.
+    object of fewer Gaussians, the distance is extrapolated as if its surface continued.
     """
     from kissgs.rendering.cpu.neighbours import leaf_scales, leaves_of
 
     means, found = np.array(splats.means, order="C"), np.empty(len(splats), np.float32)
     order, edges = leaves_of(means, LEAF)
     with Workers(threads) as pool:
-        each_part(
-            lambda first, last: leaf_scales(means, order, edges, first, last, SAMPLED, NEIGHBOURS, GAP, found),
-            even(len(edges) - 1, pool),
-            pool,
-        )
+        leaves = even(len(edges) - 1, pool)
+        each_part(lambda first, last: leaf_scales(means, order, edges, first, last, found), leaves, pool)
     sizes = np.exp(np.median(splats.scales, axis=1))
     least = np.maximum(1e-6 * np.abs(splats.means).max(axis=1, initial=0), 1e-12)  # about float32's resolution
     return np.maximum(np.maximum(found, sizes), least).astype(np.float32)
 
 
 # Coverage: how well the best camera has seen each Gaussian, by visibility and resolution.
-
-VISIBLE = 0.003
-"""Share of a Gaussian's squared alpha in an image from which on it counts as seen; with less than a twentieth of its
-opacity unobstructed, it is hidden."""
 
 RESOLVED = 3.0
 """Length in the image of the distance to the 128th neighbour from which on a Gaussian counts as resolved, pixels."""
@@ -104,9 +86,8 @@ class Coverage:
         """
         from kissgs.rendering.cpu.sensitivity import raise_coverage
 
-        limits = np.array([VISIBLE, RESOLVED / finer, frame.camera.dilation / DILATION])
-        scene = frame.gaussians, frame.projection, self._scale, frame.footprints.visible
-        pool.map(lambda rows: raise_coverage(*scene, *rows, seen, limits, self.share), frame.parts)
+        length, parts = RESOLVED / finer, frame.parts.tolist()
+        pool.map(lambda part: raise_coverage(frame, self._scale, part[0], part[1], seen, length, self.share), parts)
 
 
 # Measurement of the sensitivity of a scene, exactly to first order, with one backward pass per image.
@@ -270,62 +251,33 @@ def refit_colors(
     They are like ``sh0``, at most :data:`MAX_CHANGE` from the initial ones, to which ``prior`` attracts them. Each of
     the ``steps`` of conjugate gradients takes one rendering and one gradient per camera.
     """
+    from kissgs.rendering.cpu.frame import add_color_gradients, draw
+
     if steps == 0 or not (color_weight > 0).any():
         return decoded.sh0
     diagonal = color_weight.astype(np.float64)[:, None] * SH_C0**2
     damping = DAMPING * float(np.median(diagonal[diagonal > 0]))
+    attraction = prior.astype(np.float64)[:, None] * SH_C0**2 + damping
+    views, passes = list(zip(cameras.cameras, cameras.per_pixel(), strict=True)), itertools.count()
     with Workers(threads) as pool:
-        problem = _LeastSquares(
-            decoded=decoded,
-            original=original,
-            cameras=cameras,
-            attraction=prior.astype(np.float64)[:, None] * SH_C0**2 + damping,
-            pool=pool,
-            progress=progress,
-            total_passes=steps + 1,
-        )
-        sh0 = _conjugate_gradients(problem.negative_gradient, decoded.sh0.astype(np.float64), diagonal + damping, steps)
+        targets = []
+        if sum(camera.width * camera.height for camera, _ in views) <= MAX_CACHED_PIXELS:
+            targets = [draw(original, camera, cameras.background, pool).image for camera, _ in views]
+
+        def negative_gradient(sh0: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
+            """Return minus half the gradient by the base colours; renders all images once."""
+            total, number = np.zeros(sh0.shape, np.float32), next(passes)
+            scene = replace(decoded, sh0=sh0.astype(np.float32))
+            for done, (camera, weight) in enumerate(views):
+                progress("refit", (number + done / len(views)) / (steps + 1))
+                frame = draw(scene, camera, cameras.background, pool)
+                target = targets[done] if targets else draw(original, camera, cameras.background, pool).image
+                add_color_gradients(frame, (target - frame.image) * np.float32(weight), total, pool)
+            return attraction * (decoded.sh0 - sh0) + total
+
+        sh0 = _conjugate_gradients(negative_gradient, decoded.sh0.astype(np.float64), diagonal + damping, steps)
     progress("refit", 1.0)
     return np.clip(sh0, decoded.sh0 - MAX_CHANGE, decoded.sh0 + MAX_CHANGE).astype(np.float32)
-
-
-@dataclass(slots=True, kw_only=True)
-class _LeastSquares:
-    """The squared image error as a function of the base colours, plus the attraction to the initial ones."""
-
-    decoded: Splats
-    original: Splats
-    cameras: WeightedCameras
-    attraction: Float64[np.ndarray, "M 1"]
-    pool: Workers
-    progress: Progress
-    total_passes: int
-    passes: int = 0
-    targets: list[Float32[np.ndarray, "H W 3"]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        if sum(camera.width * camera.height for camera in self.cameras.cameras) <= MAX_CACHED_PIXELS:
-            self.targets = [self._target(camera) for camera in self.cameras.cameras]
-
-    def _target(self, camera: Camera) -> Float32[np.ndarray, "H W 3"]:
-        from kissgs.rendering.cpu.frame import draw
-
-        return draw(self.original, camera, self.cameras.background, self.pool).image
-
-    def negative_gradient(self, sh0: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
-        """Return minus half the gradient by the base colours; renders all images once."""
-        from kissgs.rendering.cpu.backward import add_color_gradients
-        from kissgs.rendering.cpu.frame import draw
-
-        total = np.zeros(sh0.shape, np.float32)
-        scene, count = replace(self.decoded, sh0=sh0.astype(np.float32)), len(self.cameras.cameras)
-        for done, (camera, weight) in enumerate(zip(self.cameras.cameras, self.cameras.per_pixel(), strict=True)):
-            self.progress("refit", (self.passes + done / count) / self.total_passes)
-            frame = draw(scene, camera, self.cameras.background, self.pool)
-            target = self.targets[done] if self.targets else self._target(camera)
-            add_color_gradients(frame, (target - frame.image) * np.float32(weight), total, self.pool)
-        self.passes += 1
-        return self.attraction * (self.decoded.sh0 - sh0) + total
 
 
 def _conjugate_gradients(

@@ -8,13 +8,10 @@ D = G d, p = G s² - S² and q = G d² - D² (four blurs instead of five),
 and its gradient by x takes three more blurs: 2 (G M + s G ∂p + d G ∂q), where M = S (∂S² - ∂p) + D (∂D² - ∂q). Equal
 images have d = 0 and SSIM exactly 1, and swapping them changes no bit.
 
-A tile is processed row by row; the last eleven rows of s and d, and of the three maps, stay in the cache, in ring
-buffers. Each row is written twice, the second time eleven rows further, so that the last eleven rows are always
-contiguous: all taps of a blur then have constant offsets, and the compiler can vectorise it.
-
-Constants: a tile has at most 480 columns (160 pixels of 3 channels). The maps extend 15 columns further on both sides
-and have a stride of 512; s and d extend 30 columns further and have a stride of 576. A row of the first ring buffer is
-s, d; a row of the second is M, ∂p, ∂q.
+A tile is processed row by row; the last eleven rows stay in the cache, in ring buffers, s and d in the first, M, ∂p and
+∂q in the second. Each row is written twice, the second time eleven rows further, so that the last eleven are always
+contiguous and the compiler can vectorise a blur. A tile has at most 480 columns (160 pixels of 3 channels); the maps
+extend 15 further on both sides, with a stride of 512; s and d 30 further, with a stride of 576.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Pace, Progress, silent
 from kissgs.core.resources import keep_free_memory
 from kissgs.rendering import tensors
-from kissgs.rendering.cpu.backward import Gradients
+from kissgs.rendering.cpu.frame import Gradients
 from kissgs.rendering.differentiable import photometric_loss, rasterize
 from kissgs.training.supervision import TrainingTargets
 

@@ -25,7 +25,7 @@ from kissgs.core.splats import (
     Splats,
     clean,
 )
-from kissgs.rendering.cpu.backward import Gradients
+from kissgs.rendering.cpu.frame import Gradients
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.tensors import tensors_of
 

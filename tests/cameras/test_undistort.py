@@ -45,8 +45,8 @@ def photograph(lens):
 @pytest.mark.parametrize("lens", LENSES)
 def test_undistorted_pixels_equal_those_of_a_pinhole(lens):
     window = full_window(lens)
-    image = undistort(photograph(lens), lens, window)
-    K = window.K(lens)
+    image = undistort(photograph(lens), window)
+    K = window.K
     x = (np.arange(window.width) + 0.5 - K[0, 2]) / K[0, 0]
     y = (np.arange(window.height) + 0.5 - K[1, 2]) / K[1, 1]
     expected = scene(*np.meshgrid(x, y))
@@ -57,14 +57,15 @@ def test_undistorted_pixels_equal_those_of_a_pinhole(lens):
 @pytest.mark.parametrize("lens", LENSES)
 def test_the_photograph_covers_the_window_but_no_larger_one(lens):
     window = full_window(lens)
-    assert all_covered(lens, window)
-    larger = Window(window.left - 1, window.top - 1, window.width + 2, window.height + 2)
+    assert all_covered(window)
+    larger = Window(lens, window.left - 1, window.top - 1, window.width + 2, window.height + 2)
     in_photo = larger.left >= 0 and larger.top >= 0
     in_photo = in_photo and larger.left + larger.width <= 120 and larger.top + larger.height <= 80
-    assert not (in_photo and all_covered(lens, larger))
+    assert not (in_photo and all_covered(larger))
 
 
-def all_covered(lens, window):
+def all_covered(window):
+    lens = window.lens
     columns, rows = window.left + np.arange(window.width), window.top + np.arange(window.height)
     x, y = np.meshgrid((columns + 0.5 - lens.cx) / lens.fx, (rows + 0.5 - lens.cy) / lens.fy)
     u, v = project(lens, x, y)
@@ -72,21 +73,19 @@ def all_covered(lens, window):
 
 
 def test_barrel_distortion_loses_nothing_and_pincushion_keeps_the_aspect_ratio():
-    assert full_window(LENSES[0]) == Window(0, 0, 120, 80)
+    assert full_window(LENSES[0]) == Window(LENSES[0], 0, 0, 120, 80)
     window = full_window(LENSES[1])
     assert 90 < window.width < 120
     assert window.width / window.height == pytest.approx(1.5, abs=0.05)
-    np.testing.assert_array_equal(
-        window.K(LENSES[1]), [[90, 0, 62.3 - window.left], [0, 95, 38.1 - window.top], [0, 0, 1]]
-    )
+    np.testing.assert_array_equal(window.K, [[90, 0, 62.3 - window.left], [0, 95, 38.1 - window.top], [0, 0, 1]])
 
 
 def test_photographs_without_distortion_stay_unchanged():
     photo = np.random.default_rng(0).integers(0, 256, (80, 120, 3), dtype=np.uint8)
     lens = Lens(90, 95, 62.3, 38.1, 120, 80)
     assert not lens.distortion
-    np.testing.assert_array_equal(undistort(photo, lens, Window(0, 0, 120, 80)), photo)
-    np.testing.assert_array_equal(undistort(photo, lens, Window(5, 7, 20, 30)), photo[7:37, 5:25])
+    np.testing.assert_array_equal(undistort(photo, Window(lens, 0, 0, 120, 80)), photo)
+    np.testing.assert_array_equal(undistort(photo, Window(lens, 5, 7, 20, 30)), photo[7:37, 5:25])
 
 
 def test_windows_exclude_rays_beyond_the_invertible_range():
@@ -132,5 +131,5 @@ def test_any_coefficients(distortion, focal, cx):
     assert window.width * window.height >= MIN_AREA * 120 * 80
     assert window.left >= 0
     assert window.left + window.width <= 120
-    image = undistort(np.full((80, 120, 3), 77, dtype=np.uint8), lens, window)
+    image = undistort(np.full((80, 120, 3), 77, dtype=np.uint8), window)
     assert (image == 77).all()

@@ -9,6 +9,8 @@ from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import COUNT, MAX_ADDED, VISIBLE_PSNR, Parts, evaluation_views
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.scene_parts import find_parts, prominence
+from kissgs.rendering.metrics import psnr
+from kissgs.rendering.rasterizer import render
 
 
 def objects(count, gaussians=100, apart=200.0, seed=0):
@@ -132,11 +134,13 @@ def test_the_number_of_added_cameras_is_limited():
 def test_the_loss_of_a_part_is_visible_to_its_added_camera():
     """It is visible over at least one of the backgrounds."""
     scene, object_of = objects(2, gaussians=300)
-    parts = Parts.of(scene, prominence(scene))
+    parts = Parts(scene, *parts_of(scene))
     with Workers(1) as pool:
-        added = parts.cameras_for(range(len(parts.parts)), (64, 48), np.random.default_rng(0), pool)
-    assert all(one.psnr < VISIBLE_PSNR for one in added)
-    for part, one in zip(parts.parts, added, strict=True):
-        assert (one.target == part.center).all()
-        assert one.background in (0.0, 0.5, 1.0)
+        added = parts.cameras_for(range(len(parts.parts)), np.random.default_rng(0), pool)
+    for number, (part, view) in enumerate(zip(parts.parts, added, strict=True)):
+        assert (view.target == part.center).all()
+        assert view.background.tolist() in ([grey] * 3 for grey in (0, 0.5, 1))
+        rest = scene.select(np.flatnonzero(parts.part_of != number))
+        images = (render(each, view.camera, background=view.background.tolist())[0] for each in (scene, rest))
+        assert psnr(*(image.clip(0, 1) for image in images)) < VISIBLE_PSNR + 2
     assert len(set(object_of[parts.part_of >= 0])) == 2

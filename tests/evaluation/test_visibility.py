@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers import reference_rasterizer
+from helpers import reference_float64
+from scipy.spatial.transform import Rotation
 
 import kissgs
 from kissgs.core.resources import Workers
@@ -14,13 +15,13 @@ from kissgs.evaluation.scene_parts import (
     GaussianSampler,
     base_colors_only,
     blending_weights,
-    drawn_opacities,
     mahalanobis_distances,
     prominence,
     share_shown,
 )
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.cpu.frame import draw
+from kissgs.rendering.rasterizer import drawn_opacities
 
 SCENE = kissgs.sample_scene(150, sh_degree=1, seed=7)
 UP = np.array([0.0, -1, 0])
@@ -35,14 +36,11 @@ CAMERAS = [camera((0, -2.2, -5)), camera((4, -1, 2)), camera((0, -1, 0.5), (0, -
 
 def brute_force(scene, view):
     """Return the sum of alpha times transmittance of each Gaussian."""
-    params = {name: getattr(scene, name).astype(np.float64) for name in ATTRIBUTES}
-    found = np.zeros(len(scene))
-    for number, alphas, before, _ in reference_rasterizer.draw(params, view, np.zeros(3)).layers:
-        found[number] += float((alphas * before).sum())
-    return found
+    drawn = reference_float64.draw(reference_float64.tensors(scene), view, np.zeros(3))
+    return drawn.weights(len(scene)).sum(axis=1)
 
 
-def test_weights_equal_those_of_the_reference_rasterizer():
+def test_weights_equal_those_of_the_reference():
     with Workers(1) as pool:
         for view in CAMERAS:
             frame = draw(SCENE, view, np.zeros(3, np.float32), pool)
@@ -101,7 +99,7 @@ def test_prominence_is_opacity_times_relative_area():
 def test_distances_equal_those_of_the_covariances():
     point = np.array([0.3, -1.0, 2.0])
     for n in range(5):
-        rotation = reference_rasterizer.rotation(SCENE.quats[n].astype(np.float64))
+        rotation = Rotation.from_quat(SCENE.quats[n, [1, 2, 3, 0]]).as_matrix()
         covariance = rotation @ np.diag(np.exp(2 * SCENE.scales[n].astype(np.float64))) @ rotation.T
         offset = point - SCENE.means[n]
         wanted = np.sqrt(offset @ np.linalg.inv(covariance) @ offset)

@@ -8,10 +8,9 @@ import math
 import numpy as np
 import torch
 
-from helpers import reference_float64, reference_rasterizer
+from helpers import reference_float64
 from helpers.extreme_containers import BACKGROUND, BY_NAME, balanced, browser, decode, fast, largest, levels, scene
 from helpers.reference_training import trained
-from helpers.render_scenes import in_float64
 from kissgs.compaction.regularizers import erank_loss
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.rasterizer import removal_scores, render
@@ -36,18 +35,18 @@ def clean(name):
 
 
 def image_error(name):
-    """Return the largest difference of a pixel to the naive rasteriser, relative to the brightest colour if above 1."""
+    """Return the largest difference of a pixel to the float64 oracle, relative to the brightest colour if above 1."""
     splats, view = scene(name)[0], BY_NAME[name].camera()
-    expected = reference_rasterizer.draw(in_float64(splats), view, np.array(BACKGROUND))
-    sure = ~expected.doubtful
+    expected = reference_float64.draw(reference_float64.tensors(splats), view, BACKGROUND)
+    sure = expected.sure
     if sure.mean() < 0.9:
         return math.inf
     image, alpha = render(splats, view, background=BACKGROUND)
-    colours = [np.abs(layer[3]).max() for layer in expected.layers]
-    brightest = max(1.0, *colours) if colours else 1.0
+    brightest = expected.colours.numpy().max(initial=1.0)
     if not (np.isfinite(image).all() and np.isfinite(alpha).all()):
         return math.inf
-    return largest(np.abs(image - expected.image)[sure] / brightest, np.abs(alpha - expected.alpha)[sure])
+    differences = np.abs(image - expected.image.numpy()) / brightest, np.abs(alpha - expected.alpha.numpy())
+    return largest(*(difference[sure] for difference in differences))
 
 
 def gradient(name):

@@ -1,7 +1,6 @@
 """Oracles in float64: cleaning, images with gradients, removal, effective rank, training.
 
-The image is that of reference_rasterizer.py, all pixels at once, so that torch can differentiate it; a test compares
-the two.
+Images are gsplat's, pixel by pixel, and share no code with the renderer under test; torch differentiates them.
 """
 
 from __future__ import annotations
@@ -10,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
-from helpers.reference_rasterizer import C0, harmonics
 from kissgs.core.splats import ATTRIBUTES
 
+C0 = 0.28209479177387814
 LOGIT = float(np.log(1e-6) - np.log1p(-1e-6))
 
 
@@ -59,6 +59,35 @@ class Rendering:
     colours: torch.Tensor  # (M, 3)
     ended: np.ndarray  # (H, W): blending ended before the last Gaussian
 
+    def weights(self, count):
+        """Return alpha times the transmittance before, ``(count, H W)``, of all Gaussians of the scene."""
+        alphas, found = self.alphas.detach().numpy(), np.zeros((count, self.alphas.shape[1]))
+        before = np.cumprod(np.concatenate([np.ones_like(alphas[:1]), 1 - alphas[:-1]]), axis=0)
+        found[self.order] = alphas * before
+        return found
+
+
+def harmonics(x, y, z):
+    """Return the real spherical harmonics of bands 1 to 3."""
+    xx, yy, zz = x * x, y * y, z * z
+    return [
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * zz - xx - yy),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3 * xx - yy),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * zz - xx - yy),
+        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+        -0.4570457994644658 * x * (4 * zz - xx - yy),
+        1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3 * yy),
+    ]
+
 
 def tensors(splats, *, leaf=False):
     return {name: torch.tensor(getattr(splats, name), dtype=torch.float64, requires_grad=leaf) for name in ATTRIBUTES}
@@ -97,25 +126,26 @@ def exponents(params, camera, W, t):
     return squares / (2 * det[:, None]), before / det
 
 
-def decisions(raw):
+def decisions(raw, alpha_max):
     """Return masks of drawn Gaussians, clamped alphas, pixels that are not doubtful, and pixels that ended early."""
     raw = raw.detach().numpy()
     left, ended, doubtful = np.ones(raw.shape[1]), np.zeros(raw.shape[1], bool), np.zeros(raw.shape[1], bool)
     drawn = np.zeros(raw.shape, bool)
     for n, row in enumerate(raw):
-        alpha = np.minimum(row, 0.99)
+        alpha = np.minimum(row, alpha_max)
         seen = (alpha >= 1 / 255) & ~ended
         after = left * (1 - alpha)
         drawn[n] = seen & (after > 1e-4)
         doubtful |= ~ended & (np.abs(alpha * 255 - 1) < 2e-4)
-        doubtful |= seen & ((np.abs(after / 1e-4 - 1) < 2e-3) | (np.abs(row / 0.99 - 1) < 2e-5))
+        doubtful |= seen & ((np.abs(after / 1e-4 - 1) < 2e-3) | (np.abs(row / alpha_max - 1) < 2e-5))
         ended |= seen & ~drawn[n]
         left = np.where(drawn[n], after, left)
-    return drawn, raw > 0.99, ~doubtful, ended
+    return drawn, raw > alpha_max, ~doubtful, ended
 
 
-def draw(params, camera, background, antialiased=False):
-    """Render an image from float64 tensors."""
+@threadpool_limits.wrap(limits=1)  # more threads take ten times as long for images so small
+def draw(params, camera, background, antialiased=False, alpha_max=0.99):
+    """Render an image from float64 tensors; ``alpha_max`` differs between releases of gsplat."""
     W, t = torch.from_numpy(camera.viewmat[:3, :3]), torch.from_numpy(camera.viewmat[:3, 3])
     depth = (params["means"].detach() @ W.T + t)[:, 2].numpy()
     order = np.argsort(depth.astype(np.float32), kind="stable")
@@ -124,8 +154,8 @@ def draw(params, camera, background, antialiased=False):
     exponent, ratio = exponents(params, camera, W, t)
     opacities = torch.sigmoid(params["opacities"]) * (ratio.sqrt() if antialiased else 1)
     raw = opacities[:, None] * torch.exp(-exponent)
-    drawn, clamped, sure, ended = decisions(raw)
-    alphas = torch.where(torch.from_numpy(drawn), torch.where(torch.from_numpy(clamped), 0.99, raw), 0.0)
+    drawn, clamped, sure, ended = decisions(raw, alpha_max)
+    alphas = torch.where(torch.from_numpy(drawn), torch.where(torch.from_numpy(clamped), alpha_max, raw), 0.0)
     sight = params["means"] + W.T @ t
     values = torch.stack(harmonics(*(sight / sight.norm(dim=1, keepdim=True)).T), dim=1)[:, : params["shN"].shape[1]]
     colours = (0.5 + C0 * params["sh0"] + (values[:, :, None] * params["shN"]).sum(1)).clamp_min(0)

@@ -35,10 +35,6 @@ def together(*scenes):
     return Splats(**{name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in ATTRIBUTES})
 
 
-def in_float64(splats):
-    return {name: getattr(splats, name).astype(np.float64) for name in ATTRIBUTES}
-
-
 def camera(width=37, height=29, distance=3.0, fov=0.8, seed=None):
     """Return a camera at a distance from the origin that looks at it; from a random side if there is a seed."""
     direction = np.array([0.1, -0.13, -1.0])

@@ -57,9 +57,9 @@ def surface(points: np.ndarray, normals: np.ndarray, size: float, seed: int) -> 
     )
 
 
-def two(distance: float, scale: float = 1.0) -> Splats:
-    """Return two objects of 6,000 Gaussians."""
-    return joined(sample_scene(6000), moved(sample_scene(6000, seed=1), by=(distance, 0, 0), scale=scale))
+def two(distance: float, scale: float = 1.0, count: int = 6000) -> Splats:
+    """Return two objects of ``count`` Gaussians."""
+    return joined(sample_scene(count), moved(sample_scene(count, seed=1), by=(distance, 0, 0), scale=scale))
 
 
 def five() -> Splats:

@@ -7,7 +7,7 @@ from helpers.rasterized import render_tensors
 from helpers.render_scenes import blobs, camera, one, together
 
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.rendering.cpu.backward import Gradients
+from kissgs.rendering.cpu.frame import Gradients
 
 
 def received(splats, views):

@@ -90,17 +90,6 @@ def test_the_gradient_flows_to_parameters_of_the_image():
     assert gain.grad.item() == pytest.approx(gain64.grad.item(), rel=1e-5)
 
 
-def test_the_result_does_not_depend_on_threads():
-    image, target = pair(2, 150, 170, 3)
-    losses = [photometric_loss(image, target, threads=threads).item() for threads in (0, 1, 2, 5)]
-    assert len(set(losses)) == 1
-    gradients = [
-        gradient_of(lambda leaf: photometric_loss(leaf, target, threads=threads), image)  # noqa: B023
-        for threads in (1, 2, 5)
-    ]
-    assert all((gradient == gradients[0]).all() for gradient in gradients)
-
-
 def test_without_a_gradient_the_value_is_the_same():
     image, target = pair(40, 50, 3)
     leaf = image.clone().requires_grad_()

@@ -29,17 +29,14 @@ from kissgs.cameras.captures.transforms_json import read_split_transforms, read_
 from kissgs.cameras.photographs import (
     QUARTER_TURNS,
     Distortion,
-    PhotoHeader,
     full_window,
     orientation,
     read_photo_header,
 )
-from kissgs.cameras.views import UndistortionSpec, View, Views
+from kissgs.cameras.views import View, Views, rotation_matrices
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.rendering.camera import Camera
-
-# Parsers of COLMAP's ``cameras`` and ``images`` files, binary and text, into records.
 
 MAX_NAME_BYTES = 4096
 """Maximum bytes of an image's name; no file system has longer paths."""
@@ -295,11 +292,7 @@ def missing_part(path: Path) -> str | None:
 
 
 def read_colmap(folder: Path) -> Capture:
-    """Read the model in ``folder``: ``cameras`` and ``images``, as ``.bin`` or else as ``.txt``.
-
-    Photographs are expected in ``images`` next to the model, or next to the topmost of folders such as ``sparse/0``,
-    unless the model names them by absolute paths.
-    """
+    """Read the model in ``folder``; its photographs are in ``images`` beside it unless it has absolute paths."""
     binary = _is_model(folder, "bin")
     images_path = folder / ("images.bin" if binary else "images.txt")
     cameras_path = folder / ("cameras.bin" if binary else "cameras.txt")
@@ -334,13 +327,11 @@ def _is_model(folder: Path, suffix: str) -> bool:
 def _root(folder: Path) -> Path:
     """Return the capture's folder: the first from ``folder`` upwards with photographs or without a model's name."""
     root = folder.resolve()
-    while not _has_photos(root) and _MODEL_FOLDER_NAMES.fullmatch(root.name):
+    while _MODEL_FOLDER_NAMES.fullmatch(root.name):
+        if any(found.is_dir() for found in [*root.glob("images*"), root / INPUT]):
+            break
         root = root.parent
     return root
-
-
-def _has_photos(folder: Path) -> bool:
-    return any(found.is_dir() for found in [*folder.glob("images*"), folder / INPUT])
 
 
 def _intrinsics(camera: CameraRecord, where: str) -> Intrinsics:
@@ -377,18 +368,13 @@ def _viewmat(record: ImageRecord, where: str) -> Float64[np.ndarray, "4 4"]:
             f"{where}: its pose has a zero quaternion or non-finite numbers; reconstruct the capture again"
         )
     quat = quat / largest  # else squares could underflow to 0 or overflow
-    w, x, y, z = quat / np.linalg.norm(quat)
     viewmat = np.eye(4)
-    viewmat[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    viewmat[:3, :3] = rotation_matrices(quat / np.linalg.norm(quat))
     viewmat[:3, 3] = record.translation
     return viewmat
 
 
-# ``load_views``: the views of a COLMAP or ``transforms.json`` capture, with cameras at the size of the photographs.
+# The views of a capture of either kind, with cameras at the size of the photographs.
 
 DEFAULT_RESOLUTION = 1600
 """Default maximum of the longer side, pixels. For landscape photographs this is the protocol of 3DGS, on which
@@ -451,16 +437,15 @@ def load_views(
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
     names = [posed.photo for posed in capture.images]
     photos = find_photos(names, capture.root, scale=scale, images=images)
-    opened: list[_Photo | None] = [None] * len(capture.images)
-    if photos is not None:
-        opened = [_Photo(photo, read_photo_header(photo.path)) for photo in photos]
-    white = capture.white and (opened[0] is None or opened[0].header.transparent)
+    white = capture.white and (photos is None or read_photo_header(photos[0].path).transparent)
     background = np.full(3, float(white), dtype=np.float32)
     limit = DEFAULT_RESOLUTION if resolution is None else resolution
     views = []
-    for posed, photo in zip(capture.images, opened, strict=True):
+    for n, posed in enumerate(capture.images):
+        photo = None if photos is None else photos[n]
         nominal, size = _sizes(posed, photo, scale or 1)
-        views.append((_view(posed, photo, nominal, _reduced(size, limit), background), posed.split))
+        file = None if photo is None else photo.path
+        views.append((_view(posed, file, nominal, _reduced(size, limit), background), posed.split))
     train, test = _split(views, hold_out)
     if photos is not None:
         source = f"{capture.source}, photographs of {_folders(photos)}"
@@ -468,14 +453,6 @@ def load_views(
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
     return Views(train, test, background, f"{capture.source}, no photographs", note, moves)
-
-
-@dataclass(frozen=True, slots=True)
-class _Photo:
-    """A photograph's file and header."""
-
-    found: FoundPhoto
-    header: PhotoHeader
 
 
 def _check_arguments(scale: int | None, resolution: int | None, hold_out: int) -> None:
@@ -513,25 +490,24 @@ def _read_capture(path: Path) -> Capture:
 
 def _view(
     posed: PosedImage,
-    photo: _Photo | None,
+    path: Path | None,
     nominal: tuple[int, int],
     size: tuple[int, int],
     background: Float32[np.ndarray, "3"],
 ) -> View:
-    path = None if photo is None else photo.found.path
     try:
         lens = posed.intrinsics.lens(nominal, size)
         pinhole = Camera(posed.viewmat, lens.K, *size)
         if path is None or not lens.distortion:
             return View(posed.name, pinhole, path, background)
         window = full_window(lens)
-        camera = Camera(posed.viewmat, window.K(lens), window.width, window.height)
-        return View(posed.name, camera, path, background, UndistortionSpec(lens, window))
+        camera = Camera(posed.viewmat, window.K, window.width, window.height)
+        return View(posed.name, camera, path, background, window)
     except InvalidViewsError as error:
         raise InvalidViewsError(f"{posed.where}: {error}") from error
 
 
-def _sizes(posed: PosedImage, photo: _Photo | None, scale: int) -> tuple[tuple[int, int], tuple[int, int]]:
+def _sizes(posed: PosedImage, photo: FoundPhoto | None, scale: int) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return (width, height) to which the intrinsics belong, and (width, height) of the photograph before reduction."""
     width, height = posed.intrinsics.width, posed.intrinsics.height
     if photo is None:
@@ -540,17 +516,18 @@ def _sizes(posed: PosedImage, photo: _Photo | None, scale: int) -> tuple[tuple[i
                 f"{posed.where}: it has neither a size (w, h) nor a photograph; add w and h or the photographs"
             )
         return (width, height), (max(1, round(width / scale)), max(1, round(height / scale)))
-    size = (photo.header.width, photo.header.height)
-    nominal = (width or size[0] * photo.found.factor, height or size[1] * photo.found.factor)
+    header = read_photo_header(photo.path)
+    size = header.width, header.height
+    nominal = width or size[0] * photo.factor, height or size[1] * photo.factor
     if not _fits(size, nominal):
-        if _fits(size[::-1], nominal) and orientation(photo.found.path) in QUARTER_TURNS:
+        if _fits(size[::-1], nominal) and orientation(photo.path) in QUARTER_TURNS:
             raise InvalidViewsError(
-                f"{photo.found.path} has {size[0]}x{size[1]} pixels, which its EXIF orientation turns upright, and its "
+                f"{photo.path} has {size[0]}x{size[1]} pixels, which its EXIF orientation turns upright, and its "
                 f"camera ({posed.where}) is for {nominal[0]}x{nominal[1]}; orientation is ignored here, so turn the "
                 "pixels of all photographs ('mogrify -auto-orient'), or compute the cameras from them as they are"
             )
         raise InvalidViewsError(
-            f"{photo.found.path} has {size[0]}x{size[1]} pixels, but its camera ({posed.where}) is for "
+            f"{photo.path} has {size[0]}x{size[1]} pixels, but its camera ({posed.where}) is for "
             f"{nominal[0]}x{nominal[1]}, another aspect ratio; name the folder of the cameras' "
             "photographs (--images of kissgs evaluate and render)"
         )

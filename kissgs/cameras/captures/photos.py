@@ -9,7 +9,7 @@ import math
 import os
 import re
 import unicodedata
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -20,8 +20,6 @@ from pydantic import ValidationError
 from kissgs.cameras.photographs import EXTENSIONS, NO_DISTORTION, Distortion, Lens
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
-
-# ``Capture``: the content of a camera file, before its photographs are searched for.
 
 MAX_JSON_BYTES = 1 << 28
 """Maximum bytes of a JSON file; ten thousand cameras take about 10 MB."""
@@ -76,10 +74,9 @@ MAX_SIDE = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """Intrinsics from a camera file; lengths in pixels of a photograph of ``width`` x ``height``.
+    """Intrinsics from a camera file; lengths in pixels of a photograph of ``width`` x ``height``, angles in radians.
 
-    Defaults of values that are None: the size of the photograph; for a focal length the angle of view (radians) or the
-    other focal length; for the principal point the centre of the image.
+    Defaults: the size of the photograph; the angle of view or the other focal length; the centre of the image.
     """
 
     width: int | None = None
@@ -187,22 +184,21 @@ class _SearchFolder:
 def find_photos(
     names: Sequence[str], root: Path, *, scale: int | None = None, images: Path | None = None
 ) -> tuple[FoundPhoto, ...] | None:
-    """Find the file of each photograph.
+    """Find the file of each photograph, in order; None if there is no folder of photographs.
 
     The default is the full-size folder, else that of scale 4, at which the protocol of 3DGS trains outdoor scenes, else
     the largest; ``input`` if there is no ``images`` of any scale. If no file has the exact name, one with another
     Unicode form, extension or case is accepted; a folder may have another Unicode form, too. An absolute path that does
-    not exist is searched for in the capture's folder: first in a folder with the name of the path's own folder, then in
-    ``images``.
-
-    Returns:
-        One file per name, in order; None if there is no folder of photographs.
+    not exist is searched for in the capture's folder.
     """
     if images is not None and scale is not None:
         raise InvalidViewsError("--images and --scale exclude each other; give only one of them")
     listing = _FolderListing()
     if images is None:
-        searched = [_search_folders(name, root, scale, listing) for name in names]
+        searched = [
+            [_search_folder(folder, tried, root, scale, listing) for folder, tried in _candidates(name, root)]
+            for name in names
+        ]
     else:
         folder = _named_folder(images, root, listing)
         searched = [[_within(folder, name)] for name in names]
@@ -237,10 +233,6 @@ def searched_folders(names: Sequence[str], root: Path) -> str:
 def is_absolute(name: str) -> bool:
     """Whether a photograph's name is an absolute path, of POSIX or of Windows."""
     return re.match(r"[A-Za-z]:[/\\]|[/\\]", name) is not None
-
-
-def _default_factor(factors: Collection[int]) -> int:
-    return next((factor for factor in (1, 4) if factor in factors), min(factors))
 
 
 class _FolderListing:
@@ -329,11 +321,6 @@ def _stem(name: str) -> str:
     return path.stem if path.suffix.lower() in EXTENSIONS else path.name
 
 
-def _search_folders(name: str, root: Path, scale: int | None, listing: _FolderListing) -> list[_SearchFolder]:
-    """Return the folders in which to search for ``name``, in order; at least one."""
-    return [_search_folder(folder, names, root, scale, listing) for folder, names in _candidates(name, root)]
-
-
 def _search_folder(
     folder: Path, names: tuple[str, ...], root: Path, scale: int | None, listing: _FolderListing
 ) -> _SearchFolder:
@@ -343,7 +330,7 @@ def _search_folder(
     variants = listing.variants(folder)
     if not variants:
         return _SearchFolder(folder, 1, names, has_photos=False)
-    factor = _default_factor(variants) if scale is None else scale
+    factor = next((usual for usual in (1, 4) if usual in variants), min(variants)) if scale is None else scale
     if factor not in variants:
         wanted = folder.name if factor == 1 else f"{folder.name}_{factor}"
         existing = ", ".join(variants[known].name for known in sorted(variants))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import codecs
-import dataclasses
 import json
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -30,9 +30,7 @@ from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.io.files import atomic_file
 from kissgs.rendering.camera import Camera
 
-# Cameras as JSON: the format of kissgs, one camera per file, and the ``cameras.json`` of 3DGS and its derivatives.
-#
-# The format of kissgs is::
+# The format of kissgs, one camera per file, is::
 #
 #     {"viewmat": [[…4…], …4…], "K": [[…3…], …3…], "width": 1280, "height": 960}
 #
@@ -45,7 +43,7 @@ from kissgs.rendering.camera import Camera
 # ``img_name`` and ``id``; the principal point is the centre of the image. A file holds one entry or a list of entries.
 
 _WholeSide = Annotated[StrictInt, Field(ge=1, le=MAX_SIDE)]
-_Focal = Annotated[FiniteFloat, Field(gt=0)]
+_Length = Annotated[FiniteFloat, Field(gt=0)]
 _Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 _Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 
@@ -67,8 +65,8 @@ class _TrainerCamera(BaseModel):
     height: _WholeSide
     position: _Row3
     rotation: Annotated[list[_Row3], Field(min_length=3, max_length=3)]
-    fx: _Focal
-    fy: _Focal
+    fx: _Length
+    fy: _Length
 
 
 def read_cameras(path: Path) -> tuple[View, ...]:
@@ -109,7 +107,8 @@ def _parse(path: Path) -> object:
 
 def _view(entry: object, where: str, name: str) -> View:
     if not isinstance(entry, dict) or not {"viewmat", "rotation"} & entry.keys():
-        hint = "; a transforms.json is a capture: pass it to --views" if _is_transforms(entry) else ""
+        is_capture = isinstance(entry, dict) and "frames" in entry
+        hint = "; a transforms.json is a capture: pass it to --views" if is_capture else ""
         raise InvalidViewsError(
             f"{where} is not a camera: it has neither viewmat, K, width and height nor position, rotation, fx, fy, "
             f"width and height{hint}"
@@ -125,10 +124,6 @@ def _view(entry: object, where: str, name: str) -> View:
         raise InvalidViewsError(f"{where}: {error}") from error
 
 
-def _is_transforms(entry: object) -> bool:
-    return isinstance(entry, dict) and "frames" in entry
-
-
 def _from_kissgs(found: _KissgsCamera) -> Camera:
     viewmat, K = np.array(found.viewmat), np.array(found.K)
     if not np.allclose(viewmat[3], (0, 0, 0, 1)):
@@ -139,16 +134,17 @@ def _from_kissgs(found: _KissgsCamera) -> Camera:
 
 
 def _from_trainer(found: _TrainerCamera) -> Camera:
-    to_world = np.array(found.rotation)
+    K = np.array([[found.fx, 0, 0.5 * found.width], [0, found.fy, 0.5 * found.height], [0, 0, 1]])
+    return Camera(_to_camera(np.array(found.rotation), np.array(found.position)), K, found.width, found.height)
+
+
+def _to_camera(rotation: Float64[np.ndarray, "3 3"], position: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
+    """Return the transform from world to camera, given that from camera to world."""
     viewmat = np.eye(4)
-    viewmat[:3, :3] = to_world.T
+    viewmat[:3, :3] = rotation.T
     with np.errstate(all="ignore"):  # Camera rejects values that overflow
-        viewmat[:3, 3] = -to_world.T @ np.array(found.position)
-    return Camera(viewmat, _trainer_intrinsics(found), found.width, found.height)
-
-
-def _trainer_intrinsics(found: _TrainerCamera) -> Float64[np.ndarray, "3 3"]:
-    return np.array([[found.fx, 0, 0.5 * found.width], [0, found.fy, 0.5 * found.height], [0, 0, 1]])
+        viewmat[:3, 3] = -rotation.T @ position
+    return viewmat
 
 
 # Selection of a view by number, by name, or from a camera file.
@@ -172,10 +168,7 @@ def view_of_file(which: str) -> View:
 
 
 def pick_view(views: Sequence[View], which: str, source: str) -> View:
-    """Return the view with this name, else the one with this index, else the one with this file name or stem.
-
-    For example, ``a.png`` and ``a`` select ``images/a.png`` if no other view matches.
-    """
+    """Return the view with this name, else the one with this index, else the one with this file name or stem."""
     found = [view for view in views if view.name == which]
     if not found and which.isascii() and which.isdigit() and len(which) < 10:
         if int(which) >= len(views):
@@ -203,13 +196,10 @@ def _split(which: str) -> tuple[str, str] | None:
     return None if at < 0 else (which[: at + 5], which[at + 6 :])
 
 
-# Parser of the ``transforms.json`` of NeRF's synthetic scenes, of instant-ngp and of nerfstudio.
-#
-# Poses in these files go from camera to world, with OpenGL's axes (z backward, y up); they are converted to world to
-# camera, with z forward and y down. World coordinates are those of the file: instant-ngp's ``scale`` and ``offset`` are
-# not applied. Scenes may have others: those of the COLMAP model from which nerfstudio converted the poses by
-# ``applied_transform``, or those in which nerfstudio trained, by ``dataparser_transforms.json``. :func:`similarities`
-# returns these.
+# Poses in a ``transforms.json`` go from camera to world, with OpenGL's axes (z backward, y up); they are converted to
+# world to camera, with z forward and y down. World coordinates are those of the file: instant-ngp's ``scale`` and
+# ``offset`` are not applied. Scenes may have others, which :func:`similarities` returns: those of the COLMAP model from
+# which nerfstudio converted the poses by ``applied_transform``, or those in which nerfstudio trained.
 
 MAX_SKEW = 0.01
 """Maximum relative difference between the singular values of a rotation matrix, to accept rounded numbers."""
@@ -221,10 +211,8 @@ PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "F
 """Supported values of ``camera_model``; all given distortion coefficients apply, whatever the value."""
 
 _Side = Annotated[FiniteFloat, Field(ge=1, le=MAX_SIDE)]
-_Length = Annotated[FiniteFloat, Field(gt=0)]
 _Angle = Annotated[FiniteFloat, Field(gt=0, lt=math.pi)]
-_Row = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
-_Matrix = Annotated[list[_Row], Field(min_length=3, max_length=4)]
+_Matrix = Annotated[list[_Row4], Field(min_length=3, max_length=4)]
 _Document = TypeVar("_Document", bound=BaseModel)
 
 
@@ -280,7 +268,7 @@ def read_transforms(path: Path) -> Capture:
     images = _posed_images(path, document)
     splits = _splits(path, document)
     if splits is not None:
-        images = [_with_split(image, splits[key]) for image in images if (key := composed(image.name)) in splits]
+        images = [replace(image, split=splits[key]) for image in images if (key := composed(image.name)) in splits]
     return Capture(tuple(images), path.parent, f"cameras of {path}", _is_synthetic(document), _applied(path, document))
 
 
@@ -294,15 +282,14 @@ def read_split_transforms(folder: Path) -> Capture:
     if test_path is None:
         return Capture(tuple(train), folder, f"cameras of {train_path}", white)
     test = _posed_images(test_path, _read(test_path, _Transforms))
-    images = [*(_with_split(image, "train") for image in train), *(_with_split(image, "test") for image in test)]
+    images = [*(replace(image, split="train") for image in train), *(replace(image, split="test") for image in test)]
     return Capture(tuple(images), folder, f"cameras of {train_path} and {test_path.name}", white)
 
 
 def similarities(folders: Iterable[Path], applied: Float64[np.ndarray, "4 4"] | None) -> tuple[Similarity, ...]:
     """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have.
 
-    nerfstudio writes its ``dataparser_transforms.json`` beside its checkpoints; the first of ``folders`` that has one
-    counts.
+    The first of ``folders`` that has a ``dataparser_transforms.json`` counts.
     """
     found = []
     path = next((path for folder in folders if (path := folder / DATAPARSER_TRANSFORMS).is_file()), None)
@@ -356,11 +343,9 @@ def _is_synthetic(document: _Transforms) -> bool:
 def _posed_images(path: Path, document: _Transforms) -> list[PosedImage]:
     images = []
     for index, frame in enumerate(document.frames):
-        where = f"{path}, frame {index} ({quoted(frame.file_path)})"
-        name = _normalized(frame.file_path)
-        images.append(
-            PosedImage(name, frame.file_path, where, _viewmat(frame, where), _intrinsics(document, frame, where))
-        )
+        where, name = f"{path}, frame {index} ({quoted(frame.file_path)})", _normalized(frame.file_path)
+        viewmat, intrinsics = _viewmat(frame, where), _intrinsics(document, frame, where)
+        images.append(PosedImage(name, frame.file_path, where, viewmat, intrinsics))
     return images
 
 
@@ -400,11 +385,7 @@ def _viewmat(frame: _Frame, where: str) -> Float64[np.ndarray, "4 4"]:
     if len(matrix) == 4 and not np.allclose(matrix[3], (0, 0, 0, 1)):
         raise InvalidViewsError(f"{where}: the last row of transform_matrix is not 0 0 0 1; export it again")
     rotation = _rotation(matrix[:3, :3], f"{where}: transform_matrix") * (1, -1, -1)  # flip the camera's y and z axes
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation.T
-    with np.errstate(all="ignore"):  # Camera rejects values that overflow
-        viewmat[:3, 3] = -rotation.T @ matrix[:3, 3]
-    return viewmat
+    return _to_camera(rotation, matrix[:3, 3])
 
 
 def _rotation(matrix: Float64[np.ndarray, "3 3"], where: str) -> Float64[np.ndarray, "3 3"]:
@@ -443,10 +424,6 @@ def _splits(path: Path, document: _Transforms) -> dict[str, Literal["train", "te
 
 def _name_set(names: Iterable[str] | None) -> set[str]:
     return {composed(_normalized(name)) for name in names or ()}
-
-
-def _with_split(image: PosedImage, split: Literal["train", "test"]) -> PosedImage:
-    return dataclasses.replace(image, split=split)
 
 
 def _normalized(name: str) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kissgs.cameras.views import UP, Vec3, black
+from kissgs.cameras.views import UP, Vec3, black, rotation_matrices
 from kissgs.core.array_types import Float64, Int
 from kissgs.core.progress import Progress
 from kissgs.core.resources import Workers
@@ -15,8 +15,6 @@ from kissgs.core.splats import SH_C0, Splats
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.constants import NEAR
 from kissgs.rendering.cpu.frame import draw
-
-# ``scene_bounds``: centre, radius and up direction of a scene, estimated from its Gaussians alone.
 
 UP_AXES = (UP, np.array([0.0, 0.0, 1.0]))
 """Up directions of scene files: COLMAP's y points roughly down, nerfstudio's z up. The first is the default."""
@@ -34,28 +32,26 @@ class SceneBounds:
 
 
 def scene_bounds(splats: Splats, start: tuple[Vec3, float] | None = None) -> SceneBounds:
-    """Estimate centre, radius and up direction of a scene.
+    """Estimate centre, radius and up direction of a scene; without any opacity, the unit sphere around the origin.
 
-    Gaussians count by their opacity, so that floaters and sky have little influence. A capture has most Gaussians where
-    its photographs point. The centre is a mode of that density, found by mean shift from the weighted median of the
-    positions, or from the centre and radius ``start``; the bandwidth is the current radius. Without any opacity, the
-    result is the unit sphere around the origin.
+    A capture has most Gaussians where its photographs point. The centre is a mode of that density, by opacity, found by
+    mean shift from the weighted median of the positions, or from the centre and radius ``start``.
     """
     means = splats.means.astype(np.float64)
     weights = opacity(splats)
     if not weights.sum() > 0:
         return SceneBounds(np.zeros(3), 1.0, UP_AXES[0])
-    centre = np.array([weighted_quantile(axis, weights) for axis in means.T]) if start is None else start[0]
+    centre = np.array([weighted_median(axis, weights) for axis in means.T]) if start is None else start[0]
     distance = np.linalg.norm(means - centre, axis=1)
     gaussian_size = float(np.exp(np.median(splats.scales.max(axis=1)).astype(np.float64)))
     min_radius = max(2 * gaussian_size, 1e-5 * float(np.abs(centre).max()), 1e-9)  # float32 positions are no finer
-    radius = max(weighted_quantile(distance, weights) if start is None else start[1], min_radius)
+    radius = max(weighted_median(distance, weights) if start is None else start[1], min_radius)
     for _ in range(30):
         kernel = weights * np.exp(-0.5 * (distance / radius) ** 2)
         new_centre = kernel @ means / kernel.sum()
         distance = np.linalg.norm(means - new_centre, axis=1)
         near = distance < 2.5 * radius
-        new_radius = max(weighted_quantile(distance[near], weights[near]), min_radius) if near.any() else radius
+        new_radius = max(weighted_median(distance[near], weights[near]), min_radius) if near.any() else radius
         moved = np.linalg.norm(new_centre - centre)
         converged = moved < 0.01 * radius and abs(new_radius - radius) < 0.01 * radius
         centre, radius = new_centre, new_radius
@@ -65,26 +61,24 @@ def scene_bounds(splats: Splats, start: tuple[Vec3, float] | None = None) -> Sce
 
 
 def opacity(splats: Splats) -> Float64[np.ndarray, " N"]:
-    """Return opacities after the sigmoid, ``(N,)`` float64, 0 to 1."""
+    """Return opacities after the sigmoid, 0 to 1."""
     return 1 / (1 + np.exp(-splats.opacities.astype(np.float64)))
 
 
-def weighted_quantile(
-    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantile: float = 0.5
-) -> float:
-    """Return the value at which this fraction of the weight is reached, by default the median; 0 without values."""
-    return weighted_quantiles(values, weights, (quantile,))[0]
+def weighted_median(values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]) -> float:
+    """Return the value at which half of the weight is reached; 0 without values."""
+    return weighted_quantiles(values, weights, 0.5)[0]
 
 
 def weighted_quantiles(
-    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantiles: Sequence[float]
+    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], *quantiles: float
 ) -> list[float]:
-    """Return the values at which several fractions of the weight are reached, see :func:`weighted_quantile`."""
+    """Return the values at which these fractions of the weight are reached; 0 without values."""
     if not len(values):
         return [0.0] * len(quantiles)
     order = np.argsort(values, kind="stable")
     cumulative = np.cumsum(weights[order])
-    places = np.searchsorted(cumulative, np.asarray(quantiles) * cumulative[-1])
+    places = np.searchsorted(cumulative, np.array(quantiles) * cumulative[-1])
     return [float(value) for value in values[order[np.minimum(places, len(values) - 1)]]]
 
 
@@ -92,8 +86,7 @@ def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.
     """Return the up direction: the normal of the ground, or the axis that files use if there is no ground.
 
     The short axes of flat Gaussians are surface normals; most of them near one file axis select that axis. The sign
-    follows from the skew of heights: objects stand on the ground, so that density falls off upwards. ``offsets`` are
-    positions relative to the centre.
+    follows from the skew of heights: objects stand on the ground, so that density falls off upwards.
     """
     axis = UP_AXES[0]
     if not weights.any():
@@ -102,7 +95,8 @@ def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.
     area = np.exp(log_scales[:, 1] + log_scales[:, 2])
     flatness = np.clip(log_scales[:, 1] - log_scales[:, 0], 0, 1)
     flat_weights = flatness * np.minimum(area, np.quantile(area, 0.95)) * weights
-    normals = _short_axes(splats)
+    rotations = rotation_matrices(splats.quats.astype(np.float64))
+    normals = rotations[np.arange(len(splats)), :, splats.scales.argmin(axis=1)]
     level = [float(flat_weights @ (np.abs(normals @ each) > np.cos(np.radians(15)))) for each in UP_AXES]
     if level[1] > 2 * level[0] + 0.1 * flat_weights.sum():
         axis = UP_AXES[1]
@@ -115,10 +109,7 @@ def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.
 
 
 def _ground_normal(axis: Vec3, normals: Float64[np.ndarray, "N 3"], weights: Float64[np.ndarray, " N"]) -> Vec3:
-    """Return the mean normal near ``axis``, or ``axis`` if less than 35 % of the weight has a normal within 30° of it.
-
-    The cone narrows in three steps, so that walls and slopes do not tilt the result.
-    """
+    """Return the mean normal near ``axis``, in a cone that narrows; ``axis`` if less than 35 % have one within 30°."""
     for degrees, min_share in ((30, 0.35), (15, 0.0), (8, 0.0)):
         cosines = normals @ axis
         near = (np.abs(cosines) > np.cos(np.radians(degrees))) * weights
@@ -127,20 +118,6 @@ def _ground_normal(axis: Vec3, normals: Float64[np.ndarray, "N 3"], weights: Flo
         mean = (near * np.sign(cosines)) @ normals
         axis = mean / np.linalg.norm(mean)
     return axis
-
-
-def _short_axes(splats: Splats) -> Float64[np.ndarray, "N 3"]:
-    """Return the direction of each Gaussian's smallest scale, ``(N, 3)`` float64 unit vectors."""
-    w, x, y, z = splats.quats.astype(np.float64).T
-    columns = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    shortest = splats.scales.argmin(axis=1)
-    return np.asarray(columns[shortest, :, np.arange(len(splats))])
 
 
 # View scores: how useful a camera is, from a thumbnail of what it sees.
@@ -210,8 +187,8 @@ class ViewScorer:
         near = (np.exp(depth) < TOO_NEAR * self.bounds.radius) * alpha
         return ViewStats(
             alpha=float(alpha.mean()),
-            log_size=weighted_quantile(size.ravel(), alpha.ravel()),
-            log_angle=weighted_quantile((size - depth).ravel(), alpha.ravel()),
+            log_size=weighted_median(size.ravel(), alpha.ravel()),
+            log_angle=weighted_median((size - depth).ravel(), alpha.ravel()),
             near=float(near.mean()),
             centre=float((centre / CENTRE_SCALE * alpha).mean()),
         )
@@ -228,9 +205,7 @@ def _from_colour(colour: np.ndarray) -> np.ndarray:
 
 
 def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.ndarray, " m"] | None = None) -> Splats:
-    """Return at most ``max_count`` evenly selected Gaussians ``among`` some, or all, without SH rest, enlarged to
-    cover the same area.
-    """
+    """Return evenly selected Gaussians ``among`` some, or all, without SH rest, enlarged to cover the same area."""
     count = len(splats) if among is None else len(among)
     step = max(1, -(-count // max_count))
     chosen = slice(None, None, step) if among is None else among[::step]
@@ -246,11 +221,11 @@ def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.
 
 
 def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[np.ndarray, " n"]:
-    """Return the view score of each camera, ``(n,)`` float64, at most 1.
+    """Return the view score of each camera, at most 1.
 
     1 is a sharp image of the scene's centre, without holes and with nothing right in front of the camera. Size and
-    angle of Gaussians are compared with the best tenth of the views that show enough. If the scene need not fill the
-    image, since an object stands alone, only an image that is much emptier than the others is a fault.
+    angle of Gaussians are compared with the best tenth of the views that show enough. The image of an object that
+    stands alone need only not be much emptier than the others.
     """
     names = ("alpha", "log_size", "log_angle", "near", "centre")
     alpha, log_size, log_angle, near, centre = (np.array([getattr(view, name) for view in stats]) for name in names)
@@ -262,8 +237,6 @@ def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[
     off_centre = np.maximum(1 - centre / 0.25, 0) if fills_image else np.zeros(len(stats))
     return np.asarray(1 - holes - 0.4 * excess_size - 0.35 * excess_angle - near - 0.5 * off_centre)
 
-
-# Candidate cameras: on orbits around a scene, inside it, or framing an object that stands alone.
 
 FIELD_OF_VIEW = np.radians(60)
 """Angle of view along the longer side, radians; roughly that of a phone."""
@@ -288,23 +261,28 @@ CLOSE_UP_INTERVAL = 4
 
 
 def horizontal_axes(up: Vec3) -> tuple[Vec3, Vec3]:
-    """Return two horizontal unit vectors, orthogonal to each other and to the unit vector ``up``; ``(3,)`` each."""
+    """Return two unit vectors, orthogonal to each other and to the unit vector ``up``."""
     first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     first /= np.linalg.norm(first)
     return first, np.cross(up, first)
 
 
+def direction_at(up: Vec3, elevation: float, azimuth: float) -> Vec3:
+    """Return the unit vector at an elevation above the horizontal plane and an azimuth, radians."""
+    east, north = horizontal_axes(up)
+    horizontal = np.cos(azimuth) * east + np.sin(azimuth) * north
+    return np.asarray(np.cos(elevation) * horizontal + np.sin(elevation) * up)
+
+
 def directions(up: Vec3, elevations: tuple[float, ...], azimuths: int) -> Iterator[Vec3]:
     """Yield unit vectors at evenly spaced azimuths, for each elevation above the horizontal plane, degrees."""
-    east, north = horizontal_axes(up)
     for elevation in np.radians(elevations):
         for azimuth in np.arange(azimuths) * (2 * np.pi / azimuths):
-            horizontal = np.cos(azimuth) * east + np.sin(azimuth) * north
-            yield np.cos(elevation) * horizontal + np.sin(elevation) * up
+            yield direction_at(up, elevation, azimuth)
 
 
 def orbit_cameras(bounds: SceneBounds, size: tuple[int, int]) -> Iterator[Camera]:
-    """Yield cameras that look at the centre from all sides, nearest first; ``size`` is (width, height), pixels."""
+    """Yield cameras that look at the centre from all sides, nearest first."""
     width, height = size
     for radius in ORBIT_RADII:
         for direction in directions(bounds.up, ORBIT_ELEVATIONS, AZIMUTHS):
@@ -313,10 +291,7 @@ def orbit_cameras(bounds: SceneBounds, size: tuple[int, int]) -> Iterator[Camera
 
 
 def inside_cameras(bounds: SceneBounds, size: tuple[int, int]) -> Iterator[Camera]:
-    """Yield cameras near the centre, in all horizontal directions; ``size`` is (width, height), pixels.
-
-    Cameras at the same position follow each other, :data:`INSIDE_DIRECTIONS` of them.
-    """
+    """Yield cameras near the centre, at each position :data:`INSIDE_DIRECTIONS` in succession."""
     width, height = size
     east, north = horizontal_axes(bounds.up)
     for rise in (0.0, 0.4):
@@ -327,10 +302,7 @@ def inside_cameras(bounds: SceneBounds, size: tuple[int, int]) -> Iterator[Camer
 
 
 def object_cameras(splats: Splats, bounds: SceneBounds, size: tuple[int, int]) -> Iterator[Camera]:
-    """Yield cameras around an object that stands alone.
-
-    Most frame the whole object; one in :data:`CLOSE_UP_INTERVAL` is at half the distance.
-    """
+    """Yield cameras that frame an object; one in :data:`CLOSE_UP_INTERVAL` is at half the distance."""
     weights = opacity(splats)
     means = splats.means.astype(np.float64)
     width, height = size
@@ -358,7 +330,7 @@ def _framing_camera(
     target, half_extents = bounds.centre.copy(), []
     for axis in (right, down, direction):
         along = (means - bounds.centre) @ axis
-        low, high = weighted_quantiles(along, weights, (0.01, 0.99))
+        low, high = weighted_quantiles(along, weights, 0.01, 0.99)
         target += 0.5 * (low + high) * axis
         half_extents.append(max(0.5 * (high - low), 0.5 * bounds.radius))
     slopes = np.array([width, height]) / (2 * towards.K[0, 0])  # tangents of half the angles of view

@@ -7,35 +7,35 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kissgs.cameras.views import Vec3, Views, black, camera_facing, log_uniform, random_direction
+from kissgs.cameras.views import Vec3, Views, black, camera_facing, check_images, log_uniform, random_direction
 from kissgs.cameras.virtual.candidates import (
     FIELD_OF_VIEW,
     PROXY_GAUSSIANS,
     SceneBounds,
     ViewScorer,
-    horizontal_axes,
+    direction_at,
     opacity,
     proxy_scene,
     scene_bounds,
 )
 from kissgs.cameras.virtual.select import (
     ScoredCandidates,
-    check_request,
     score_candidates,
     select_diverse,
     split_views,
     with_size,
 )
-from kissgs.core.array_types import Bool, Float32, Float64, Int
-from kissgs.core.errors import InvalidViewsError
+from kissgs.core.array_types import Bool, Float32, Int
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import BLOCK, Sensitivity
 from kissgs.core.splats import Splats, concatenate
 from kissgs.rendering.camera import Camera, look_at
+from kissgs.rendering.cpu.frame import add_sensitivities, draw
+from kissgs.rendering.rasterizer import drawn_opacities
 from kissgs.rendering.sensitivity import Coverage, WeightedCameras, local_scale
 
-# ``find_regions``: parts of a scene that each need cameras at their own scale.
+# Regions: parts of a scene that each need cameras at their own scale.
 #
 # The first region is the densest part of the scene, with all that can be seen from there. Where its cameras leave
 # Gaussians that they do not see, or see too small to resolve, further regions are found: a distant or a much smaller
@@ -80,13 +80,13 @@ class Region:
 def find_regions(
     splats: Splats, size: tuple[int, int], pool: Workers, progress: Progress, *, camera_count: int
 ) -> list[Region]:
-    """Return the regions of a scene in the order in which they were found, at least one; shares add up to 1.
+    """Return the regions of a scene, at least one; shares add up to 1.
 
     ``camera_count`` is the number of cameras that will be selected for the first region, at most.
     """
     candidates = score_candidates(splats, size, pool, progress).refined(camera_count)
     proxy = proxy_scene(splats)
-    visible, coverage, spacing = _visible_opacity(proxy), Coverage(proxy), local_scale(proxy)
+    visible, coverage, spacing = drawn_opacities(proxy), Coverage(proxy), local_scale(proxy)
     regions = [Region(candidates, 1.0)]
     unseen = visible * (1 - _updated_coverage(coverage, proxy, regions[0], pool))
     gains = [float(visible.sum() - unseen.sum())]
@@ -109,29 +109,16 @@ def find_regions(
     return [replace(region, share=gain / total) for region, gain in zip(regions, gains, strict=True)]
 
 
-def allocate_cameras(regions: list[Region], count: int, min_per_region: int = 4) -> list[int]:
-    """Divide ``count`` cameras among regions in proportion to their shares; return how many each gets, at least one.
-
-    A share of less than ``min_per_region`` cameras counts as so many, where ``count`` suffices. The sum is more than
-    ``count`` only if there are more regions than that.
-    """
-    min_per_region = min(min_per_region, max(1, count // len(regions)))
-    wanted = np.maximum(np.array([region.share for region in regions]) * count, min_per_region)
-    counts = np.maximum(np.floor(wanted * count / wanted.sum()), min(min_per_region, 1)).astype(int)
+def allocate_cameras(regions: list[Region], count: int) -> list[int]:
+    """Return how many of ``count`` cameras each region gets: by its share, at least four where there are enough."""
+    wanted = np.maximum(np.array([region.share for region in regions]) * count, min(4, max(1, count // len(regions))))
+    counts = np.maximum(np.floor(wanted * count / wanted.sum()), 1).astype(int)
     counts[0] += max(0, count - int(counts.sum()))
     return [int(n) for n in counts]
 
 
-def _visible_opacity(splats: Splats) -> Float64[np.ndarray, " n"]:
-    """Return opacities, ``(n,)`` float64, with 0 for those at or below 1/255, which no renderer draws."""
-    visible = opacity(splats)
-    return np.where(visible > 1 / 255, visible, 0.0)
-
-
 def _updated_coverage(coverage: Coverage, proxy: Splats, region: Region, pool: Workers) -> Float32[np.ndarray, " n"]:
-    """Add some of the region's cameras to ``coverage``; return the coverage of each Gaussian of the proxy, 0 to 1."""
-    from kissgs.rendering.cpu.frame import add_sensitivities, draw
-
+    """Add some of the region's cameras to ``coverage``, and return its share."""
     for camera in region.cameras(PROBE_CAMERAS):
         probe = camera.at_most(PROBE_SIZE)
         frame = draw(proxy, probe, black(), pool)
@@ -151,10 +138,7 @@ def _densest_part(proxy: Splats, remaining: Int[np.ndarray, " m"], spacing: Floa
 
 
 def _further_region(splats: Splats, bounds: SceneBounds, like: Camera, pool: Workers, progress: Progress) -> Region:
-    """Return a region with candidates all around ``bounds``, whose thumbnails have the size of ``like``.
-
-    Half of the proxy scene shows what is near the region, the other half what is in front of it and behind.
-    """
+    """Return a region with candidates all around; half of its proxy scene shows what is in front of it and behind."""
     near = _within(splats.means, bounds.centre, 6 * bounds.radius)
     parts = np.flatnonzero(near), np.flatnonzero(~near)
     proxy = concatenate([proxy_scene(splats, PROXY_GAUSSIANS // 2, part) for part in parts])
@@ -173,10 +157,7 @@ def _within(means: Float32[np.ndarray, "N 3"], centre: Vec3, radius: float) -> B
 
 
 def _surrounding_cameras(bounds: SceneBounds, like: Camera) -> Iterator[Camera]:
-    """Yield cameras evenly from all directions (a Fibonacci sphere), at 1.3, 2 and 3 radii in turn.
-
-    The region fills the image of the nearest, and has a margin around it in that of the farthest.
-    """
+    """Yield cameras evenly from all directions (a Fibonacci sphere), at 1.3, 2 and 3 radii in turn."""
     for n in range(CANDIDATES_PER_REGION):
         height, azimuth = 1 - (2 * n + 1) / CANDIDATES_PER_REGION, n * np.pi * (3 - np.sqrt(5))  # the golden angle
         horizontal = np.sqrt(1 - height**2)
@@ -185,23 +166,11 @@ def _surrounding_cameras(bounds: SceneBounds, like: Camera) -> Iterator[Camera]:
         yield look_at(position, bounds.centre, bounds.up, fov=FIELD_OF_VIEW, width=like.width, height=like.height)
 
 
-# ``scene_views``: virtual cameras that together see every region of a scene.
-
-
 def scene_views(
-    splats: Splats,
-    *,
-    width: int,
-    height: int,
-    count: int,
-    threads: int = 0,
-    progress: Progress = silent,
+    splats: Splats, *, width: int, height: int, count: int, threads: int = 0, progress: Progress = silent
 ) -> Views:
-    """Return views of every region of a scene, more of regions that show more; every 8th is held out.
-
-    The result is the same for any number of threads.
-    """
-    check_request(count, (width, height))
+    """Return views of every region of a scene, more of regions that show more; every 8th is held out."""
+    check_images(count, width, height)
     with Workers(threads) as pool:
         regions = find_regions(splats, (width, height), pool, progress, camera_count=count)
     progress("cameras", 1.0)
@@ -210,9 +179,7 @@ def scene_views(
     return split_views(with_size(cameras[:count], width, height))
 
 
-# ``sensitivity_cameras``: cameras that sensitivity and the colour refit see a scene from.
-#
-# These are a capture's cameras and some virtual ones around the scene, or virtual ones alone.
+# Cameras of the sensitivity and of the colour refit: a capture's and some virtual ones, or virtual ones alone.
 
 VIRTUAL_WEIGHT = 0.3
 """Weight of all virtual cameras together, relative to all cameras of a capture. Parts that no photograph shows must not
@@ -229,10 +196,7 @@ FEW_GAUSSIANS = 150_000
 
 
 def default_view_count(gaussians: int) -> int:
-    """Return how many cameras measure a scene of so many Gaussians.
-
-    The number falls with the fourth root: in a large scene, errors of single Gaussians matter less.
-    """
+    """Return how many cameras measure a scene: in a large one, errors of single Gaussians matter less."""
     return round(min(max(MAX_VIEWS * (FEW_GAUSSIANS / max(gaussians, 1)) ** 0.25, MIN_VIEWS), MAX_VIEWS))
 
 
@@ -247,9 +211,8 @@ def sensitivity_cameras(
 ) -> WeightedCameras:
     """Return the cameras, each with its weight, that measure sensitivity and refit colours.
 
-    Of a capture, only training views are used, at most ``count``, evenly selected, and two thirds as many virtual
-    cameras are added; without any, ``count`` are virtual. ``size`` is the longer side of the images, pixels; a
-    capture's smaller images keep their size, larger ones are sampled.
+    Of a capture, at most ``count`` training views are used, and two thirds as many virtual cameras are added; without
+    any, ``count`` are virtual. ``size`` is the longer side of the images, pixels; larger ones are sampled.
     """
     if views is None or not views.train:
         side = size * 4 // 5
@@ -276,11 +239,10 @@ def _widened(camera: Camera) -> Camera:
     return Camera(camera.viewmat, K, camera.width, camera.height)
 
 
-# ``random_poses``: virtual cameras to train or to measure losses with, from where photographs might have been taken.
+# Random poses, from where photographs might have been taken, to train or to measure losses with.
 #
-# :func:`kissgs.virtual_views` selects a few cameras that are as good as possible. A scene that is trained from such
-# views only falls apart between and beside them. Random cameras are near and far, high and low, around every region;
-# only those with a low view score are left out.
+# A scene that is trained from a few cameras that are as good as possible falls apart between and beside them. Random
+# ones are near and far, high and low, around every region; only those with a low view score are left out.
 
 SCORE_MARGIN = 0.5
 """How much lower than the best candidate a random camera may score; photographs of real captures stay within it."""
@@ -312,12 +274,10 @@ def random_poses(
 ) -> Views:
     """Return views for square images from random poses around every region of a scene; every 8th is held out.
 
-    ``count`` is the number of views of a scene with one region. With several there are so many more that the region
-    with the largest share gets ``count``, at most :data:`MAX_COUNT_FACTOR` times ``count``; where few poses show the
-    scene, there are fewer. The result is the same for any number of threads.
+    The region with the largest share gets ``count`` of them; together there are at most :data:`MAX_COUNT_FACTOR` times
+    as many, and fewer where few poses show the scene.
     """
-    if count < 1:
-        raise InvalidViewsError(f"there must be at least 1 view, not {count}")
+    check_images(count, side, side)
     rng = np.random.default_rng(seed)
     cameras: list[Camera] = []
     with Workers(threads) as pool:
@@ -361,7 +321,6 @@ class _PoseSampler:
 
     def __init__(self, candidates: ScoredCandidates, rng: np.random.Generator) -> None:
         self._bounds, self._candidates, self._rng = candidates.bounds, candidates, rng
-        self._east, self._north = horizontal_axes(candidates.bounds.up)
         samplers = {"enclosed": self._inside, "background": self._in_front, "object": self._around_object}
         self.draw = samplers[candidates.kind]
 
@@ -387,9 +346,7 @@ class _PoseSampler:
 
     def _direction(self, elevation: float) -> Vec3:
         """Draw a unit vector at this elevation, radians, and a uniform azimuth."""
-        azimuth = self._rng.uniform(0, 2 * np.pi)
-        horizontal = np.cos(azimuth) * self._east + np.sin(azimuth) * self._north
-        return np.asarray(np.cos(elevation) * horizontal + np.sin(elevation) * self._bounds.up)
+        return direction_at(self._bounds.up, elevation, self._rng.uniform(0, 2 * np.pi))
 
     def _elevation(self, low: float = MIN_ELEVATION, high: float = MAX_ELEVATION) -> float:
         """Draw an elevation, radians, so that directions are uniform on the sphere between the limits."""
@@ -400,9 +357,8 @@ class _PoseSampler:
         return self._bounds.centre + TARGET_SPREAD * self._bounds.radius * self._rng.normal(size=3)
 
 
-# ``close_ups``: cameras close to single Gaussians, which see what views of whole objects are too far away to resolve.
-#
-# A scene that is pruned without them gets holes behind and between what other cameras see.
+# Close-ups see what views of whole objects are too far away to resolve: a scene that is pruned without them gets holes
+# behind and between what other cameras see.
 
 PHOTOGRAPH_FIELD_OF_VIEW = np.radians(70)
 """Angle of view along both sides, radians, where no longer lens is needed."""
@@ -412,10 +368,7 @@ OCTAVES = 3.0
 
 
 def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[Camera]:
-    """Return cameras for square images, each with a random Gaussian in the centre, from a random direction.
-
-    A Gaussian is drawn in proportion to its opacity; without any visible one there are no cameras.
-    """
+    """Return cameras with random Gaussians in the centre, drawn by opacity; none if none is visible."""
     weights = opacity(splats)
     if not weights.sum() > 0:
         return []
@@ -429,9 +382,7 @@ def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[C
     return cameras
 
 
-# ``scattered_cameras``: cameras anywhere in and around a scene, for what a capture does not show.
-#
-# They preserve what is seen from beside, behind and above the cameras of a capture, from afar and from within.
+# Scattered cameras preserve what is seen from beside, behind and above the cameras of a capture, from afar and within.
 
 NEAREST, FARTHEST = 10.0, 3.0
 """Smallest distance from the Gaussian in the centre, local scales (:func:`~kissgs.rendering.sensitivity.local_scale`)
@@ -445,11 +396,7 @@ MAX_BESIDE = 8.0
 
 
 def scattered_cameras(splats: Splats, *, side: int, count: int, seed: int = 0, threads: int = 0) -> list[Camera]:
-    """Return cameras for square images, each with a random Gaussian in the centre, from any distance.
-
-    Gaussians of the proxy scene are drawn in proportion to their opacity; distances are log-uniformly distributed,
-    directions uniformly. Without any visible Gaussian there are no cameras.
-    """
+    """Return cameras like :func:`close_ups`, but from any distance."""
     proxy = proxy_scene(splats)
     weights = opacity(proxy)
     if not weights.sum() > 0:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from kissgs.cameras.views import View, Views, black
+from kissgs.cameras.views import View, Views, black, check_images
 from kissgs.cameras.virtual.candidates import (
     FIELD_OF_VIEW,
     INSIDE_DIRECTIONS,
@@ -25,14 +25,11 @@ from kissgs.cameras.virtual.candidates import (
     view_scores,
 )
 from kissgs.core.array_types import Float64, Int
-from kissgs.core.errors import InvalidViewsError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera, look_at, pinhole
 
-# ``score_candidates``: candidate cameras for a scene, with their view scores, for a first choice.
-#
 # Which candidates suit depends on the kind of scene. Inside a room or under a sky, cameras must stay within what
 # encloses them; before a background, the image should be full; an object that stands alone is framed from all sides.
 
@@ -74,14 +71,9 @@ class ScoredCandidates:
         return self.scorer.bounds
 
     @property
-    def fills_image(self) -> bool:
-        """Whether the scene should fill the image."""
-        return self.kind != "object"
-
-    @property
     def scores(self) -> Float64[np.ndarray, " n"]:
-        """View scores, ``(n,)`` float64, at most 1."""
-        return view_scores(self.stats, fills_image=self.fills_image) - self.outside_penalty
+        """View scores, at most 1."""
+        return view_scores(self.stats, fills_image=self.kind != "object") - self.outside_penalty
 
     def good(self) -> Int[np.ndarray, " good"]:
         """Return the indices of the cameras that score at most :data:`SCORE_MARGIN` less than the best."""
@@ -89,10 +81,10 @@ class ScoredCandidates:
         return np.flatnonzero(scores >= scores.max() - SCORE_MARGIN)
 
     def scores_of(self, cameras: list[Camera]) -> Float64[np.ndarray, " more"]:
-        """Return the view scores of other cameras, ``(more,)`` float64, on the same scale."""
+        """Return the view scores of other cameras, on the same scale."""
         penalty = _outside_penalty(cameras, self.scorer) if self.kind == "enclosed" else np.zeros(len(cameras))
         stats = [*self.stats, *self.scorer.measure(cameras)]
-        return view_scores(stats, fills_image=self.fills_image)[len(self.stats) :] - penalty
+        return view_scores(stats, fills_image=self.kind != "object")[len(self.stats) :] - penalty
 
     def refined(self, count: int) -> ScoredCandidates:
         """Return the candidates with cameras between good ones added, until twice ``count`` are good, if possible."""
@@ -128,8 +120,7 @@ class ScoredCandidates:
 
 def score_candidates(splats: Splats, size: tuple[int, int], pool: Workers, progress: Progress) -> ScoredCandidates:
     """Return some hundred candidate cameras of a scene, with their view scores."""
-    if min(size) < 1:
-        raise InvalidViewsError(f"an image must have at least 1x1 pixels, not {size[0]}x{size[1]}")
+    check_images(1, *size)
     proxy = proxy_scene(splats)
     bounds = scene_bounds(proxy)
     scale = THUMBNAIL_SIZE / max(size)
@@ -153,23 +144,16 @@ def _is_enclosed(inside: list[ViewStats]) -> bool:
 
 
 def _has_background(orbits: list[ViewStats], size: tuple[int, int], scorer: ViewScorer) -> bool:
-    """Whether images from the largest orbit are full, at least the fullest tenth of them.
+    """Whether a tenth of the images from the largest orbit are full; an object may fill portrait images alone."""
 
-    An object may fill a portrait image, so that landscape images are tried too where ``size``, (width, height), is
-    portrait.
-    """
+    def fills(stats: list[ViewStats]) -> bool:
+        return bool(np.quantile([view.alpha for view in stats], 0.9) > FULL_ALPHA)
+
     outermost = len(orbits) // len(ORBIT_RADII)
-    if not _fullest_tenth(orbits[-outermost:]):
-        return False
-    if size[0] >= size[1]:
-        return True
+    if not fills(orbits[-outermost:]) or size[0] >= size[1]:
+        return fills(orbits[-outermost:])
     landscape = list(orbit_cameras(scorer.bounds, (size[1], size[0])))
-    return _fullest_tenth(scorer.measure(landscape[-outermost:]))
-
-
-def _fullest_tenth(stats: list[ViewStats]) -> bool:
-    """Whether at least a tenth of the images are full."""
-    return bool(np.quantile([view.alpha for view in stats], 0.9) > FULL_ALPHA)
+    return fills(scorer.measure(landscape[-outermost:]))
 
 
 def _outside_penalty(cameras: list[Camera], scorer: ViewScorer) -> Float64[np.ndarray, " n"]:
@@ -181,7 +165,7 @@ def _outside_penalty(cameras: list[Camera], scorer: ViewScorer) -> Float64[np.nd
 def normalized_poses(
     cameras: list[Camera], bounds: SceneBounds
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Return positions in radii of the scene and unit viewing directions of cameras, ``(n, 3)`` float64 each."""
+    """Return positions in radii of the scene and unit viewing directions of cameras."""
     positions = np.array([camera.position for camera in cameras]) / bounds.radius
     return positions, np.array([camera.viewmat[2, :3] for camera in cameras])
 
@@ -189,16 +173,11 @@ def normalized_poses(
 def pose_distances(
     positions: Float64[np.ndarray, "n 3"], forward: Float64[np.ndarray, "n 3"], index: int
 ) -> Float64[np.ndarray, " n"]:
-    """Return how far each pose is from pose ``index``, ``(n,)`` float64: radii of the scene plus change of direction.
-
-    ``positions`` and ``forward`` are those of :func:`normalized_poses`.
-    """
+    """Return how far each of :func:`normalized_poses` is from one of them: radii plus change of direction."""
     to_position = np.linalg.norm(positions - positions[index], axis=1)
     return np.asarray(to_position + np.linalg.norm(forward - forward[index], axis=1))
 
 
-# ``virtual_views``: virtual cameras that show a scene well, for people to look at.
-#
 # Candidates are scored by thumbnails. A trained scene is sharp from where it was photographed and dissolves elsewhere,
 # so the good ones lie on the side that was captured. Among these, cameras far from each other are chosen.
 
@@ -236,26 +215,13 @@ def virtual_views(
     Raises:
         InvalidViewsError: ``count``, ``width`` or ``height`` is less than 1.
     """
-    candidates, selected = _select(splats, (width, height), count, threads, progress)
-    views = split_views(with_size([candidates.cameras[n] for n in selected], width, height))
+    _, _, views = _select(splats, (width, height), count, threads, progress)
     return replace(views, origin=splats.origin)
 
 
-def best_view(
-    splats: Splats,
-    *,
-    width: int = 640,
-    height: int = 480,
-    count: int = 32,
-    threads: int = 0,
-    progress: Progress = silent,
-) -> View:
-    """Return the one of :func:`virtual_views` that represents the scene best; arguments and errors are the same.
-
-    Besides the view score, distance counts: an overview represents a scene better than a close-up.
-    """
-    candidates, selected = _select(splats, (width, height), count, threads, progress)
-    views = split_views(with_size([candidates.cameras[n] for n in selected], width, height))
+def best_view(splats: Splats, *, width: int, height: int, threads: int = 0, progress: Progress = silent) -> View:
+    """Return the one of :func:`virtual_views` that represents the scene best, by view score and distance."""
+    candidates, selected, views = _select(splats, (width, height), 32, threads, progress)
     bounds = candidates.bounds
     distances = [float(np.linalg.norm(candidates.cameras[n].position - bounds.centre)) for n in selected]
     scores = candidates.scores[selected] + [overview_bonus(distance / bounds.radius) for distance in distances]
@@ -270,8 +236,8 @@ def overview_bonus(radii: float) -> float:
 def select_diverse(candidates: ScoredCandidates, count: int) -> list[int]:
     """Return the indices of ``count`` good candidates that are far from each other, in order of azimuth.
 
-    The first is the best; each further one is the farthest from all that are selected, where distance counts less for
-    lower scores. With fewer good candidates than ``count``, the best are taken; with fewer candidates, some repeatedly.
+    Starting with the best, each further one is the farthest from all that are selected, where distance counts less for
+    lower scores. Of fewer than ``count``, some are returned repeatedly.
     """
     scores, good = candidates.scores, candidates.good()
     if len(good) < count:
@@ -286,14 +252,6 @@ def select_diverse(candidates: ScoredCandidates, count: int) -> list[int]:
     azimuths = [float(np.arctan2(forward[n] @ north, forward[n] @ east)) for n in selected]
     ordered = [int(good[selected[n]]) for n in np.argsort(azimuths, kind="stable")]
     return [ordered[n % len(ordered)] for n in range(count)]
-
-
-def check_request(count: int, size: tuple[int, int]) -> None:
-    """Check a number of views and the (width, height) of their images."""
-    if min(*size, count) < 1:
-        raise InvalidViewsError(
-            f"there must be at least 1 view of at least 1x1 pixels, not {count} of {size[0]}x{size[1]}"
-        )
 
 
 def with_size(cameras: list[Camera], width: int, height: int) -> list[Camera]:
@@ -313,10 +271,11 @@ def split_views(cameras: list[Camera]) -> Views:
 
 def _select(
     splats: Splats, size: tuple[int, int], count: int, threads: int, progress: Progress
-) -> tuple[ScoredCandidates, list[int]]:
-    """Return all scored candidates of a scene and the indices of the selected ones."""
-    check_request(count, size)
+) -> tuple[ScoredCandidates, list[int], Views]:
+    """Return all scored candidates of a scene, the indices of the selected ones, and their views."""
+    check_images(count, *size)
     with Workers(threads) as pool:
         candidates = score_candidates(splats, size, pool, progress).refined(count)
     progress("cameras", 1.0)
-    return candidates, select_diverse(candidates, count)
+    selected = select_diverse(candidates, count)
+    return candidates, selected, split_views(with_size([candidates.cameras[n] for n in selected], *size))

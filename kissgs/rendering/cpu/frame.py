@@ -1,13 +1,14 @@
-"""One image on the CPU: rendering, removal scores and sensitivity, independent of the number of threads."""
+"""One image on the CPU: rendering, removal scores, sensitivity and gradients, independent of the number of threads."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Int64, Shaped
+from kissgs.core.array_types import Bool, Float32, Float64, Int32, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
@@ -15,7 +16,8 @@ from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending, sensitivity
-from kissgs.rendering.cpu.records import Blended, Footprints, Gaussians, Projection, TileLists
+from kissgs.rendering.cpu.projection import add_colors, project_backward, shade_backward
+from kissgs.rendering.cpu.records import Blended, Frame, Gaussians, Projection, Slots
 from kissgs.rendering.cpu.tiles import (
     Part,
     each_part,
@@ -30,34 +32,6 @@ BAND = 1 << 19
 """Number of members of tiles whose moments are in memory at once."""
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """A rendered image, with the intermediate results that its derivatives and scores need."""
-
-    gaussians: Gaussians
-    camera: Camera
-    projection: Projection
-    footprints: Footprints
-    parts: list[Part]
-    """Ranges of rows that hold footprints; other rows are not set."""
-    lists: TileLists
-    blended: Blended
-
-    @property
-    def image(self) -> Float32[np.ndarray, "H W 3"]:
-        """RGB, 0 and up, not clamped to 1."""
-        return self.blended.image
-
-    @property
-    def transmittance(self) -> Float32[np.ndarray, "H W"]:
-        """Share of the background that is visible, 1 - alpha."""
-        return self.blended.transmittance
-
-    def rows(self) -> Int64[np.ndarray, " M"]:
-        """Return the rows that hold footprints, ascending."""
-        return np.concatenate([np.arange(first, last) for first, last in self.parts])
-
-
 def draw(
     splats: Splats,
     camera: Camera,
@@ -67,8 +41,7 @@ def draw(
 ) -> Frame:
     """Render an image of a finite scene (:func:`kissgs.clean`) by the image model of :mod:`kissgs.rendering.constants`.
 
-    The list of a pixel ends at the transmittance ``end``. A larger one than that of the image model takes less time,
-    and shows the background instead of what is behind.
+    Beyond the transmittance ``end``, the background is shown instead of what is behind.
     """
     colour = np.array(background, np.float32, order="C")
     if colour.shape != (3,) or not np.isfinite(colour).all():
@@ -91,44 +64,50 @@ def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], 
         background,
         np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, end], np.float32),
     )
-    each_part(
-        lambda first, last: blending.blend(footprints.records, lists, first, last, blended),
-        even_tiles(lists, pool),
-        pool,
-    )
-    return Frame(gaussians, camera, projection, footprints, parts, lists, blended)
+    frame = Frame(gaussians, projection, footprints, np.array(parts), lists, blended)
+    each_part(lambda first, last: blending.blend(frame, first, last), even_tiles(lists, pool), pool)
+    return frame
+
+
+def _each_tile(
+    kernel: Callable[..., None], frame: Frame, slots: Slots, pool: Workers, *arguments: object, band: Part | None = None
+) -> None:
+    """Call a kernel for all tiles, or for a band of them, in threads."""
+    tiles = even_tiles(frame.lists, pool, band)
+    each_part(lambda first, last: kernel(frame, slots, first, last, *arguments), tiles, pool)
+
+
+def _each_footprint(kernel: Callable[..., None], frame: Frame, slots: Slots, pool: Workers, *arguments: object) -> None:
+    """Call a kernel for all footprints with slots, in threads."""
+    rows = even(len(slots.rows), pool)
+    each_part(lambda first, last: kernel(frame, slots, first, last, *arguments), rows, pool)
 
 
 def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
-    """Return, for each Gaussian of the scene, the squared change of the image by its removal alone, ``(N,)``.
-
-    A sum over pixels and RGB (GaussianPOP, section 3), exact except for Gaussians behind the end of a pixel's list,
-    which a removal may reveal; 0 for Gaussians outside the image.
-    """
-    lists, records = frame.lists, frame.footprints.records
-    slots, errors = number_slots(lists, len(records)), np.empty(len(lists.members), np.float32)
-    each_part(
-        lambda first, last: blending.removal_errors(records, lists, slots, first, last, frame.blended, errors),
-        even_tiles(lists, pool),
-        pool,
+    """Return the squared change of the image by each Gaussian's removal; see :func:`rasterizer.removal_scores`."""
+    slots, errors = (
+        number_slots(frame.lists, len(frame.gaussians.means)),
+        np.zeros(len(frame.lists.members), np.float32),
     )
-    scores = np.zeros(len(records), np.float64)
-    blending.sum_errors(errors, slots, frame.footprints.visible, scores)
-    return scores
+    _each_tile(blending.removal_errors, frame, slots, pool, errors)
+    return sums_of_slots(frame, slots, errors)
+
+
+def sums_of_slots(frame: Frame, slots: Slots, values: Float32[np.ndarray, " slots"]) -> Float64[np.ndarray, " N"]:
+    """Return, for each Gaussian of the scene, the sum of the values in its slots."""
+    sums = np.zeros(len(frame.footprints.records), np.float64)
+    blending.sum_slots(values, slots, frame.footprints.visible, sums)
+    return sums
 
 
 def add_sensitivities(
     frame: Frame, weight: float, spread: float, into: Sensitivity, pool: Workers
 ) -> Float32[np.ndarray, " N"]:
-    """Add the sensitivity in this image to sums over images, ``into``; ``weight``: of a single value's squared error.
+    """Add the sensitivity in this image to ``into``, and return the sum of (alpha T)² over its pixels by footprint.
 
-    ``spread`` is the standard deviation of each channel of the background. ``shape_hessian`` receives moments, to be
-    converted by :func:`kissgs.rendering.cpu.sensitivity.moments_to_hessians` in the end; both fields of harmonics
-    receive sums of (alpha T)² times the spherical harmonics, to be divided by ``color_weight``.
-
-    Returns:
-        Sum of (alpha T)² over the pixels of this image, by row of the frame's footprints; rows without a footprint are
-        not set.
+    ``weight`` is that of a single value's squared error, ``spread`` the standard deviation of the background.
+    ``shape_hessian`` receives moments, which :func:`sensitivity.moments_to_hessians` converts in the end; harmonics are
+    weighted by (alpha T)², and to be divided by ``color_weight``.
     """
     seen = np.empty(len(frame.footprints.records), np.float32)
     for first, last in frame.parts:
@@ -141,36 +120,14 @@ def add_sensitivities(
         into.higher_harmonics,
         seen,
     )
-    for band in itertools.pairwise(_bands(frame.lists)):
-        _add_band(frame, (int(band[0]), int(band[1])), weight, spread, sums, pool)
+    starts = frame.lists.starts
+    edges = np.searchsorted(starts, np.arange(0, starts[-1], BAND))
+    for first, last in itertools.pairwise(np.unique(np.append(edges, [0, len(starts) - 1])).tolist()):
+        slots = number_slots(frame.lists, len(frame.footprints.records), (first, last))
+        moments = np.zeros((len(slots.of), blending.MOMENTS), np.float32)
+        _each_tile(blending.moments, frame, slots, pool, spread, moments, band=(first, last))
+        _each_footprint(sensitivity.add_to_parameters, frame, slots, pool, moments, weight, sums)
     return seen
-
-
-def _add_band(frame: Frame, band: Part, weight: float, spread: float, sums: sensitivity.Sums, pool: Workers) -> None:
-    """Add the sensitivity in a band of tiles."""
-    lists, footprints = frame.lists, frame.footprints
-    slots = number_slots(lists, len(footprints.records), band)
-    moments = np.empty((len(slots.of), sensitivity.MOMENTS), np.float32)
-    each_part(
-        lambda first, last: sensitivity.moments(
-            footprints.records, lists, slots, first, last, frame.blended, spread, moments
-        ),
-        even_tiles(lists, pool, band),
-        pool,
-    )
-    each_part(
-        lambda first, last: sensitivity.add_to_parameters(
-            frame.gaussians, frame.projection, footprints.visible, slots, moments, first, last, weight, sums
-        ),
-        even(len(slots.rows), pool),
-        pool,
-    )
-
-
-def _bands(lists: TileLists) -> Int64[np.ndarray, " edges"]:
-    """Return the edges of bands of tiles of about :data:`BAND` members each."""
-    edges = np.searchsorted(lists.starts, np.arange(0, lists.starts[-1], BAND))
-    return np.unique(np.append(edges, [0, len(lists.starts) - 1]))
 
 
 def for_kernels(splats: Splats) -> Splats:
@@ -179,3 +136,77 @@ def for_kernels(splats: Splats) -> Splats:
     return (
         splats if all(array is getattr(splats, name) for name, array in arrays.items()) else replace(splats, **arrays)
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Gradients:
+    """Gradients of a loss by the stored parameters of the R Gaussians that have any; those of all others are 0."""
+
+    gaussians: Int32[np.ndarray, " R"]
+    """Indices of these Gaussians, ascending."""
+    means: Float32[np.ndarray, "R 3"]
+    quats: Float32[np.ndarray, "R 4"]
+    scales: Float32[np.ndarray, "R 3"]
+    opacities: Float32[np.ndarray, " R"]
+    sh0: Float32[np.ndarray, "R 3"]
+    shN: Float32[np.ndarray, "R K 3"]
+
+    def add_to(self, name: str, total: Shaped[np.ndarray, "N ..."]) -> None:
+        """Add the gradients by the attribute ``name`` to those of all Gaussians."""
+        total[self.gaussians] += getattr(self, name)
+
+    @classmethod
+    def sum(cls, parts: Sequence[Gradients]) -> Gradients:
+        """Return the sum of one or more gradients, added in order."""
+        if len(parts) == 1:
+            return parts[0]
+        gaussians = np.unique(np.concatenate([part.gaussians for part in parts]))
+        totals = []
+        for field in fields(cls)[1:]:
+            total = np.zeros((len(gaussians), *getattr(parts[0], field.name).shape[1:]), np.float32)
+            for part in parts:
+                total[np.searchsorted(gaussians, part.gaussians)] += getattr(part, field.name)
+            totals.append(total)
+        return cls(gaussians, *totals)
+
+
+def differentiate(
+    frame: Frame, v_image: Float32[np.ndarray, "H W 3"], v_alpha: Float32[np.ndarray, "H W"], pool: Workers
+) -> Gradients:
+    """Return the gradients of a loss by the stored parameters, given those by the image and by its alpha.
+
+    Only Gaussians that contribute to the image have any: of many Gaussians, most lie outside it, or behind others.
+    """
+    v_slots, slots, any_gradient = differentiate_footprints(frame, v_image, v_alpha, pool)
+    changed = slots.rows[any_gradient[slots.rows]]
+    count = len(changed)
+    gradients = Gaussians(*(np.empty((count, *array.shape[1:]), np.float32) for array in frame.gaussians))
+    indices, v_colors = np.empty(count, np.int32), np.empty((count, 3), np.float64)
+
+    def part(first: int, last: int) -> None:
+        project_backward(frame, slots, v_slots, changed, first, last, indices, gradients, v_colors)
+        shade_backward(frame, indices, first, last, v_colors, gradients)
+
+    each_part(part, even(count, pool), pool)
+    return Gradients(indices, *gradients)
+
+
+def differentiate_footprints(
+    frame: Frame, v_image: Float32[np.ndarray, "H W 3"], v_alpha: Float32[np.ndarray, "H W"], pool: Workers
+) -> tuple[Float32[np.ndarray, "slots 9"], Slots, Bool[np.ndarray, " N"]]:
+    """Return what :func:`blending.blend_backward` finds: sums by slot, the slots, and which rows have any gradient."""
+    count = len(frame.footprints.records)
+    slots, changed = number_slots(frame.lists, count), np.zeros(count, bool)
+    v_slots = np.zeros((len(frame.lists.members), 9), np.float32)
+    _each_tile(blending.blend_backward, frame, slots, pool, v_image, v_alpha, v_slots, changed)
+    return v_slots, slots, changed
+
+
+def add_color_gradients(
+    frame: Frame, v_image: Float32[np.ndarray, "H W 3"], into: Float32[np.ndarray, "N 3"], pool: Workers
+) -> None:
+    """Add the gradients of a loss by ``sh0`` alone, given its gradient by the image, ``v_image``, to ``into``."""
+    slots = number_slots(frame.lists, len(frame.footprints.records))
+    v_slots = np.zeros((len(frame.lists.members), 3), np.float32)
+    _each_tile(blending.blend_colors_backward, frame, slots, pool, v_image, v_slots)
+    _each_footprint(add_colors, frame, slots, pool, v_slots, into)

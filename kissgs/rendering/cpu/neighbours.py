@@ -103,7 +103,7 @@ def _at_rank(bits: np.ndarray, rank: int, low: int, high: int) -> int:
 
 
 @njit(nogil=True, error_model="numpy")
-def _squared_scale(squared: np.ndarray, rank: int, gap: float) -> float:
+def _squared_scale(squared: np.ndarray, rank: int) -> float:
     """Return the square of the local scale, given squared distances and the rank at which it usually lies."""
     bits, value = squared.view(np.int32), np.empty(1, np.int32)
     low, high = bits[0], bits[0]
@@ -121,26 +121,18 @@ def _squared_scale(squared: np.ndarray, rank: int, gap: float) -> float:
         few //= 2
     if rank == 0:
         return 0.0
-    return smallest if smallest < gap * gap * usual else usual
+    return smallest if smallest < 0.2 * 0.2 * usual else usual
 
 
-@compiled("void(float32[:, ::1], int32[::1], int64[::1], int64, int64, int64, int64, float64, float32[::1])")
+@compiled("void(float32[:, ::1], int32[::1], int64[::1], int64, int64, float32[::1])")
 def leaf_scales(
-    means: np.ndarray,
-    order: np.ndarray,
-    edges: np.ndarray,
-    first: int,
-    last: int,
-    stride: int,
-    neighbours: int,
-    gap: float,
-    scales: np.ndarray,
+    means: np.ndarray, order: np.ndarray, edges: np.ndarray, first: int, last: int, scales: np.ndarray
 ) -> None:
     """Compute the local scales of the points in leaves ``first`` to ``last`` (exclusive).
 
-    Distances are measured to every ``stride``-th point of the leaf; the scale is the one within which one in
-    ``neighbours`` of these lie. If the nearest half, quarter or eighth of them is nearer than the share ``gap`` of what
-    a surface of uniform density would have, their distance is used.
+    The scale is the distance within which one in four of every fourth point of the leaf lies. If the nearest half,
+    quarter or eighth of these is nearer than a fifth of what a surface of uniform density would have, the object has no
+    more points, and their distance is used.
     """
     for leaf in range(first, last):
         members = np.sort(order[edges[leaf] : edges[leaf + 1]])
@@ -149,15 +141,15 @@ def leaf_scales(
         for i in range(count):
             for c in range(3):
                 points[c, i] = means[members[i], c]
-        some = np.ascontiguousarray(points[:, ::stride])
+        some = np.ascontiguousarray(points[:, ::4])
         number = some.shape[1]
-        squared, rank = np.empty(number, np.float32), min(number // neighbours, number - 1)
+        squared, rank = np.empty(number, np.float32), min(number // 4, number - 1)
         for i in range(count):
             x, y, z = points[0, i], points[1, i], points[2, i]
             for j in range(number):
                 dx, dy, dz = x - some[0, j], y - some[1, j], z - some[2, j]
                 squared[j] = dx * dx + dy * dy + dz * dz
-            scales[members[i]] = np.sqrt(_squared_scale(squared, rank, gap))
+            scales[members[i]] = np.sqrt(_squared_scale(squared, rank))
 
 
 @compiled("void(float64[:, ::1], int32[::1], int64[::1], float64[:, :, ::1])")

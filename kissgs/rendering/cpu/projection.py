@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import float64, int32, int64, njit, void
+from numba import float32, float64, int32, int64, njit, void
 
 from kissgs.core.numba_kernels import compiled
-from kissgs.rendering.cpu.records import FOOTPRINTS, GAUSSIANS, PROJECTION, Footprints, Gaussians, Projection
+from kissgs.rendering.cpu.records import (
+    FOOTPRINTS,
+    FRAME,
+    GAUSSIANS,
+    PROJECTION,
+    SLOTS,
+    Footprints,
+    Frame,
+    Gaussians,
+    Projection,
+    Slots,
+)
 
-# Numba kernels of shading: from spherical harmonics to colours in a camera, and gradients back.
+# Shading: from spherical harmonics to colours in a camera, and gradients back.
 
 
 @njit(nogil=True, error_model="numpy")
@@ -85,18 +96,13 @@ def shade(gaussians: Gaussians, projection: Projection, first: int, last: int, f
         records[row, 8] = max(blue, 0.0)
 
 
-@compiled(void(GAUSSIANS, PROJECTION, int32[::1], int64, int64, float64[:, ::1], GAUSSIANS))
+@compiled(void(FRAME, int32[::1], int64, int64, float64[:, ::1], GAUSSIANS))
 def shade_backward(
-    gaussians: Gaussians,
-    projection: Projection,
-    indices: np.ndarray,
-    first: int,
-    last: int,
-    v_colors: np.ndarray,
-    gradients: Gaussians,
+    frame: Frame, indices: np.ndarray, first: int, last: int, v_colors: np.ndarray, gradients: Gaussians
 ) -> None:
     """Compute gradients by SH coefficients, and add those by means, of the Gaussians ``indices[first:last]``."""
-    means, shN, eye, rest = gaussians.means, gaussians.shN, projection.eye, gaussians.shN.shape[1]
+    means, shN, eye = frame.gaussians.means, frame.gaussians.shN, frame.projection.eye
+    rest = shN.shape[1]
     v_means, v_sh0, v_shN = gradients.means, gradients.sh0, gradients.shN
     basis, v_basis = np.empty(15, np.float64), np.empty(15, np.float64)
     for i in range(first, last):
@@ -121,7 +127,7 @@ def shade_backward(
         v_means[i, 2] += (gz - along * z) * inverse
 
 
-# Numba kernels of projection: from Gaussians to footprints in the image, and gradients back.
+# Projection: from Gaussians to footprints in the image, and gradients back.
 #
 # The 2x2 covariance is W Wᵀ + dilation, where W = J Rc R diag(s) is 2x3: J the derivative of the projection, Rc and R
 # the rotations of camera and Gaussian. Its determinant is computed from W as a sum of positive terms (Cauchy-Binet), so
@@ -134,6 +140,8 @@ Vector = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 Bounds = tuple[float, float, float, float]
+Jacobian = tuple[float, float, float, float]
+Ellipsoid = tuple[Quat, float, Matrix, Vector]
 
 _helper = njit(nogil=True, error_model="numpy")
 
@@ -312,19 +320,19 @@ def _clamped(x: float, y: float, frustum: Bounds) -> tuple[float, float]:
 
 
 @_helper
-def _jacobian(K: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float, float]:
+def _jacobian(K: np.ndarray, x: float, y: float, z: float) -> Jacobian:
     """Return the derivatives of the image's x by x and z, and of its y by y and z, given x/z, y/z and z."""
     return K[0, 0] / z, -K[0, 0] / z * x, K[1, 1] / z, -K[1, 1] / z * y
 
 
 @_helper
-def _image_rows(J: tuple[float, float, float, float], rotation: Matrix) -> tuple[Vector, Vector]:
+def _image_rows(J: Jacobian, rotation: Matrix) -> tuple[Vector, Vector]:
     """Return the rows of J Rc."""
     return _mix(J[0], rotation[0], J[1], rotation[2]), _mix(J[2], rotation[1], J[3], rotation[2])
 
 
 @_helper
-def _ellipsoid(gaussians: Gaussians, n: int) -> tuple[Quat, float, Matrix, Vector]:
+def _ellipsoid(gaussians: Gaussians, n: int) -> Ellipsoid:
     """Return the unit quaternion, 1 / length of the stored one, the rotation and the standard deviations."""
     w, x, y, z, shrink = _unit_quat(gaussians.quats, n)
     return (w, x, y, z), shrink, _rotation(w, x, y, z), _deviations(gaussians.scales, n)
@@ -334,6 +342,19 @@ def _ellipsoid(gaussians: Gaussians, n: int) -> tuple[Quat, float, Matrix, Vecto
 def _image_axes(p: Vector, q: Vector, R: Matrix, s: Vector) -> tuple[Vector, Vector]:
     """Return the rows of W, given those of J Rc."""
     return _scaled(_times(p, R), s), _scaled(_times(q, R), s)
+
+
+@_helper
+def _in_image(
+    gaussians: Gaussians, projection: Projection, pose: tuple[Matrix, Vector], frustum: Bounds, n: int
+) -> tuple[Vector, Jacobian, tuple[Vector, Vector], Ellipsoid, tuple[Vector, Vector]]:
+    """Return a Gaussian's position, J, the rows of J Rc, the ellipsoid, and the rows of W."""
+    position = _in_camera(pose, _load(gaussians.means, n))
+    clamped_x, clamped_y = _clamped(position[0], position[1], frustum)
+    J = _jacobian(projection.K, clamped_x, clamped_y, position[2])
+    p, q = _image_rows(J, pose[0])
+    ellipsoid = _ellipsoid(gaussians, n)
+    return position, J, (p, q), ellipsoid, _image_axes(p, q, ellipsoid[2], ellipsoid[3])
 
 
 @_helper
@@ -387,3 +408,119 @@ def project(gaussians: Gaussians, projection: Projection, first: int, last: int,
         records[row, 5], records[row, 9], records[row, 10] = opacity, tau, half_height
         row += 1
     return row - first
+
+
+# Gradients by the parameters of Gaussians.
+
+
+@_helper
+def _by_axes(
+    sums: np.ndarray, w: Vector, v: Vector, dilation: float, antialiased: bool, v_scales: np.ndarray, i: int
+) -> tuple[Vector, Vector]:
+    """Return the gradients by the rows of W; write those by the log-scales of row ``i``.
+
+    By W: -4 Lᵀ S L W, S = (Σ uu, Σ uv; Σ uv, Σ vv); the derivative of a scale by its logarithm is the scale.
+    """
+    l0, l1, l2 = _cholesky(w, v, dilation)
+    u_rows, v_rows = _whitened(w, v, dilation)
+    spread_u, spread_v = _mix(sums[3], u_rows, sums[4], v_rows), _mix(sums[4], u_rows, sums[5], v_rows)
+    for c in range(3):
+        v_scales[i, c] = -4 * (spread_u[c] * u_rows[c] + spread_v[c] * v_rows[c])
+    by_w, by_v = _mix(-4 * l0, spread_u, 0.0, spread_v), _mix(-4 * l1, spread_u, -4 * l2, spread_v)
+    if antialiased:
+        # By the logarithm of the compensation, -Σ 1; by W it is ((W Wᵀ)⁻¹ - 2 Lᵀ L) W, and the first term has the
+        # rows v × n and n × w over n², n being w × v.
+        by_log, normal = -sums[0], _cross(w, v)
+        axis, more = _unit(normal), by_log / _dot(normal, normal)
+        for k in range(3):
+            v_scales[i, k] += by_log * _strain(axis, u_rows, v_rows, k, k)
+        by_w = _mix(1.0, by_w, -2 * by_log * l0, u_rows)
+        by_v = _mix(1.0, _mix(1.0, by_v, -2 * by_log * l1, u_rows), -2 * by_log * l2, v_rows)
+        by_w, by_v = _mix(1.0, by_w, more, _cross(v, normal)), _mix(1.0, by_v, more, _cross(normal, w))
+    return by_w, by_v
+
+
+@_helper
+def _by_position(
+    K: np.ndarray,
+    rotation: Matrix,
+    frustum: Bounds,
+    position: Vector,
+    J: Jacobian,
+    by_centre: tuple[float, float],
+    by_rows: tuple[Vector, Vector],
+) -> Vector:
+    """Return the gradient by the mean: through the centre, through J, and through the x/z and y/z of J if not clamped.
+
+    ``position``: x/z, y/z and z; ``by_rows``: gradients by the rows of J Rc.
+    """
+    (left, right, top, bottom), (x, y, z), (jx, jxz, jy, jyz) = frustum, position, J
+    by_p, by_q = by_rows
+    by_jx, by_jxz = _dot(by_p, rotation[0]), _dot(by_p, rotation[2])
+    by_jy, by_jyz = _dot(by_q, rotation[1]), _dot(by_q, rotation[2])
+    by_ratio_x = by_centre[0] * K[0, 0] - (by_jxz * jx if left < x < right else 0.0)
+    by_ratio_y = by_centre[1] * K[1, 1] - (by_jyz * jy if top < y < bottom else 0.0)
+    by_z = -(by_jx * jx + by_jxz * jxz + by_jy * jy + by_jyz * jyz + by_ratio_x * x + by_ratio_y * y) / z
+    return _times((by_ratio_x / z, by_ratio_y / z, by_z), rotation)
+
+
+@compiled(void(FRAME, SLOTS, float32[:, ::1], int32[::1], int64, int64, int32[::1], GAUSSIANS, float64[:, ::1]))
+def project_backward(
+    frame: Frame,
+    slots: Slots,
+    v_slots: np.ndarray,
+    changed: np.ndarray,
+    first: int,
+    last: int,
+    indices: np.ndarray,
+    gradients: Gaussians,
+    v_colors: np.ndarray,
+) -> None:
+    """Compute the gradients of the footprints ``changed[first:last]`` from those of :func:`blend_backward`.
+
+    Writes their Gaussians, ``indices``; the gradients by these, all but those by SH; and, ``(R, 3)``, those by the
+    colours before they are clamped.
+    """
+    gaussians, projection, footprints = frame.gaussians, frame.projection, frame.footprints
+    pose, frustum = _pose(projection.viewmat), _frustum(projection)
+    sums = np.empty(9, np.float64)
+    for i in range(first, last):
+        row = changed[i]
+        n = footprints.visible[row]
+        indices[i] = n
+        sums[:] = 0.0
+        for slot in range(slots.first[row], slots.first[row + 1]):
+            for c in range(9):
+                sums[c] += v_slots[slot, c]
+        for c in range(3):
+            v_colors[i, c] = sums[6 + c] if footprints.records[row, 6 + c] > 0 else 0.0
+        gradients.opacities[i] = -sums[0] / (1.0 + np.exp(np.float64(gaussians.opacities[n])))
+
+        position, J, (p, q), (quat, shrink, R, s), (w, v) = _in_image(gaussians, projection, pose, frustum, n)
+        by_w, by_v = _by_axes(sums, w, v, projection.dilation, projection.antialiased, gradients.scales, i)
+        by_w, by_v = _scaled(by_w, s), _scaled(by_v, s)
+        by_rotation = _mix(p[0], by_w, q[0], by_v), _mix(p[1], by_w, q[1], by_v), _mix(p[2], by_w, q[2], by_v)
+        by_quat = _by_quat(quat, by_rotation)
+        for c in range(4):
+            gradients.quats[i, c] = by_quat[c] * shrink
+        l0, l1, l2 = _cholesky(w, v, projection.dilation)
+        by_centre = -2 * l0 * sums[1], -2 * (l1 * sums[1] + l2 * sums[2])  # -2 Lᵀ (Σ u, Σ v)
+        by_rows = _applied(R, by_w), _applied(R, by_v)
+        by_mean = _by_position(projection.K, pose[0], frustum, position, J, by_centre, by_rows)
+        gradients.means[i, 0], gradients.means[i, 1], gradients.means[i, 2] = by_mean
+
+
+@compiled(void(FRAME, SLOTS, int64, int64, float32[:, ::1], float32[:, ::1]))
+def add_colors(frame: Frame, slots: Slots, first: int, last: int, v_slots: np.ndarray, v_colors: np.ndarray) -> None:
+    """Add the gradients by ``sh0``, given those of :func:`blend_colors_backward`, of ``slots.rows[first:last]``.
+
+    Colours that are clamped to 0 have no gradient.
+    """
+    for i in range(first, last):
+        row = slots.rows[i]
+        for c in range(3):
+            if frame.footprints.records[row, 6 + c] > 0:
+                total = np.float32(0)
+                for slot in range(slots.first[row], slots.first[row + 1]):
+                    total += v_slots[slot, c]
+                v_colors[frame.footprints.visible[row], c] += np.float32(0.28209479177387814) * total

@@ -1,4 +1,4 @@
-"""Tuples of arrays, with names, that kernels take and give; and their numba types."""
+"""Tuples of arrays, with names, that kernels take and give, up to a whole image; and their numba types."""
 
 from __future__ import annotations
 
@@ -101,6 +101,32 @@ class Blended(NamedTuple):
     """ALPHA_MIN, ALPHA_MAX, and the transmittance at which the list of a pixel ends."""
 
 
+class Frame(NamedTuple):
+    """A rendered image, with the intermediate results that its derivatives and scores need."""
+
+    gaussians: Gaussians
+    projection: Projection
+    footprints: Footprints
+    parts: Int64[np.ndarray, "parts 2"]
+    """First and last (exclusive) row of each range that holds footprints; other rows are not set."""
+    lists: TileLists
+    blended: Blended
+
+    @property
+    def image(self) -> Float32[np.ndarray, "H W 3"]:
+        """RGB, 0 and up, not clamped to 1."""
+        return self.blended.image
+
+    @property
+    def transmittance(self) -> Float32[np.ndarray, "H W"]:
+        """Share of the background that is visible, 1 - alpha."""
+        return self.blended.transmittance
+
+    def rows(self) -> Int64[np.ndarray, " M"]:
+        """Return the rows that hold footprints, ascending."""
+        return np.concatenate([np.arange(first, last) for first, last in self.parts])
+
+
 class Slots(NamedTuple):
     """Numbers of the members of some tiles, footprint by footprint, so that sums over tiles have a fixed order.
 
@@ -127,4 +153,5 @@ PROJECTION = named_tuple(
 FOOTPRINTS = named_tuple((int32[::1], float32[::1], float32[:, ::1]), Footprints)
 TILE_LISTS = named_tuple((int64, int64[::1], int32[::1], uint16[::1]), TileLists)
 BLENDED = named_tuple((float32[:, :, ::1], float32[:, ::1], int32[:, ::1], float32[::1], float32[::1]), Blended)
+FRAME = named_tuple((GAUSSIANS, PROJECTION, FOOTPRINTS, int64[:, ::1], TILE_LISTS, BLENDED), Frame)
 SLOTS = named_tuple((int64, int32[::1], int32[::1], int32[::1]), Slots)

@@ -5,36 +5,23 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import float32, float64, int32, int64, njit, void
+from numba import float32, float64, int64, void
 
 from kissgs.core.array_types import Float32
 from kissgs.core.harmonics_kernel import write_harmonics
 from kissgs.core.numba_kernels import compiled
-from kissgs.rendering.cpu.blending import (
-    _FAST,
-    Place,
-    _alpha,
-    _copy_records,
-    _copy_stops,
-    _footprint,
-    _pixel_centres,
-    _rows,
-)
 from kissgs.rendering.cpu.projection import (
     Vector,
     _applied,
     _cholesky,
-    _clamped,
     _cross,
     _deviations,
     _dot,
-    _ellipsoid,
     _frustum,
     _harmonics,
     _helper,
-    _image_axes,
     _image_rows,
-    _in_camera,
+    _in_image,
     _jacobian,
     _load,
     _pose,
@@ -43,46 +30,33 @@ from kissgs.rendering.cpu.projection import (
     _unit,
     _whitened,
 )
-from kissgs.rendering.cpu.records import (
-    BLENDED,
-    GAUSSIANS,
-    PROJECTION,
-    SLOTS,
-    TILE_LISTS,
-    Blended,
-    Gaussians,
-    Projection,
-    Slots,
-    TileLists,
-    named_tuple,
-)
+from kissgs.rendering.cpu.records import FRAME, SLOTS, Frame, Slots, named_tuple
 
 # Numba kernel of coverage: how well an image shows each Gaussian, by visibility and resolution.
 
 
-@compiled(void(GAUSSIANS, PROJECTION, float32[::1], int32[::1], int64, int64, float32[::1], float64[::1], float32[::1]))
+@compiled(void(FRAME, float32[::1], int64, int64, float32[::1], float64, float32[::1]))
 def raise_coverage(
-    gaussians: Gaussians,
-    projection: Projection,
+    frame: Frame,
     local_scale: np.ndarray,
-    visible: np.ndarray,
     first: int,
     last: int,
     seen: np.ndarray,
-    limits: np.ndarray,
+    resolved_length: float,
     share: np.ndarray,
 ) -> None:
     """Raise the coverage, ``share``, of the Gaussians of footprints ``first`` to ``last`` (exclusive) by one image.
 
-    ``seen`` is the sum of (alpha T)² over the pixels of each footprint. ``limits``: share of the squared alpha from
-    which a Gaussian counts as seen; length in the image of the local scale from which it counts as resolved, pixels;
-    area of a squared Gaussian that is a dilated point, pixels.
+    ``seen`` is the sum of (alpha T)² over the pixels of each footprint; ``resolved_length`` the length in the image of
+    the local scale from which a Gaussian counts as resolved, pixels. It counts as seen from 0.003 of its squared alpha
+    on; with less than a twentieth of its opacity unobstructed, it is hidden.
     """
+    gaussians, projection = frame.gaussians, frame.projection
     means, scales, K, eye = gaussians.means, gaussians.scales, projection.K, projection.eye
-    seen_share, resolved_length, dilated_area = limits[0], limits[1], limits[2]
+    dilated_area = projection.dilation / 0.3  # of a squared point, pixels
     focal, pixels = np.sqrt(K[0, 0] * K[1, 1]), np.float64(projection.width * projection.height)
     for row in range(first, last):
-        n = visible[row]
+        n = frame.footprints.visible[row]
         x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
         per_unit = focal / max(np.sqrt(x * x + y * y + z * z), projection.near)
         a, b, c = np.float64(scales[n, 0]), np.float64(scales[n, 1]), np.float64(scales[n, 2])
@@ -92,7 +66,7 @@ def raise_coverage(
         if projection.antialiased:
             opacity *= (area - dilated_area) / area
         shown = max(opacity * opacity * min(area, pixels), 1e-300)
-        visibility = min(seen[row] / (seen_share * shown), 1.0)
+        visibility = min(seen[row] / (0.003 * shown), 1.0)
         resolution = min(np.float64(local_scale[n]) * per_unit / resolved_length, 1.0)
         share[n] = max(share[n], np.float32(visibility * resolution * resolution))
 
@@ -107,118 +81,6 @@ def raise_coverage(
 # without random probes.
 #
 # The background that a scene will be shown with is unknown, so it is random: |w|² is the mean over backgrounds.
-
-MOMENTS = 10
-"""Number of moments of each footprint in each tile."""
-
-
-@njit(nogil=True, error_model="numpy")
-def _begin_tile(records: np.ndarray, lists: TileLists, tile: int, frame: Blended, s: np.ndarray) -> None:
-    """Write T, the colour behind all Gaussians, and the transmittance to the background behind, of a tile's pixels.
-
-    What is behind the end of a pixel's list has about the colour of the next Gaussian, and hides the background.
-    """
-    x0, y0 = (tile % lists.columns) * 16, (tile // lists.columns) * 16
-    height, width = frame.transmittance.shape
-    background, begin, max_color = frame.background, lists.starts[tile], np.float32(2)
-    for p in range(256):
-        s[768 + p] = frame.transmittance[min(y0 + (p >> 4), height - 1), min(x0 + (p & 15), width - 1)]
-        s[1024 + p], s[1280 + p], s[1536 + p], s[1792 + p] = background[0], background[1], background[2], 1
-        if begin + frame.stops[tile, p] < lists.starts[tile + 1]:
-            n = lists.members[begin + frame.stops[tile, p]]
-            s[1024 + p] = min(records[n, 6], max_color)
-            s[1280 + p] = min(records[n, 7], max_color)
-            s[1536 + p] = min(records[n, 8], max_color)
-            s[1792 + p] = 0
-
-
-@njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
-def _moments(
-    s: np.ndarray,
-    span: np.uint16,
-    index: np.float32,
-    footprint: tuple[Place, tuple[np.float32, ...]],
-    limits: tuple[np.float32, np.float32],
-    variance: np.float32,
-    sums: np.ndarray,
-) -> None:
-    """Compute the moments of one footprint over a tile's pixels, and step in front of it."""
-    place, (opacity, red, green, blue) = footprint
-    zero, one = np.float32(0), np.float32(1)
-    max_color = np.float32(2)  # a display shows at most 1; brighter colours are limited to twice that
-    red, green, blue = min(red, max_color), min(green, max_color), min(blue, max_color)
-    top, bottom = _rows(span)
-    m0, m20, m11, m02, m40, m31, m22, m13, m04 = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    squared_weight = zero
-    for p in range(top, bottom):
-        drawn = index < s[p + np.uint64(512)]
-        u, v, full, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
-        t = s[p + np.uint64(768)] / (one - alpha)
-        s[p + np.uint64(768)] = t
-        dr = alpha * (red - s[p + np.uint64(1024)])
-        dg = alpha * (green - s[p + np.uint64(1280)])
-        db = alpha * (blue - s[p + np.uint64(1536)])
-        s[p + np.uint64(1024)] += dr
-        s[p + np.uint64(1280)] += dg
-        s[p + np.uint64(1536)] += db
-        weight = alpha * t
-        squared_weight += weight * weight
-        background_change = alpha * s[p + np.uint64(1792)]
-        s[p + np.uint64(1792)] -= background_change
-        g = t * t * (dr * dr + dg * dg + db * db + variance * (background_change * background_change))
-        m0 += g
-        g = g if full <= limits[1] else zero
-        uu, uv, vv = u * u, u * v, v * v
-        guu, gvv = g * uu, g * vv
-        m20 += guu
-        m11 += g * uv
-        m02 += gvv
-        m40 += guu * uu
-        m31 += guu * uv
-        m22 += guu * vv
-        m13 += gvv * uv
-        m04 += gvv * vv
-    sums[0], sums[1], sums[2], sums[3] = m0, m20, m11, m02
-    sums[4], sums[5], sums[6], sums[7], sums[8] = m40, m31, m22, m13, m04
-    sums[9] = squared_weight
-
-
-@compiled(
-    void(float32[:, ::1], TILE_LISTS, SLOTS, int64, int64, BLENDED, float64, float32[:, ::1]),
-    fastmath=_FAST,
-)
-def moments(
-    records: np.ndarray,
-    lists: TileLists,
-    slots: Slots,
-    first: int,
-    last: int,
-    frame: Blended,
-    spread: float,
-    sums: np.ndarray,
-) -> None:
-    """Compute moments of the members of tiles ``first`` to ``last`` (exclusive), ``(slots, 10)``.
-
-    These are sums over the tile's pixels of |w|² times 1, u², uv, v², u⁴, u³v, u²v², uv³, v⁴; and of (alpha T)².
-    ``spread`` is the standard deviation of each channel of the background. Pixels at which alpha is clamped to
-    ALPHA_MAX count in the first sum only, which is therefore the error of removing the Gaussian.
-    """
-    limits, variance = (frame.limits[0], frame.limits[1]), np.float32(3 * spread * spread)
-    # Per pixel: x, y, stop, T; R, G, B behind the Gaussian, and transmittance to the background behind it.
-    s, copies = np.empty(8 * 256, np.float32), np.empty((64, 9), np.float32)
-    _pixel_centres(s)
-    for tile in range(first, last):
-        x0, y0 = (tile % lists.columns) * 16, (tile // lists.columns) * 16
-        begin, last_stop = lists.starts[tile], _copy_stops(frame.stops, tile, s)
-        _begin_tile(records, lists, tile, frame, s)
-        for i in range(begin + last_stop, lists.starts[tile + 1]):
-            sums[slots.of[i - slots.begin], :] = np.float32(0)
-        for end in range(begin + last_stop, begin, -64):
-            start = max(begin, end - 64)
-            _copy_records(records, lists.members, start, end, copies)
-            for i in range(end - 1, start - 1, -1):
-                footprint, index = _footprint(copies, i - start, x0, y0), np.float32(i - begin)
-                _moments(s, lists.spans[i], index, footprint, limits, variance, sums[slots.of[i - slots.begin]])
 
 
 @_helper
@@ -314,26 +176,18 @@ def _write_basis(mean: Vector, eye: np.ndarray, own: int, basis: np.ndarray) -> 
         _harmonics(dx, dy, dz, own, basis)
 
 
-@compiled(void(GAUSSIANS, PROJECTION, int32[::1], SLOTS, float32[:, ::1], int64, int64, float64, SUMS))
+@compiled(void(FRAME, SLOTS, int64, int64, float32[:, ::1], float64, SUMS))
 def add_to_parameters(
-    gaussians: Gaussians,
-    projection: Projection,
-    visible: np.ndarray,
-    slots: Slots,
-    moments: np.ndarray,
-    first: int,
-    last: int,
-    weight: float,
-    out: Sums,
+    frame: Frame, slots: Slots, first: int, last: int, moments: np.ndarray, weight: float, out: Sums
 ) -> None:
     """Add the moments of some tiles of an image to those of the Gaussians of footprints ``slots.rows[first:last]``."""
-    dilation = projection.dilation
+    gaussians, projection, dilation = frame.gaussians, frame.projection, frame.projection.dilation
     pose, frustum = _pose(projection.viewmat), _frustum(projection)
     own, higher = out.harmonics.shape[1], out.higher_harmonics.shape[1]
     basis, m = np.zeros(own + higher, np.float64), np.empty(10, np.float64)
     for i in range(first, last):
         row = slots.rows[i]
-        n = visible[row]
+        n = frame.footprints.visible[row]
         m[:] = 0.0
         for slot in range(slots.first[row], slots.first[row + 1]):
             for c in range(10):
@@ -344,12 +198,7 @@ def add_to_parameters(
         for c in range(10):
             m[c] *= weight
 
-        mean = _load(gaussians.means, n)
-        x, y, z = _in_camera(pose, mean)
-        clamped_x, clamped_y = _clamped(x, y, frustum)
-        p, q = _image_rows(_jacobian(projection.K, clamped_x, clamped_y, z), pose[0])
-        _, _, R, s = _ellipsoid(gaussians, n)
-        w, v = _image_axes(p, q, R, s)
+        (x, y, z), _, _, (_, _, _, s), (w, v) = _in_image(gaussians, projection, pose, frustum, n)
         _add_shape(m, w, v, s, dilation, projection.antialiased, out.shape_moments, n)
 
         # Derivative of ln alpha by position: 2 (u, v) L dc, c being the centre.
@@ -361,7 +210,7 @@ def add_to_parameters(
 
         out.color_weight[n] += m[9]
         if own > 0:
-            _write_basis(mean, projection.eye, own, basis)
+            _write_basis(_load(gaussians.means, n), projection.eye, own, basis)
             for c in range(own):
                 out.harmonics[n, c] += m[9] * basis[c]
             for c in range(higher):

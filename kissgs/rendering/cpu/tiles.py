@@ -117,15 +117,21 @@ def _clamp(value: float, top: int) -> int:
 
 
 @njit(nogil=True, error_model="numpy")
+def _disc(records: np.ndarray, n: int) -> tuple[float, float, float, float, float, float]:
+    """Return a footprint's centre, l0, l1, l2 and largest u² + v²; float32 alphas may exceed exact ones by rounding."""
+    x, y = np.float64(records[n, 0]), np.float64(records[n, 1])
+    l0, l1, l2 = np.float64(records[n, 2]), np.float64(records[n, 3]), np.float64(records[n, 4])
+    return x, y, l0, l1, l2, np.float64(records[n, 9]) * 1.0001 + 1e-5
+
+
+@njit(nogil=True, error_model="numpy")
 def _columns(records: np.ndarray, n: int, row: int, columns: int) -> tuple[int, int]:
     """Return the first and last (exclusive) tile that footprint ``n`` touches in a row of tiles.
 
     The footprint is the disc u² + v² <= tau. In a row of tiles, v is in an interval; x = (u - k v) / l0 is largest at
     v = -k √tau / √(1 + k²) or at the interval's nearer end.
     """
-    centre_x, centre_y = np.float64(records[n, 0]), np.float64(records[n, 1])
-    l0, l1, l2 = np.float64(records[n, 2]), np.float64(records[n, 3]), np.float64(records[n, 4])
-    tau = np.float64(records[n, 9]) * 1.0001 + 1e-5  # float32 alphas may exceed the exact ones by rounding
+    centre_x, centre_y, l0, l1, l2, tau = _disc(records, n)
     radius = np.sqrt(tau)
     low = max((16 * row + 0.5 - centre_y) * l2, -radius)
     high = min((16 * row + 15.5 - centre_y) * l2, radius)
@@ -143,9 +149,8 @@ def _columns(records: np.ndarray, n: int, row: int, columns: int) -> tuple[int, 
 @njit(nogil=True, error_model="numpy")
 def _box(records: np.ndarray, n: int, columns: int, rows: int) -> tuple[int, int, int, int]:
     """Return the first and last (exclusive) column and row of tiles that footprint ``n`` touches."""
-    x, y = np.float64(records[n, 0]), np.float64(records[n, 1])
-    l0, l1, l2 = np.float64(records[n, 2]), np.float64(records[n, 3]), np.float64(records[n, 4])
-    width = np.sqrt((np.float64(records[n, 9]) * 1.0001 + 1e-5) * (l1 * l1 + l2 * l2)) / (l0 * l2)
+    x, y, l0, l1, l2, tau = _disc(records, n)
+    width = np.sqrt(tau * (l1 * l1 + l2 * l2)) / (l0 * l2)
     height = np.float64(records[n, 10]) * 1.0001 + 0.01
     return (
         _clamp(np.ceil((x - width - 15.51) / 16), columns),
@@ -161,10 +166,8 @@ def _span(records: np.ndarray, n: int, column: int, row: int) -> int:
 
     Within the tile's columns, the footprint is highest at its own highest point or at the nearer side of the tile.
     """
-    x = 16 * column - np.float64(records[n, 0])
-    y = 16 * row - np.float64(records[n, 1])
-    l0, l1, l2 = np.float64(records[n, 2]), np.float64(records[n, 3]), np.float64(records[n, 4])
-    tau = np.float64(records[n, 9]) * 1.0001 + 1e-5
+    centre_x, centre_y, l0, l1, l2, tau = _disc(records, n)
+    x, y = 16 * column - centre_x, 16 * row - centre_y
     reach = np.sqrt(tau) / l2
     top_offset = l1 * reach / l0
     a = l1 * l1 + l2 * l2

@@ -8,6 +8,7 @@ from helpers.looked_at import looked_at
 from helpers.whole_scenes import moved, two
 
 from kissgs import render, sample_scene
+from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.cameras.virtual.samples import close_ups, scattered_cameras
 from kissgs.rendering.sensitivity import local_scale
 
@@ -43,7 +44,7 @@ def test_images_are_alike_at_any_scale(draw, least, scale):
     assert shown[0] > least
 
 
-def test_distances_directions_and_fields_of_view():
+def test_distances_directions_and_fields_of_view_of_close_ups():
     """Distances are log-uniform from one local scale to eight, directions uniform, the field of view is 70 degrees."""
     scene = sample_scene(500)
     spacing = local_scale(scene)
@@ -88,3 +89,30 @@ def test_scenes_of_a_few_gaussians_and_of_one_place(draw):
         scene = sample_scene(count)
         for splats in (scene, replace(scene, means=np.zeros_like(scene.means))):
             assert len(draw(splats, side=8, count=6)) == 6
+
+
+def test_distances_and_directions_of_scattered_cameras():
+    """Log-uniform from 10 local scales or a radius to three radii; every third one stands beside another Gaussian."""
+    scene = sample_scene(2000)
+    spacing, radius = local_scale(scene), scene_bounds(scene).radius
+    cameras = scattered_cameras(scene, side=16, count=300)
+    assert len(cameras) == 300
+    shares = []
+    for n, (distance, target) in enumerate(looked_at(scene, cameras)):
+        nearest = min(10 * spacing[target], radius)
+        if n % 3:
+            shares.append(np.log(distance / nearest) / np.log(3 * radius / nearest))
+    assert np.min(shares) > -0.01
+    assert np.max(shares) < 1.01
+    assert 0.4 < np.mean(shares) < 0.6
+    across = [np.linalg.norm(scene.means - camera.position, axis=1) / spacing for camera in cameras[::3]]
+    assert max(ratio.min() for ratio in across) < 8.1
+    assert np.linalg.norm(np.mean([camera.viewmat[2, :3] for camera in cameras], axis=0)) < 0.2
+    assert {(camera.width, camera.height) for camera in cameras} == {(16, 16)}
+
+
+def test_objects_of_all_sizes_are_looked_at():
+    scene = two(1000, 1 / 50)
+    cameras = scattered_cameras(scene, side=32, count=90, seed=1)
+    small = [target >= len(scene) // 2 for _, target in looked_at(scene, cameras)]
+    assert 25 < sum(small) < 65, "both objects have equally many Gaussians"

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from helpers.hollow_scenes import box, surface
+from helpers.fewer_cameras import try_fewer
+from helpers.hollow_scenes import box
 
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.virtual.samples import FIELDS_OF_VIEW, random_poses
-from kissgs.core.errors import Cancelled, InvalidViewsError
-from kissgs.core.splats import Splats, clean
+from kissgs.core.splats import clean
 from kissgs.io.ply import read_ply
 from kissgs.rendering.rasterizer import render
 
@@ -15,6 +15,11 @@ from kissgs.rendering.rasterizer import render
 @pytest.fixture(scope="module")
 def tall_box():
     return box((0.5, 1.5, 0.3), 3000, 0.1)
+
+
+@pytest.fixture(autouse=True)
+def fewer(monkeypatch):
+    try_fewer(monkeypatch)
 
 
 def positions_of(views):
@@ -34,12 +39,9 @@ def test_views_are_split_named_square_and_of_several_fields_of_view(tall_box):
     assert (len(single.train), len(single.test)) == (1, 0)
 
 
-@pytest.mark.quick(0)
-def test_the_same_seed_gives_the_same_views_for_any_number_of_threads(tall_box):
-    one, same = (random_poses(tall_box, side=32, count=9, seed=3, threads=threads) for threads in (1, 3))
-    assert np.array_equal(positions_of(one), positions_of(same))
-    other = random_poses(tall_box, side=32, count=9, seed=4)
-    assert not set(map(tuple, positions_of(one))) & set(map(tuple, positions_of(other)))
+def test_another_seed_gives_other_views(tall_box):
+    one, other = (set(map(tuple, positions_of(random_poses(tall_box, side=32, count=9, seed=n)))) for n in (3, 4))
+    assert not one & other
 
 
 def test_an_object_is_seen_from_all_around_and_from_outside(tall_box):
@@ -76,37 +78,3 @@ def test_poses_of_photographs_are_among_them(shared_data):
     for view in load_views(shared_data / "fox").test:
         near = np.linalg.norm(positions - view.camera.position, axis=1) < 2.0  # the scene is about 6 across
         assert (directions[near] @ view.camera.viewmat[2, :3]).max() > np.cos(np.radians(20)), view.name
-
-
-@pytest.mark.parametrize(("count", "size", "log_scale", "opacity"), [(0, 1, 0, 0), (1, 1, 30, 3), (9, 1e6, -30, -13)])
-def test_any_scene_gets_views(count, size, log_scale, opacity):
-    points = np.random.default_rng(0).normal(0, size, (count, 3))
-    flat = surface(points, np.zeros(count, int), 1.0)
-    scene = Splats(
-        means=flat.means,
-        quats=flat.quats,
-        scales=np.full((count, 3), log_scale, np.float32),
-        opacities=np.full(count, opacity, np.float32),
-        sh0=flat.sh0,
-        shN=flat.shN,
-    )
-    views = random_poses(scene, side=24, count=9)
-    assert 2 <= len(views.all) <= 9
-    for view in views.all:
-        image, _ = render(scene, view.camera)
-        assert np.isfinite(image).all()
-
-
-@pytest.mark.parametrize("wrong", [{"count": 0, "side": 8}, {"count": 1, "side": 0}])
-def test_numbers_below_one_are_refused(tall_box, wrong):
-    with pytest.raises(InvalidViewsError, match="at least"):
-        random_poses(tall_box, **wrong)
-
-
-def test_the_work_can_be_stopped(tall_box):
-    def stop(stage, fraction):
-        assert stage == "cameras"
-        raise Cancelled("stopped")
-
-    with pytest.raises(Cancelled):
-        random_poses(tall_box, side=24, count=4, progress=stop)

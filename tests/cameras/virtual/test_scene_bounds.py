@@ -5,7 +5,7 @@ import pytest
 from helpers.hollow_scenes import box, surface
 
 from kissgs import sample_scene
-from kissgs.cameras.virtual.candidates import scene_bounds, weighted_quantile
+from kissgs.cameras.virtual.candidates import scene_bounds, weighted_median, weighted_quantiles
 from kissgs.core.splats import ATTRIBUTES, Splats
 
 
@@ -54,7 +54,6 @@ def test_the_up_direction_is_found_for_all_axis_conventions(table, matrix, up):
 
 def test_weighted_quantiles():
     values = np.array([3.0, 1.0, 2.0])
-    assert weighted_quantile(values, np.ones(3)) == 2
-    assert weighted_quantile(values, np.array([9.0, 1, 1])) == 3
-    assert weighted_quantile(values, np.ones(3), 0.99) == 3
-    assert weighted_quantile(values, np.ones(3), 0.01) == 1
+    assert weighted_median(values, np.ones(3)) == 2
+    assert weighted_median(values, np.array([9.0, 1, 1])) == 3
+    assert weighted_quantiles(values, np.ones(3), 0.99, 0.01) == [3, 1]

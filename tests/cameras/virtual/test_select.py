@@ -9,8 +9,7 @@ from kissgs import sample_scene
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.cameras.virtual.select import best_view, virtual_views
-from kissgs.core.errors import Cancelled, InvalidViewsError
-from kissgs.core.splats import Splats, clean
+from kissgs.core.splats import clean
 from kissgs.io.ply import read_ply
 from kissgs.rendering.rasterizer import render
 
@@ -39,13 +38,6 @@ def test_views_are_split_named_and_of_the_requested_size(table):
         assert view.camera.K[0, 0] == view.camera.K[1, 1] == pytest.approx(100 / np.tan(np.radians(30)))
         assert view.photo is None
     assert len({tuple(view.camera.viewmat.ravel()) for view in by_name(views)}) == 17
-
-
-@pytest.mark.usefixtures("fewer")
-def test_the_same_scene_gives_the_same_cameras_for_any_number_of_threads(table):
-    first, second = (virtual_views(table, count=8, threads=threads) for threads in (1, 3))
-    for one, other in zip(by_name(first), by_name(second), strict=True):
-        assert np.array_equal(one.camera.viewmat, other.camera.viewmat)
 
 
 @pytest.mark.usefixtures("fewer")
@@ -84,7 +76,7 @@ def test_an_object_in_portrait_images_is_not_taken_for_a_background():
     """The object fills narrow images, and once was treated as a scene with a background."""
     half = np.array([0.5, 1.5, 0.3])
     corners = np.array(np.meshgrid(*zip(-half, half, strict=True))).reshape(3, -1).T
-    view = best_view(box(half, 2000, 0.15), width=36, height=96, count=8)
+    view = best_view(box(half, 2000, 0.15), width=36, height=96)
     pixels = (corners @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]) @ view.camera.K.T
     pixels = pixels[:, :2] / pixels[:, 2:]
     assert ((pixels > 0) & (pixels < [36, 96])).all()
@@ -93,8 +85,8 @@ def test_an_object_in_portrait_images_is_not_taken_for_a_background():
 @pytest.mark.usefixtures("fewer")
 def test_the_best_view_is_one_of_all_views_and_not_a_close_up():
     tall_box = box((0.5, 1.5, 0.3), 2000, 0.15)
-    options = {"width": 60, "height": 40, "count": 12}
-    best, views = best_view(tall_box, **options), by_name(virtual_views(tall_box, **options))
+    best, views = (place(tall_box, width=60, height=40) for place in (best_view, virtual_views))
+    views = by_name(views)
     (same,) = [view for view in views if view.name == best.name]
     assert np.array_equal(best.camera.viewmat, same.camera.viewmat)
     assert np.array_equal(best.camera.K, same.camera.K)
@@ -112,6 +104,7 @@ def test_a_room_is_seen_from_inside():
         assert alpha.mean() > 0.9
 
 
+@pytest.mark.quick(0)
 def test_the_photographed_side_is_found(shared_data):
     """Behind the fox is a wall: no photograph was taken from there, so no virtual camera should be there."""
     splats, _ = clean(read_ply(shared_data / "fox" / "point_cloud.ply"))
@@ -122,6 +115,7 @@ def test_the_photographed_side_is_found(shared_data):
         assert nearest > np.cos(np.radians(50)), f"{view.name} looks {np.degrees(np.arccos(nearest)):.0f}° off"
 
 
+@pytest.mark.quick(0)
 @pytest.mark.usefixtures("fewer")
 def test_cameras_are_not_next_to_opaque_gaussians(shared_data):
     splats, _ = clean(read_ply(shared_data / "guitar" / "guitar.ply"))
@@ -130,58 +124,3 @@ def test_cameras_are_not_next_to_opaque_gaussians(shared_data):
     for view in by_name(virtual_views(splats)):
         nearest = np.linalg.norm(opaque - view.camera.position, axis=1).min()
         assert nearest > 0.2 * bounds.radius
-
-
-@pytest.mark.parametrize(
-    ("count", "size", "offset", "log_scale", "opacity"),
-    [
-        (0, 1, 0, 0, 0),
-        (1, 1, 0, -3, 3),
-        (1, 1, 1e6, -30, 13.8),
-        (2, 0, 0, -30, 0),
-        (7, 1e-6, 0, -15, 3),
-        (8, 1e6, 1e6, 10, 3),
-        (9, 1, 0, 30, 3),
-        (9, 1, 0, -3, -13.8),
-        (40, 1e-6, 1e6, -3, -5),
-    ],
-)
-def test_any_scene_gets_cameras(monkeypatch, count, size, offset, log_scale, opacity):
-    try_fewer(monkeypatch, azimuths=4, radii=(1.1,))
-    rng = np.random.default_rng(0)
-    splats = Splats(
-        means=(rng.normal(0, 1, (count, 3)) * size + offset).astype(np.float32),
-        quats=rng.normal(0, 1, (count, 4)).astype(np.float32),
-        scales=np.full((count, 3), log_scale, np.float32),
-        opacities=np.full(count, opacity, np.float32),
-        sh0=rng.normal(0, 1, (count, 3)).astype(np.float32),
-        shN=np.empty((count, 0, 3), np.float32),
-    )
-    views = virtual_views(splats, width=40, height=30, count=9)
-    assert len(by_name(views)) == 9
-    assert len(views.test) == 2
-    for view in by_name(views):
-        image, _ = render(splats, view.camera)
-        assert np.isfinite(image).all()
-
-
-@pytest.mark.parametrize("wrong", [{"count": 0}, {"width": 0}, {"height": -1}])
-def test_numbers_below_one_are_refused(wrong):
-    with pytest.raises(InvalidViewsError, match="at least 1 view"):
-        virtual_views(box((1, 1, 1), 10), **wrong)
-
-
-@pytest.mark.usefixtures("fewer")
-def test_progress_increases_to_one_and_can_stop_the_work(table):
-    events = []
-    virtual_views(table, count=4, progress=lambda stage, fraction: events.append((stage, fraction)))
-    assert {stage for stage, _ in events} == {"cameras"}
-    fractions = [fraction for _, fraction in events]
-    assert fractions == sorted(fractions)
-    assert fractions[-1] == 1
-
-    def stop(stage, fraction):
-        raise Cancelled("stopped")
-
-    with pytest.raises(Cancelled):
-        virtual_views(table, progress=stop)
