@@ -115,11 +115,11 @@ def _train(
     some, weights = data.take(members), data.weights[members]
     probabilities = weights.astype(np.float64) / weights.sum(dtype=np.float64)
     centroids = some[rng.choice(len(some), number, replace=False, p=probabilities)]
+    rows, totals, errors = np.arange(len(some)), np.empty(number), np.empty(number)
     for _ in range(iterations):
-        sums, totals = np.zeros(centroids.shape), np.zeros(number)
-        kernels.weighted_sums(some, weights, assign(some, centroids)[0].astype(np.int32), sums, totals)
-        filled = totals > 0
-        centroids[filled] = sums[filled] / totals[filled, None]
+        labels, distances = assign(some, centroids)
+        members, edges = sorted_by_label(labels.astype(np.int32), number)
+        kernels.means(some, rows, weights, distances, members, edges, 0, number, centroids, totals, errors)
     return centroids
 
 

@@ -97,15 +97,22 @@ def box_blur(image: Float32[np.ndarray, "H W C"], radius: int, pool: Workers) ->
     """Average squares of ``2*radius + 1`` cells, wrapping around horizontally and mirrored vertically."""
     from kissgs.planning import kernels
 
-    def work(first: int) -> np.ndarray:
-        part = np.ascontiguousarray(image[:, :, first : first + CHANNELS_PER_TASK])
-        rows, blurred = np.empty_like(part), np.empty_like(part)
-        kernels.box_blur_rows(part, radius, rows, np.empty((1, part.shape[2])))
-        kernels.box_blur_columns(rows, radius, blurred, np.empty((part.shape[1], part.shape[2])))
-        return blurred
+    height, width, channels = image.shape
+    wrapped = np.arange(-radius, width + radius + 1) % width
+    period = max(2 * (height - 1), 1)
+    mirrored = np.abs(np.arange(-radius, height + radius + 1)) % period
+    mirrored = np.minimum(mirrored, period - mirrored)
 
-    parts = pool.map(work, range(0, image.shape[2], CHANNELS_PER_TASK))
-    return np.concatenate(parts, axis=2)
+    def work(first: int) -> np.ndarray:
+        part = image[:, :, first : first + CHANNELS_PER_TASK]
+        for places in (wrapped, mirrored):
+            part = np.ascontiguousarray(part.transpose(1, 0, 2))
+            blurred = np.empty_like(part)
+            kernels.box_blur(part, places, blurred)
+            part = blurred
+        return part
+
+    return np.concatenate(pool.map(work, range(0, channels, CHANNELS_PER_TASK)), axis=2)
 
 
 # Arrange vectors on a square grid by their principal axes, so that neighbours are similar.

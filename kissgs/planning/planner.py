@@ -214,9 +214,9 @@ def plan_uniform(
     else:
         fields = {
             "means": quantize_means(selected(source.means, cells), bits=bits, pool=pool),
-            "opacities": _quantize(shapes.opacities, settings.opacity_step, settings, pool),
-            "scales": _quantize(shapes.scales, settings.scale_step, settings, pool),
-            "quaternions": _quantize(shapes.quats, settings.quat_step, settings, pool, paper_top=99),
+            "opacities": _quantize(shapes.field("opacities"), settings.opacity_step, settings, pool),
+            "scales": _quantize(shapes.field("scales"), settings.scale_step, settings, pool),
+            "quaternions": _quantize(shapes.field("quaternions"), settings.quat_step, settings, pool, paper_top=99),
             "f_dc": _quantize(selected(sh0, cells), settings.sh0_step, settings, pool),
         }
         errors = {name: half_steps(field) for name, field in fields.items()}
@@ -246,17 +246,20 @@ def _table_fields(
     Without ``shared_step_size``, every table has as many values as it may, and rotations have all their levels.
     """
     equal = np.ones(len(means))
-    steps = (settings.opacity_step, settings.scale_step, settings.quat_step, settings.sh0_step)
-    if not settings.shared_step_size:
-        steps = (FINEST, FINEST, FINEST, FINEST)
-    opacity, scale, rotation, color = (step * equal for step in steps)
+    steps = {
+        "opacities": settings.opacity_step,
+        "scales": settings.scale_step,
+        "quaternions": settings.quat_step,
+        "f_dc": settings.sh0_step,
+    }
+    each = {name: (step if settings.shared_step_size else FINEST) * equal for name, step in steps.items()}
     unit = log_extent(means) / MEANS_TOP
     wanted = rd_fields.stored_values(values, tables)
-    shapes = rd_fields.rounded_shapes(wanted, equal, (opacity, scale, rotation), tables)
+    shapes = rd_fields.rounded_shapes(wanted, equal, each, tables)
     fields = {
         **rd_fields.finished_shapes(shapes, values[:, 0], tables),
         "means": rd_fields.means_field(means, max(unit, 1e-30) * 2.0 ** (16 - bits)),
-        "f_dc": rd_fields.color_field(colors.astype(np.float64), color, equal),
+        "f_dc": rd_fields.color_field(colors.astype(np.float64), each["f_dc"], equal),
     }
     return fields, largest_errors(fields, values, means, colors)
 

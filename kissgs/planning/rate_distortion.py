@@ -216,11 +216,11 @@ def plan_rate_distortion(
     note = _pruning_note(pruned, costs)
     kept, costs = _without(pruned, kept, costs)
     del pruned
-    condense = container.tables is None and not keep_costs
-    if condense:
+    keeps = container.tables is not None or keep_costs
+    if not keeps:
         costs = costs.of_rounding()
-    criterion = RdCriterion(costs, costs.classes(settings.step_classes, selected(splats.means, kept)), rd_lambda)
-    criterion = criterion.condensed() if condense else criterion
+    classes = costs.classes(settings.step_classes, selected(splats.means, kept))
+    criterion = RdCriterion.of(costs, classes, rd_lambda, keep=keeps)
     del costs
     return_free_memory()
 
