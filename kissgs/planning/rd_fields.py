@@ -37,7 +37,7 @@ from kissgs.planning.quantize import (
     without_unused,
 )
 from kissgs.planning.rd_criterion import RdCriterion
-from kissgs.planning.rotation_forms import KEPT, PERMUTATIONS, StoredShapes
+from kissgs.planning.rotation_forms import KEPT, PERMUTATIONS, SHAPE_COLUMNS, StoredShapes
 from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook
 
 # RDO quantisation: levels of the smallest squared image error plus lambda · bits.
@@ -86,9 +86,6 @@ ROUNDS = 3
 CHUNK = 1 << 14
 """Gaussians per task."""
 
-SHAPE_FIELDS = ("opacities", "scales", "quaternions")
-"""Fields whose levels are chosen jointly."""
-
 
 def quantize_by_steps(
     values: Float[np.ndarray, "M C"] | Rows,
@@ -136,13 +133,13 @@ def rdo_quantize(
     from kissgs.planning import rdo_kernels
 
     classes = criterion.classes
-    levels = np.concatenate([parts[name].levels for name in SHAPE_FIELDS], axis=1)
+    levels = np.concatenate([parts[name].levels for name in SHAPE_COLUMNS], axis=1)
     omitted = parts["omitted"].levels[:, 0] if "omitted" in parts else None
     floor = np.array([criterion.least[name] for name in ("opacity", "scale", "rotation")])
 
     for _ in range(ROUNDS):
         rate_table = criterion.rd_lambda * level_bits(levels, classes, pool)
-        values_of_levels, ends = _values_of_levels([parts[name] for name in SHAPE_FIELDS])
+        values_of_levels, ends = _values_of_levels([parts[name] for name in SHAPE_COLUMNS])
         if tables is not None:
             ends[0] = tables.first_drawn, tables.last_drawn
 
@@ -178,7 +175,7 @@ def rdo_quantize(
             moved = refit_table(table, levels[:, 1:4], values[:][:, 1:4], criterion.costs.scale, bounds)
             parts = {**parts, "scales": replace(parts["scales"], table=moved.astype(np.float64)[:, None])}
     chosen = np.split(levels, [1, 4], axis=1)
-    found = {name: replace(parts[name], levels=own) for name, own in zip(SHAPE_FIELDS, chosen, strict=True)}
+    found = {name: replace(parts[name], levels=own) for name, own in zip(SHAPE_COLUMNS, chosen, strict=True)}
     return {**parts, **found}
 
 
@@ -351,7 +348,7 @@ class RdFields:
             for name, field in (("opacity", "opacities"), ("scale", "scales"), ("rotation", "quaternions"))
         }
         if tables is None or criterion.costs is None:
-            fields = {name: quantize_by_steps(values.field(name), steps[name], pool) for name in SHAPE_FIELDS}
+            fields = {name: quantize_by_steps(values.field(name), steps[name], pool) for name in SHAPE_COLUMNS}
         else:
             logits = values.field("opacities")[:][:, 0]
             wanted = stored_values(values[:], tables)

@@ -199,7 +199,7 @@ def pras_forms(
     side: int,
     pool: Workers,
     *,
-    decay: float = 0.95,
+    decay: float,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> UInt8[np.ndarray, " N"]:
     """Choose forms that make neighbours on the grid similar: the closest to 8-bit proxies, blurred less and less.

@@ -57,10 +57,9 @@ def test_the_gradient_is_finite_and_at_most_2(scales):
 
 def test_gradients_match_finite_differences():
     rng = np.random.default_rng(0)
-    for _ in range(50):
-        scales = torch.tensor([[rng.uniform(0, 1), rng.uniform(-5, -1), rng.uniform(-6, -1)]], dtype=torch.float64)
-        if float(erank_loss(scales)[0]) > 0:
-            assert torch.autograd.gradcheck(erank_loss, scales.requires_grad_(), eps=1e-6, atol=1e-6)
+    scales = torch.from_numpy(rng.uniform([0, -5, -6], [1, -1, -1], (50, 3))).requires_grad_()
+    clear = erank_loss(scales).detach() > 0
+    assert torch.autograd.gradcheck(erank_loss, scales[clear].detach().requires_grad_(), eps=1e-6, atol=1e-6)
 
 
 def test_needles_become_wider_and_balls_flatter():
