@@ -134,7 +134,7 @@ class Clustering:
             merged, split, partners, costs, gains, second, self.members, self.edges, self.labels, self.near
         )
 
-    def _arrays(self) -> tuple[np.ndarray, ...]:
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the vectors, their distances, and the members of each cluster, as kernels take them."""
         data = self.data
         return data.table, data.rows, data.weights, self.distances, self.members, self.edges

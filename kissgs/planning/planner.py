@@ -113,8 +113,12 @@ def refined_order(
         order[places] = chosen[_block_order(means[chosen], pixels[chosen])]
 
     for done in range(ROUNDS):
+
+        def report_done(fraction: float, done: int = done) -> None:
+            report((done + fraction) / ROUNDS)
+
         blocks = _blocks(ends, BLOCK if done % 2 == 0 else BLOCK // 2)
-        pool.map(refine, blocks, lambda fraction, done=done: report((done + fraction) / ROUNDS))
+        pool.map(refine, blocks, report_done)
     return _with_equal_positions_in_order(order, means)
 
 

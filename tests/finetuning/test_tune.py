@@ -151,7 +151,7 @@ def test_interrupted_work_resumes_to_the_same_bytes(tmp_path, monkeypatch, steps
     scene, path = cloud(150, 1), tmp_path / "c.npz"
     whole = tuned(scene, container)[0]
     with pytest.raises(Interrupted):
-        tuned(scene, container, checkpoint=path, progress=stopping_after(steps))
+        tuned(scene, container, checkpoint=path, progress=stopping_after(steps, "finetune"))
     assert path.exists() == (steps > 0)
     done = []
     again = tuned(scene, container, checkpoint=path, progress=lambda stage, fraction, note="": done.append(bool(note)))[
@@ -165,7 +165,7 @@ def test_a_checkpoint_of_other_work_is_rejected(tmp_path, monkeypatch):
     monkeypatch.setattr(Checkpoint, "due", True)
     path = tmp_path / "c.npz"
     with pytest.raises(Interrupted):
-        tuned(cloud(60), checkpoint=path, progress=stopping_after(3))
+        tuned(cloud(60), checkpoint=path, progress=stopping_after(3, "finetune"))
     for other in (
         partial(tuned, cloud(60), lr=0.03),
         partial(tuned, cloud(61)),
@@ -179,7 +179,7 @@ def test_a_checkpoint_belongs_to_one_sog_container_and_its_tables(tmp_path, monk
     monkeypatch.setattr(Checkpoint, "due", True)
     scene, path = cloud(60), tmp_path / "c.npz"
     with pytest.raises(Interrupted):
-        tuned(scene, "sog", checkpoint=path, progress=stopping_after(3))
+        tuned(scene, "sog", checkpoint=path, progress=stopping_after(3, "finetune"))
     plan, model = chosen(scene, "fast", MODELS["sog"], **COARSE), MODELS["sog"]
     scales = plan.fields["scales"]
     other = replace(plan, fields={**plan.fields, "scales": replace(scales, table=scales.table + 0.01)})
