@@ -460,10 +460,9 @@ def _move(
 @njit(nogil=True, error_model="numpy")
 def _rotate(order: np.ndarray, places: np.ndarray, first: int, middle: int, end: int) -> None:
     """Swap the part from ``first`` to before ``middle`` with the part from there to before ``end``."""
-    moved = np.concatenate((order[middle:end], order[first:middle]))
-    for k in range(len(moved)):
-        order[first + k] = moved[k]
-        places[moved[k]] = first + k
+    _reverse(order, places, first, middle - 1)
+    _reverse(order, places, middle, end - 1)
+    _reverse(order, places, first, end - 1)
 
 
 @compiled("void(uint8[:, ::1], int32[:, ::1], int32[:, ::1], int64, int32[::1])")
