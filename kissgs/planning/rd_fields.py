@@ -92,7 +92,7 @@ def quantize_by_steps(
     steps: Float64[np.ndarray, " M"] | Rows,
     pool: Workers | None = None,
 ) -> Quantized:
-    """Round to the nearest multiples of each Gaussian's own step, which is one of all channels."""
+    """Round to the nearest multiples of each Gaussian's own step, the same for all its channels."""
     smallest, largest = row_range(values, pool)
     low32 = smallest.astype(np.float32) + np.float32(0)
     low = low32.astype(np.float64)
@@ -350,7 +350,7 @@ class RdFields:
         if tables is None or criterion.costs is None:
             fields = {name: quantize_by_steps(values.field(name), steps[name], pool) for name in SHAPE_COLUMNS}
         else:
-            logits = values.field("opacities")[:][:, 0]
+            logits = values.field("opacities")[:][:, 0].astype(np.float64)
             wanted = stored_values(values[:], tables)
             fields = rounded_shapes(
                 wanted, criterion.costs.scale, {name: some[:] for name, some in steps.items()}, tables

@@ -11,7 +11,7 @@ from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, UInt8
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.planning.layout import box_blur
-from kissgs.planning.quantize import Computed, Planning, for_each_block
+from kissgs.planning.quantize import Computed, Planning, for_each_block, selected
 
 # Rotations as three components of a quaternion, a byte each; the fourth, not negative, follows from the length 1.
 
@@ -130,6 +130,8 @@ class StoredShapes:
 
     def field(self, name: str) -> Computed:
         """Return the columns of one of :data:`SHAPE_COLUMNS`."""
+        if name == "opacities":  # needs no rotations
+            return selected(self.splats.opacities[:, None], self.index)
         return Computed(len(self), lambda rows: self[rows][:, SHAPE_COLUMNS[name]])
 
 
