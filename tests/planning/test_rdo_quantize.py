@@ -52,6 +52,8 @@ def test_levels_of_a_class_are_multiples_of_its_step():
     rng = np.random.default_rng(0)
     values, classes = rng.normal(size=(3000, 3)), np.repeat([0, 1, 2], 1000)
     criterion = criterion_of(np.repeat([1.0, 0.1, 0.004], 1000), classes, 1e-4)
+    about_three_axes = np.array(criterion.steps["scale"]) / 3**0.5
+    np.testing.assert_allclose(criterion.steps["rotation"], about_three_axes)
     found = quantize_by_steps(values, criterion.each_step("scale", np.full(3000, 2.0)))
     each = (found.high.astype(float) - found.low) / found.top
     errors = np.abs(found.low + found.levels * each - values)
