@@ -2,5 +2,4 @@
 
 Gaussians are scored and pruned, and the remaining ones are trained to show the same images (POPSpa, KISS-GS 3.1); or
 neighbours are merged, without images.
-Takes and returns :class:`kissgs.Splats`; writes no files but checkpoints, and knows nothing of the encoder's plans.
 """

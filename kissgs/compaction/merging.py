@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
@@ -399,38 +398,29 @@ def merged_levels(splats: Splats, counts: Sequence[int], *, threads: int = 0) ->
         return levels
 
 
-@dataclass(slots=True, eq=False)
 class _Clusters:
     """The Gaussians that are left, each of which stands for one or more of the input.
 
     Neighbours have rows near each other, which processors read faster.
     """
 
-    source: Splats
-    pool: Workers
-    means: Float64[np.ndarray, "M 3"] = field(init=False)
-    covariances: Float64[np.ndarray, "M 6"] = field(init=False)  # xx, xy, xz, yy, yz, zz
-    alphas: Float64[np.ndarray, " M"] = field(init=False)
-    colors: Float32[np.ndarray, "M F"] = field(init=False)  # SH coefficients, those of sh0 first
-    errors: Float64[np.ndarray, " M"] = field(init=False)  # that merges have caused, see pair_errors
-    origin: Int32[np.ndarray, " M"] = field(init=False)  # the member with the largest weight
-    heaviest: Float64[np.ndarray, " M"] = field(init=False)  # its weight
-    merged: Bool[np.ndarray, " M"] = field(init=False)  # whether it stands for several
-
-    def __post_init__(self) -> None:
-        splats, count = self.source, len(self.source)
-        self.origin, _ = leaves_of(splats.means, SEARCH_LEAF)
-        self.means = splats.means[self.origin].astype(np.float64)
-        self.covariances = np.empty((count, 6))
-        quats, scales = splats.quats[self.origin], splats.scales[self.origin]
+    def __init__(self, source: Splats, pool: Workers) -> None:
+        count, self.source, self.pool = len(source), source, pool
+        self.origin: Int32[np.ndarray, " M"] = leaves_of(source.means, SEARCH_LEAF)[0]  # the heaviest member
+        self.means: Float64[np.ndarray, "M 3"] = source.means[self.origin].astype(np.float64)
+        self.covariances: Float64[np.ndarray, "M 6"] = np.empty((count, 6))  # xx, xy, xz, yy, yz, zz
+        quats, scales = source.quats[self.origin], source.scales[self.origin]
         self._each(count, lambda a, b: covariances_of(quats, scales, a, b, self.covariances))
-        self.alphas = 1 / (1 + np.exp(-splats.opacities[self.origin].astype(np.float64)))
-        self.colors = np.empty((count, 3 + 3 * splats.shN.shape[1]), np.float32)
-        self.colors[:, :3] = splats.sh0[self.origin]
+        self.alphas: Float64[np.ndarray, " M"] = 1 / (1 + np.exp(-source.opacities[self.origin].astype(np.float64)))
+        # SH coefficients, those of sh0 first
+        self.colors: Float32[np.ndarray, "M F"] = np.empty((count, 3 + 3 * source.shN.shape[1]), np.float32)
+        self.colors[:, :3] = source.sh0[self.origin]
         for a in range(0, count, BLOCK):
             rows = self.origin[a : a + BLOCK]
-            self.colors[a : a + BLOCK, 3:] = splats.shN[rows].reshape(len(rows), -1)
-        self.errors, self.heaviest, self.merged = np.zeros(count), np.zeros(count), np.zeros(count, bool)
+            self.colors[a : a + BLOCK, 3:] = source.shN[rows].reshape(len(rows), -1)
+        self.errors: Float64[np.ndarray, " M"] = np.zeros(count)  # that merges have caused, see pair_errors
+        self.heaviest: Float64[np.ndarray, " M"] = np.zeros(count)  # weight of the heaviest member
+        self.merged: Bool[np.ndarray, " M"] = np.zeros(count, bool)  # whether it stands for several
 
     def reduce(self, count: int) -> Iterator[int]:
         """Merge until ``count`` Gaussians are left; before each round, yield how many there are."""

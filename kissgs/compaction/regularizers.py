@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kissgs.core.array_types import Float
-from kissgs.training.loop import Parameters, TrainableScene
+from kissgs.training.loop import Parameters, Regularizer, TrainableScene
 
 # Regularization of the shapes of Gaussians during training: neither needles nor balls.
 
@@ -33,7 +33,7 @@ def erank_loss(scales: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
     return (-torch.log(torch.expm1(entropy) + EPSILON)).clamp_min(0)
 
 
-class ShapeRegularizer:
+class ShapeRegularizer(Regularizer):
     """Regularizer: weighted mean of :func:`erank_loss`, plus weighted mean of each Gaussian's smallest scale.
 
     The second term flattens Gaussians. It is in units of ``extent``, so that the loss does not depend on the size of
@@ -52,14 +52,11 @@ class ShapeRegularizer:
         loss = self._erank_weight * erank_loss(scales).mean()
         return loss + self._min_scale_weight * scales.amin(dim=1).exp().mean()
 
-    def update(self, step: int, scene: TrainableScene) -> None:
-        """Do nothing: the loss has no state."""
-
 
 # Sparsification of opacities by ADMM: opacities of the candidates for pruning are pulled to 0 during training.
 
 
-class AdmmSparsifier:
+class AdmmSparsifier(Regularizer):
     """Regularizer: minimise the loss subject to at most ``count`` opacities other than 0.
 
     Zhang et al., "GaussianSpa: An Optimizing-Sparsifying Simplification Framework for Compact and High-Quality 3D

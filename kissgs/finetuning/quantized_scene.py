@@ -16,8 +16,7 @@ from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.positions import signed_exp
 from kissgs.core.progress import Pace
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.finetuning import planes
-from kissgs.finetuning.planes import Plane, each_part, planes_of, sum_by_label
+from kissgs.finetuning.planes import Plane, each_part, level_bits, planes_of, sum_by_label
 from kissgs.planning import rotation_forms
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import Grid
@@ -27,7 +26,7 @@ from kissgs.planning.rd_fields import UNUSED_COUNT, decoded_quats
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.tensors import Parameters
-from kissgs.training.loop import TrainableScene
+from kissgs.training.loop import Regularizer
 from kissgs.training.model import PrunableAdam
 
 # The decoders' own functions for training: exact values forward, gradients backward.
@@ -329,119 +328,6 @@ class CodebookRate:
         return colors[:, 1:] - colors[:, :-1], colors[1:] - colors[:-1]
 
 
-ENTROPY_FIELDS = ("opacities", "scales", "quaternions", "f_dc")
-"""Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that.
-
-Entries of the SH codebook are added where they are a list, sorted by frequency: neighbours then predict nothing.
-In a square they predict each other (:class:`kissgs.finetuning.quantized_scene.CodebookRate`).
-"""
-
-RECOUNT_STEPS = 25
-"""Number of steps between two updates of the histograms and of the mean differences."""
-
-
-class RateLoss:
-    """Regularizer: estimated bits of all levels.
-
-    The bits are those of an ideal entropy code with one histogram per sensitivity class and channel. WebP's entropy
-    image comes near to it, and RDO quantisation uses it too (:mod:`kissgs.planning.rd_fields`). Between two levels,
-    bits are interpolated linearly, so that the gradient moves latents to the cheaper neighbouring level. Those of a
-    square SH codebook come from differences of neighbouring entries.
-    """
-
-    def __init__(self, scene: QuantizedScene, weight: float) -> None:
-        """Prepare the loss of ``scene``; ``weight`` is the weight of one bit."""
-        self._scene, self._weight = scene, weight
-        self._rates: dict[str, _LevelRate | CodebookRate] = {}
-        for name in ENTROPY_FIELDS:
-            plane = scene.planes[name]
-            self._rates[name] = _LevelRate(plane, scene.classes, np.arange(plane.base_multiples.shape[1]))
-        codebook = scene.planes["f_rest_centroids"]
-        if not scene.trained_tables:
-            self._rates["f_rest_centroids"] = CodebookRate(codebook)
-        else:
-            used = (codebook.min_latent < codebook.max_latent).any(dim=0).cpu().numpy()
-            # An image has one code per colour, for all coefficients; those that are not stored get one of their own.
-            colors = np.where(used, np.arange(len(used)) // COEFFICIENTS, 3)
-            self._rates["f_rest_centroids"] = _LevelRate(codebook, np.zeros(len(codebook.start), np.int64), colors)
-
-    def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
-        """Return the weighted bits of the current levels, but for a constant; ``parameters`` are not used."""
-        if self._weight == 0 or len(self._scene) == 0:
-            return None
-        latents = self._scene.latents
-        if step % RECOUNT_STEPS == 0:
-            for name, rate in self._rates.items():
-                rate.count(latents[name])
-        return self._weight * sum((rate.bits(latents[name]) for name, rate in self._rates.items()), torch.tensor(0.0))
-
-    def update(self, step: int, scene: TrainableScene) -> None:
-        """Do nothing: :meth:`penalty` updates what it needs."""
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Return the rate tables by field, see :meth:`restore`."""
-        return {f"{name}.bits": rate.table for name, rate in self._rates.items()}
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from a :meth:`state`."""
-        for name, rate in self._rates.items():
-            rate.table = state[f"{name}.bits"]
-
-
-PAPER_TV_WEIGHTS = {"opacities": 1e-4, "scales": 1e-4, "means": 1e-4, "f_dc": 1e-4, "quaternions": 1e-2}
-"""Weights of total variation by field (KISS-GS, appendix); for positions, of each of the two byte images."""
-
-TV_RAMP = (0.35, 0.6)
-"""Fractions of the steps between which these weights grow linearly from 0 (KISS-GS, appendix)."""
-
-
-class TotalVariationLoss:
-    """Regularizer: masked L1 total variation of the images, the paper's term for small files.
-
-    For each image it is the mean absolute difference of levels over all pairs of neighbouring cells that hold Gaussians
-    and over channels. The paper does not state the unit; here it is levels.
-    """
-
-    def __init__(self, scene: QuantizedScene, weight: float, pace: Pace) -> None:
-        """Prepare the loss."""
-        self._scene, self._weight, self._pace = scene, weight, pace
-        device = scene.latents["means"].device
-        self._one, self._other = (torch.from_numpy(side).to(device) for side in _neighbours(scene.grid))
-
-    def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
-        """Return the weighted total variation of the current levels; ``parameters`` are not used."""
-        begin, end = TV_RAMP
-        weight = self._weight * min(max((step / self._pace.steps - begin) / (end - begin), 0.0), 1.0)
-        if weight == 0 or len(self._one) == 0:
-            return None
-        total = torch.zeros((), dtype=torch.float64, device=self._one.device)
-        for name, factor in PAPER_TV_WEIGHTS.items():
-            levels = self._scene.planes[name].levels(self._scene.latents[name])
-            for image in _bytes(levels) if name == "means" else (levels,):
-                total = total + factor * (image[self._one] - image[self._other]).abs().mean()
-        return weight * total
-
-    def update(self, step: int, scene: TrainableScene) -> None:
-        """Do nothing: the loss has no state."""
-
-
-def _neighbours(grid: Grid) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
-    """Return all pairs of Gaussians in horizontally or vertically adjacent cells, each pair once."""
-    index = np.where(grid.mask, np.cumsum(grid.mask) - 1, -1).reshape(grid.side, grid.side)
-    horizontal = (index[:, :-1].reshape(-1), index[:, 1:].reshape(-1))
-    vertical = (index[:-1].reshape(-1), index[1:].reshape(-1))
-    one, other = (np.concatenate(ends) for ends in zip(horizontal, vertical, strict=True))
-    both = (one >= 0) & (other >= 0)
-    return one[both], other[both]
-
-
-def _bytes(levels: Float64[Tensor, "M 3"]) -> tuple[Float64[Tensor, "M 3"], Float64[Tensor, "M 3"]]:
-    """Split 16-bit levels into low and high bytes; the gradient of the high byte is that of a division by 256."""
-    high = levels / 256
-    high = high + (torch.floor(high) - high).detach()
-    return levels - 256 * high.detach(), high
-
-
 class _LevelRate:
     """Rate of the levels of one field."""
 
@@ -496,9 +382,9 @@ class _Bits(torch.autograd.Function):
         slopes = np.empty(tuple(latents.shape), np.float32)
 
         def part(first: int, last: int) -> float:
-            return float(planes.level_bits(start, found, codes, bits_of, symbols, first, last, slopes))
+            return float(level_bits(start, found, codes, bits_of, symbols, first, last, slopes))
 
-        bits = planes.each_part(part, len(slopes), torch.get_num_threads())
+        bits = each_part(part, len(slopes), torch.get_num_threads())
         ctx.save_for_backward(torch.from_numpy(slopes))
         return torch.tensor(math.fsum(bits), dtype=torch.float32)
 
@@ -507,3 +393,110 @@ class _Bits(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         (slopes,) = ctx.saved_tensors
         return torch.from_numpy(slopes.numpy() * upstream.numpy()), None, None, None, None
+
+
+ENTROPY_FIELDS = ("opacities", "scales", "quaternions", "f_dc")
+"""Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that.
+
+Entries of the SH codebook are added where they are a list, sorted by frequency: neighbours then predict nothing.
+In a square they predict each other (:class:`kissgs.finetuning.quantized_scene.CodebookRate`).
+"""
+
+RECOUNT_STEPS = 25
+"""Number of steps between two updates of the histograms and of the mean differences."""
+
+
+class RateLoss(Regularizer):
+    """Regularizer: estimated bits of all levels.
+
+    The bits are those of an ideal entropy code with one histogram per sensitivity class and channel. WebP's entropy
+    image comes near to it, and RDO quantisation uses it too (:mod:`kissgs.planning.rd_fields`). Between two levels,
+    bits are interpolated linearly, so that the gradient moves latents to the cheaper neighbouring level. Those of a
+    square SH codebook come from differences of neighbouring entries.
+    """
+
+    def __init__(self, scene: QuantizedScene, weight: float) -> None:
+        """Prepare the loss of ``scene``; ``weight`` is the weight of one bit."""
+        self._scene, self._weight = scene, weight
+        self._rates: dict[str, _LevelRate | CodebookRate] = {}
+        for name in ENTROPY_FIELDS:
+            plane = scene.planes[name]
+            self._rates[name] = _LevelRate(plane, scene.classes, np.arange(plane.base_multiples.shape[1]))
+        codebook = scene.planes["f_rest_centroids"]
+        if not scene.trained_tables:
+            self._rates["f_rest_centroids"] = CodebookRate(codebook)
+        else:
+            used = (codebook.min_latent < codebook.max_latent).any(dim=0).cpu().numpy()
+            # An image has one code per colour, for all coefficients; those that are not stored get one of their own.
+            colors = np.where(used, np.arange(len(used)) // COEFFICIENTS, 3)
+            self._rates["f_rest_centroids"] = _LevelRate(codebook, np.zeros(len(codebook.start), np.int64), colors)
+
+    def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
+        """Return the weighted bits of the current levels, but for a constant; ``parameters`` are not used."""
+        if self._weight == 0 or len(self._scene) == 0:
+            return None
+        latents = self._scene.latents
+        if step % RECOUNT_STEPS == 0:
+            for name, rate in self._rates.items():
+                rate.count(latents[name])
+        return self._weight * sum((rate.bits(latents[name]) for name, rate in self._rates.items()), torch.tensor(0.0))
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return the rate tables by field, see :meth:`restore`."""
+        return {f"{name}.bits": rate.table for name, rate in self._rates.items()}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from a :meth:`state`."""
+        for name, rate in self._rates.items():
+            rate.table = state[f"{name}.bits"]
+
+
+PAPER_TV_WEIGHTS = {"opacities": 1e-4, "scales": 1e-4, "means": 1e-4, "f_dc": 1e-4, "quaternions": 1e-2}
+"""Weights of total variation by field (KISS-GS, appendix); for positions, of each of the two byte images."""
+
+TV_RAMP = (0.35, 0.6)
+"""Fractions of the steps between which these weights grow linearly from 0 (KISS-GS, appendix)."""
+
+
+class TotalVariationLoss(Regularizer):
+    """Regularizer: masked L1 total variation of the images, the paper's term for small files.
+
+    For each image it is the mean absolute difference of levels over all pairs of neighbouring cells that hold Gaussians
+    and over channels. The paper does not state the unit; here it is levels.
+    """
+
+    def __init__(self, scene: QuantizedScene, weight: float, pace: Pace) -> None:
+        """Prepare the loss."""
+        self._scene, self._weight, self._pace = scene, weight, pace
+        device = scene.latents["means"].device
+        self._one, self._other = (torch.from_numpy(side).to(device) for side in _neighbours(scene.grid))
+
+    def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
+        """Return the weighted total variation of the current levels; ``parameters`` are not used."""
+        begin, end = TV_RAMP
+        weight = self._weight * min(max((step / self._pace.steps - begin) / (end - begin), 0.0), 1.0)
+        if weight == 0 or len(self._one) == 0:
+            return None
+        total = torch.zeros((), dtype=torch.float64, device=self._one.device)
+        for name, factor in PAPER_TV_WEIGHTS.items():
+            levels = self._scene.planes[name].levels(self._scene.latents[name])
+            for image in _bytes(levels) if name == "means" else (levels,):
+                total = total + factor * (image[self._one] - image[self._other]).abs().mean()
+        return weight * total
+
+
+def _neighbours(grid: Grid) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
+    """Return all pairs of Gaussians in horizontally or vertically adjacent cells, each pair once."""
+    index = np.where(grid.mask, np.cumsum(grid.mask) - 1, -1).reshape(grid.side, grid.side)
+    horizontal = (index[:, :-1].reshape(-1), index[:, 1:].reshape(-1))
+    vertical = (index[:-1].reshape(-1), index[1:].reshape(-1))
+    one, other = (np.concatenate(ends) for ends in zip(horizontal, vertical, strict=True))
+    both = (one >= 0) & (other >= 0)
+    return one[both], other[both]
+
+
+def _bytes(levels: Float64[Tensor, "M 3"]) -> tuple[Float64[Tensor, "M 3"], Float64[Tensor, "M 3"]]:
+    """Split 16-bit levels into low and high bytes; the gradient of the high byte is that of a division by 256."""
+    high = levels / 256
+    high = high + (torch.floor(high) - high).detach()
+    return levels - 256 * high.detach(), high

@@ -69,21 +69,10 @@ class Clustering:
         """Move every centroid to the weighted mean of its vectors; one without vectors stays."""
         from kissgs.planning import kmeans_kernels as kernels
 
-        data = self.data
         self.sort_members()
+        arrays = self._arrays()
         pool.map(
-            lambda part: kernels.means(
-                data.table,
-                data.rows,
-                data.weights,
-                self.distances,
-                self.members,
-                self.edges,
-                *part,
-                self.centroids,
-                self.totals,
-                self.errors,
-            ),
+            lambda part: kernels.means(*arrays, *part, self.centroids, self.totals, self.errors),
             self.parts(),
         )
 
@@ -126,7 +115,7 @@ class Clustering:
         """
         from kissgs.planning import kmeans_kernels as kernels
 
-        data, count = self.data, len(self.centroids)
+        arrays, count = self._arrays(), len(self.centroids)
         nearest = np.ascontiguousarray(self.near[:, :PARTNERS])
         partners, costs, gains = np.empty(count, np.int32), np.empty(count), np.zeros(count)
         second = np.zeros(len(self.labels), dtype=np.bool_)
@@ -136,21 +125,7 @@ class Clustering:
 
         def work(part: tuple[int, int]) -> None:
             kernels.merge_costs(self.centroids, self.totals, nearest, *part, partners, costs)
-            kernels.split_gains(
-                data.table,
-                data.rows,
-                data.weights,
-                self.distances,
-                self.members,
-                self.edges,
-                self.centroids,
-                self.totals,
-                self.errors,
-                least,
-                *part,
-                second,
-                gains,
-            )
+            kernels.split_gains(*arrays, self.centroids, self.totals, self.errors, least, *part, second, gains)
 
         pool.map(work, self.parts())
         merged = np.argsort(costs, kind="stable")[:most].astype(np.int32)
@@ -158,6 +133,11 @@ class Clustering:
         kernels.relocate(
             merged, split, partners, costs, gains, second, self.members, self.edges, self.labels, self.near
         )
+
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the vectors, their distances, and the members of each cluster, as kernels take them."""
+        data = self.data
+        return data.table, data.rows, data.weights, self.distances, self.members, self.edges
 
     def parts(self) -> list[tuple[int, int]]:
         """Return ranges of clusters with about equal numbers of vectors."""

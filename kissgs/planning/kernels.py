@@ -58,46 +58,18 @@ def hilbert_keys(cells: np.ndarray, keys: np.ndarray) -> None:
         keys[n] = key
 
 
-@compiled("void(float32[:, :, ::1], int64, float32[:, :, ::1], float64[:, ::1])")
-def box_blur_rows(image: np.ndarray, radius: int, out: np.ndarray, total: np.ndarray) -> None:
-    """Average 2*radius+1 columns of every row of ``(H, W, C)``, wrapping around; ``total`` is ``(1, C)`` scratch."""
+@compiled("void(float32[:, :, ::1], int64[::1], float32[:, :, ::1])")
+def box_blur(image: np.ndarray, places: np.ndarray, out: np.ndarray) -> None:
+    """Write the mean of the rows ``places[y:][:size]`` of ``(H, W, C)`` to row ``y``; there are ``H + size`` places."""
     height, width, channels = image.shape
-    scale = 1.0 / (2 * radius + 1)
-    for y in range(height):
-        for c in range(channels):
-            total[0, c] = 0.0
-        for x in range(-radius, radius + 1):
-            for c in range(channels):
-                total[0, c] += image[y, x % width, c]
-        for x in range(width):
-            enter = (x + radius + 1) % width
-            leave = (x - radius) % width
-            for c in range(channels):
-                out[y, x, c] = total[0, c] * scale
-                total[0, c] += np.float64(image[y, enter, c]) - np.float64(image[y, leave, c])
-
-
-@compiled("void(float32[:, :, ::1], int64, float32[:, :, ::1], float64[:, ::1])")
-def box_blur_columns(image: np.ndarray, radius: int, out: np.ndarray, total: np.ndarray) -> None:
-    """Average 2*radius+1 rows of every column of ``(H, W, C)``, mirrored at the borders without repeating the edge.
-
-    ``total`` is ``(W, C)`` scratch.
-    """
-    height, width, channels = image.shape
-    scale = 1.0 / (2 * radius + 1)
-    period = max(2 * (height - 1), 1)
-    total[:, :] = 0.0
-    for y in range(-radius, radius + 1):
-        source = abs(y) % period
-        source = min(source, period - source)
+    size = places.shape[0] - height
+    scale, total = 1.0 / size, np.zeros((width, channels))
+    for place in places[:size]:
         for x in range(width):
             for c in range(channels):
-                total[x, c] += image[source, x, c]
+                total[x, c] += image[place, x, c]
     for y in range(height):
-        enter = (y + radius + 1) % period
-        enter = min(enter, period - enter)
-        leave = abs(y - radius) % period
-        leave = min(leave, period - leave)
+        leave, enter = places[y], places[y + size]
         for x in range(width):
             for c in range(channels):
                 out[y, x, c] = total[x, c] * scale
@@ -235,18 +207,6 @@ def nearest_forms(
         forms[n] = chosen
 
 
-# Compiled inner loops of :mod:`kissgs.planning.rotation_forms`.
-
-
-@compiled("void(float32[:, ::1], float64[:, ::1])")
-def normalize(quats: np.ndarray, unit: np.ndarray) -> None:
-    """Write the quaternions ``(N, 4)``, divided by their lengths, to ``unit``."""
-    for n in range(quats.shape[0]):
-        w, x, y, z = np.float64(quats[n, 0]), np.float64(quats[n, 1]), np.float64(quats[n, 2]), np.float64(quats[n, 3])
-        length = np.sqrt(w * w + x * x + y * y + z * z)
-        unit[n, 0], unit[n, 1], unit[n, 2], unit[n, 3] = w / length, x / length, y / length, z / length
-
-
 @compiled("void(float64[:, ::1], float64[:, ::1], uint8[::1])")
 def largest_w(quats: np.ndarray, rotations: np.ndarray, forms: np.ndarray) -> None:
     """Write the form of largest w of each quaternion ``(N, 4)`` to ``forms``; among equals, the first of the table.
@@ -328,9 +288,6 @@ def covariance_error(quats: np.ndarray, scales: np.ndarray, new_quats: np.ndarra
     return np.sqrt(worst)
 
 
-# Compiled sorting of keys, for :mod:`kissgs.planning.layout`.
-
-
 @compiled("void(uint64[::1], int32[::1], uint64[::1], int32[::1], int64)")
 def sort_keys(
     keys: UInt64[np.ndarray, " N"],
@@ -365,7 +322,7 @@ def sort_keys(
             new[place] = old[n]
 
 
-# Compiled inner loops of :mod:`kissgs.planning.planner`: near pixels, and local search (2-opt, Or-opt).
+# Local search of the order (2-opt, Or-opt).
 
 
 @njit(nogil=True, error_model="numpy")
@@ -503,10 +460,9 @@ def _move(
 @njit(nogil=True, error_model="numpy")
 def _rotate(order: np.ndarray, places: np.ndarray, first: int, middle: int, end: int) -> None:
     """Swap the part from ``first`` to before ``middle`` with the part from there to before ``end``."""
-    moved = np.concatenate((order[middle:end], order[first:middle]))
-    for k in range(len(moved)):
-        order[first + k] = moved[k]
-        places[moved[k]] = first + k
+    _reverse(order, places, first, middle - 1)
+    _reverse(order, places, middle, end - 1)
+    _reverse(order, places, first, end - 1)
 
 
 @compiled("void(uint8[:, ::1], int32[:, ::1], int32[:, ::1], int64, int32[::1])")

@@ -12,6 +12,7 @@ from kissgs.core.array_types import Float32, Float64, Int, Int32, UInt16
 from kissgs.core.resources import Workers
 from kissgs.planning.clustering import BLOCK, Clustering, Vectors, sorted_by_label
 from kissgs.planning.quantize import clip_outliers, for_each_block
+from kissgs.settings import EncodeSettings
 
 if TYPE_CHECKING:
     from kissgs.planning.clustering import ShMetric
@@ -27,9 +28,9 @@ CANDIDATES = 4
 """Centroids of nearby cells among which the nearest ones are found, in multiples of the number to be found."""
 
 
-def start(data: Vectors, spread: float, size: int, options: KMeansOptions, pool: Workers) -> Clustering:
+def start(data: Vectors, spread: float, size: int, settings: EncodeSettings, pool: Workers) -> Clustering:
     """Return a hierarchical clustering: about K^(1/3) cells, each of them split likewise, and their centroids."""
-    rng = np.random.Generator(np.random.PCG64(options.seed))
+    rng = np.random.Generator(np.random.PCG64(settings.seed))
     dimensions = data.table.shape[1]
     labels = np.zeros(len(data.rows), dtype=np.int32)
     counts, errors = np.array([len(labels)]), np.array([len(labels) * dimensions * spread**2])
@@ -38,11 +39,11 @@ def start(data: Vectors, spread: float, size: int, options: KMeansOptions, pool:
         (round(size ** (2 / 3)), CELL_ITERATIONS),
         (size, START_ITERATIONS),
     ):
-        shares = allocate(errors, counts, max(number, len(counts)), dimensions * options.tolerance**2)
+        shares = allocate(errors, counts, max(number, len(counts)), dimensions * settings.sh_tolerance**2)
         centroids, labels, distances = _split(data, labels, shares, iterations, rng, pool)
         counts = np.bincount(labels, minlength=len(centroids))
         errors = np.bincount(labels, distances * data.weights, minlength=len(centroids))
-    near = near_centroids(centroids, np.concatenate([[0], np.cumsum(shares)]), options.neighbors, pool)
+    near = near_centroids(centroids, np.concatenate([[0], np.cumsum(shares)]), settings.sh_neighbors, pool)
     members, edges = sorted_by_label(labels, len(centroids))
     state = Clustering(data, centroids, labels, distances, near, members, edges, np.zeros(len(centroids)), errors)
     state.update(pool)
@@ -115,11 +116,11 @@ def _train(
     some, weights = data.take(members), data.weights[members]
     probabilities = weights.astype(np.float64) / weights.sum(dtype=np.float64)
     centroids = some[rng.choice(len(some), number, replace=False, p=probabilities)]
+    rows, totals, errors = np.arange(len(some)), np.empty(number), np.empty(number)
     for _ in range(iterations):
-        sums, totals = np.zeros(centroids.shape), np.zeros(number)
-        kernels.weighted_sums(some, weights, assign(some, centroids)[0].astype(np.int32), sums, totals)
-        filled = totals > 0
-        centroids[filled] = sums[filled] / totals[filled, None]
+        labels, distances = assign(some, centroids)
+        members, edges = sorted_by_label(labels.astype(np.int32), number)
+        kernels.means(some, rows, weights, distances, members, edges, 0, number, centroids, totals, errors)
     return centroids
 
 
@@ -182,20 +183,6 @@ OUTLIERS = 1e-3
 """Share of entries, at either end of a dimension, that may be clipped so that the step of the others stays small."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KMeansOptions:
-    """Options of :func:`fit`."""
-
-    seed: int
-    iterations: int  # iterations after the hierarchical start
-    neighbors: int  # number of centroids, the nearest to a vector's present one, that are compared in an iteration
-    tolerance: float  # root mean square error per dimension below which a cluster is not split further
-    lattice: float  # step that centroids are rounded to, in units of the codebook's root mean square error
-    # whether the lattice holds 0 in all dimensions, instead of each dimension's smallest value, and any number of its
-    # points may be used, instead of 255 per dimension
-    from_zero: bool = False
-
-
 @dataclass(frozen=True, slots=True)
 class Clusters:
     """Result of a clustering."""
@@ -210,13 +197,19 @@ def fit(
     rows: Int[np.ndarray, " N"],
     weights: Float32[np.ndarray, " N"],
     size: int,
+    settings: EncodeSettings,
     pool: Workers,
-    options: KMeansOptions,
     *,
+    lattice: float,
+    from_zero: bool = False,
     metric: ShMetric | None = None,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Clusters:
-    """Find at most ``size`` centroids of small weighted squared error."""
+    """Find at most ``size`` centroids of small weighted squared error.
+
+    They are rounded to steps of ``lattice`` times their root mean square error, 0 for none; see
+    :func:`_round_to_lattice` for ``from_zero``.
+    """
     # The kernels take contiguous, writeable arrays only, although they do not write to these.
     data = Vectors(
         np.require(table, requirements=("C", "W")),
@@ -224,17 +217,18 @@ def fit(
         np.require(weights, requirements=("C", "W")),
     )
     mean, spread = data.mean_and_rms(pool)
-    if spread <= options.tolerance:
+    if spread <= settings.sh_tolerance:
         return Clusters(mean[None], np.zeros(len(rows), dtype=np.int32), 0.0)
     if len(rows) <= size:
         unique, exact = np.unique(data.table[data.rows], axis=0, return_inverse=True)
-        step = _round_to_lattice(unique, 0.0, options) if options.lattice else 0.0
+        step = _round_to_lattice(unique, 0.0, settings.sh_tolerance, from_zero) if lattice else 0.0
         return Clusters(unique, exact.reshape(-1).astype(np.int32), step)
 
-    state = start(data, spread, size, options, pool)
+    state = start(data, spread, size, settings, pool)
     report(0.4)
-    all_iterations = options.iterations + (0 if metric is None else METRIC_ITERATIONS)
-    for iteration in range(options.iterations):
+    iterations = settings.sh_kmeans_iterations
+    all_iterations = iterations + (0 if metric is None else METRIC_ITERATIONS)
+    for iteration in range(iterations):
         if iteration:  # the start has just made the lists
             state.refresh_near(pool)
         state.relocate(pool)
@@ -243,34 +237,29 @@ def fit(
         state.update(pool)
         report(0.4 + 0.6 * (iteration + 1) / all_iterations)
     if metric is not None:
-        for iteration in range(options.iterations, all_iterations):
+        for iteration in range(iterations, all_iterations):
             state.refresh_near(pool)
             metric.reassign(state, pool)
             metric.move_centroids(state, pool)
             report(0.4 + 0.6 * (iteration + 1) / all_iterations)
-    step = _place_on_lattice(state, metric, options, pool) if options.lattice else 0.0
+    step = 0.0
+    if lattice:
+        step = lattice * _mean_square_error(state, metric, pool) ** 0.5
+        step = _round_to_lattice(state.centroids, step, settings.sh_tolerance, from_zero)
+        if metric is None:
+            state.reassign(pool)
+        else:
+            metric.reassign(state, pool)
     used = np.bincount(state.labels, minlength=len(state.centroids)) > 0
     compact = np.cumsum(used, dtype=np.int32) - np.int32(1)
     return Clusters(state.centroids[used], compact[state.labels], step)
 
 
-def _place_on_lattice(state: Clustering, metric: ShMetric | None, options: KMeansOptions, pool: Workers) -> float:
-    """Round the centroids to the lattice, assign the vectors anew, and return the step."""
-    if metric is None:
-        error = float(np.average(state.distances, weights=state.data.weights) / state.data.table.shape[1])
-    else:
-        error = _mean_square_error(state, pool)
-    step = _round_to_lattice(state.centroids, options.lattice * error**0.5, options)
-    if metric is None:
-        state.reassign(pool)
-    else:
-        metric.reassign(state, pool)
-    return step
-
-
-def _mean_square_error(state: Clustering, pool: Workers) -> float:
+def _mean_square_error(state: Clustering, metric: ShMetric | None, pool: Workers) -> float:
     """Return the weighted mean square distance of the vectors to their centroids, per dimension."""
     data = state.data
+    if metric is None:  # as they were last assigned
+        return float(np.average(state.distances, weights=data.weights) / data.table.shape[1])
 
     def squares(rows: slice) -> float:
         lost = data.table[data.rows[rows]] - state.centroids[state.labels[rows]]
@@ -280,11 +269,14 @@ def _mean_square_error(state: Clustering, pool: Workers) -> float:
     return float(total / data.weights.sum(dtype=np.float64) / data.table.shape[1])
 
 
-def _round_to_lattice(centroids: np.ndarray, step: float, options: KMeansOptions) -> float:
-    """Round in place to whole steps from each dimension's smallest value; a constant dimension keeps its value."""
-    tolerance, low = options.tolerance, np.zeros(centroids.shape[1])
+def _round_to_lattice(centroids: np.ndarray, step: float, tolerance: float, from_zero: bool) -> float:
+    """Round in place to multiples of the step that is returned, counted from 0 or from each dimension's smallest value.
+
+    In the latter case a constant dimension keeps its value, and there are at most 255 steps.
+    """
+    low = np.zeros(centroids.shape[1])
     step = max(step, 2 * tolerance)
-    if not options.from_zero:
+    if not from_zero:
         # An exact codebook, of few vectors, has no error that outliers could be compared with.
         if step > 2 * tolerance:
             centroids[:] = clip_outliers(centroids, step=step, share=OUTLIERS)

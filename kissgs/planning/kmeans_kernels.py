@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from kissgs.core.array_types import Bool, Float32, Float64, Int32, Int64, UInt16
 from kissgs.core.numba_kernels import compiled
+
+_FAST = {"contract", "nnan", "ninf", "nsz", "reassoc"}
 
 
 @compiled("void(int32[::1], int64[::1], int32[::1])")
@@ -20,19 +23,6 @@ def sort_by_label(
         label = labels[n]
         members[edges[label]] = n
         edges[label] += 1
-
-
-@compiled("void(float32[:, ::1], float32[::1], int32[::1], float64[:, ::1], float64[::1])")
-def weighted_sums(
-    vectors: np.ndarray, weights: np.ndarray, labels: np.ndarray, sums: np.ndarray, totals: np.ndarray
-) -> None:
-    """Add ``weights[n] * vectors[n]`` to ``sums[labels[n]]`` and ``weights[n]`` to ``totals[labels[n]]``."""
-    for n in range(vectors.shape[0]):
-        label = labels[n]
-        weight = np.float64(weights[n])
-        totals[label] += weight
-        for c in range(vectors.shape[1]):
-            sums[label, c] += weight * vectors[n, c]
 
 
 @compiled(
@@ -76,7 +66,7 @@ def means(
 
 @compiled(
     "void(float32[:, ::1], uint16[:, ::1], int64, int64, int64, uint16[:, ::1])",
-    fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
+    fastmath=_FAST,
 )
 def find_near(
     centroids: Float32[np.ndarray, "K D"],
@@ -119,10 +109,36 @@ def find_near(
                 found[k, at] = c
 
 
+@njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
+def _lowest(vector: np.ndarray, columns: np.ndarray, norms: np.ndarray, scores: np.ndarray) -> tuple[int, float]:
+    """Return the first column of the smallest score, its scalar product with a vector plus its norm, and the score.
+
+    The loops over columns are what the compiler turns into vector code.
+    """
+    dimensions, count = columns.shape
+    thirds = dimensions - dimensions % 3
+    for j in range(count):
+        scores[j] = norms[j]
+    for d in range(0, thirds, 3):  # three at a time: each score is loaded and stored less often
+        x0, x1, x2 = vector[d], vector[d + 1], vector[d + 2]
+        for j in range(count):
+            scores[j] += x0 * columns[d, j] + x1 * columns[d + 1, j] + x2 * columns[d + 2, j]
+    for d in range(thirds, dimensions):
+        for j in range(count):
+            scores[j] += vector[d] * columns[d, j]
+    lowest = scores[0]
+    for j in range(1, count):
+        lowest = min(lowest, scores[j])
+    best = 0
+    while scores[best] > lowest:
+        best += 1
+    return best, lowest
+
+
 @compiled(
     "void(float32[:, ::1], int64[::1], int32[::1], int64[::1], float32[:, ::1], uint16[:, ::1], int64, int64, "
     "int32[::1], float32[::1])",
-    fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
+    fastmath=_FAST,
 )
 def assign_near(
     table: Float32[np.ndarray, "R D"],
@@ -137,55 +153,34 @@ def assign_near(
     distances: Float32[np.ndarray, " N"],  # receives the squared distances
 ) -> None:
     """Assign the vectors of the clusters ``first`` to ``last`` to the nearest of their cluster's near centroids."""
-    dimensions = table.shape[1]
-    thirds = dimensions - dimensions % 3
-    count = near.shape[1]
-    # The near centroids times -2, one a column: the loops over them are what the compiler turns into vector code.
-    columns = np.empty((dimensions, count), dtype=np.float32)
+    dimensions, count = table.shape[1], near.shape[1]
+    columns = np.empty((dimensions, count), dtype=np.float32)  # the near centroids times -2
     norms = np.empty(count, dtype=np.float32)
     scores = np.empty(count, dtype=np.float32)
     for k in range(first, last):
         if edges[k] == edges[k + 1]:
             continue
         for j in range(count):
-            c = near[k, j]
             norm = np.float32(0)
             for d in range(dimensions):
-                x = centroids[c, d]
+                x = centroids[near[k, j], d]
                 norm += x * x
                 columns[d, j] = np.float32(-2) * x
             norms[j] = norm
         for i in range(edges[k], edges[k + 1]):
             n = members[i]
-            row = rows[n]
-            for j in range(count):
-                scores[j] = norms[j]
-            for d in range(0, thirds, 3):  # three at a time: each score is loaded and stored less often
-                x0 = table[row, d]
-                x1 = table[row, d + 1]
-                x2 = table[row, d + 2]
-                for j in range(count):
-                    scores[j] += x0 * columns[d, j] + x1 * columns[d + 1, j] + x2 * columns[d + 2, j]
-            for d in range(thirds, dimensions):
-                x0 = table[row, d]
-                for j in range(count):
-                    scores[j] += x0 * columns[d, j]
-            lowest = scores[0]
-            for j in range(1, count):
-                lowest = min(lowest, scores[j])
-            best = 0
-            while scores[best] > lowest:
-                best += 1
+            vector = table[rows[n]]
+            best, lowest = _lowest(vector, columns, norms, scores)
             norm = np.float32(0)
             for d in range(dimensions):
-                norm += table[row, d] * table[row, d]
+                norm += vector[d] * vector[d]
             labels[n] = near[k, best]
             distances[n] = max(lowest + norm, np.float32(0))
 
 
 @compiled(
     "void(float32[:, ::1], int32[::1], int64[::1], float32[:, ::1], uint16[:, ::1], int64, int32[::1])",
-    fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
+    fastmath=_FAST,
 )
 def assign_by_form(
     vectors: Float32[np.ndarray, "n P+D"],  # upper triangle of the form of each, row by row, and the form times it
@@ -200,45 +195,27 @@ def assign_by_form(
 
     The form of a difference x - c is that of c less twice the product of c with the form times x, and a constant.
     """
-    dimensions = centroids.shape[1]
-    coefficients = dimensions // 3
-    width = vectors.shape[1]
-    triangle = width - dimensions
-    count = near.shape[1]
-    columns = np.empty((width, count), dtype=np.float32)
-    scores = np.empty(count, dtype=np.float32)
+    dimensions, count = centroids.shape[1], near.shape[1]
+    triangle = vectors.shape[1] - dimensions
+    columns = np.empty((vectors.shape[1], count), dtype=np.float32)
+    norms, scores = np.zeros(count, dtype=np.float32), np.empty(count, dtype=np.float32)
     for cluster in range(edges.shape[0] - 1):
         if edges[cluster] == edges[cluster + 1]:
             continue
         for j in range(count):
             c = near[first + cluster, j]
             at = 0
-            for a in range(coefficients):
-                for b in range(a, coefficients):
+            for a in range(0, dimensions, 3):
+                for b in range(a, dimensions, 3):
                     product = np.float32(0)
                     for channel in range(3):
-                        product += centroids[c, 3 * a + channel] * centroids[c, 3 * b + channel]
+                        product += centroids[c, a + channel] * centroids[c, b + channel]
                     columns[at, j] = product if a == b else np.float32(2) * product
                     at += 1
             for d in range(dimensions):
                 columns[triangle + d, j] = np.float32(-2) * centroids[c, d]
         for i in range(edges[cluster], edges[cluster + 1]):
-            scores[:] = np.float32(0)
-            for d in range(0, width - width % 3, 3):  # three at a time, as in assign_near
-                x0 = vectors[i, d]
-                x1 = vectors[i, d + 1]
-                x2 = vectors[i, d + 2]
-                for j in range(count):
-                    scores[j] += x0 * columns[d, j] + x1 * columns[d + 1, j] + x2 * columns[d + 2, j]
-            for d in range(width - width % 3, width):
-                x0 = vectors[i, d]
-                for j in range(count):
-                    scores[j] += x0 * columns[d, j]
-            best = 0
-            for j in range(1, count):
-                if scores[j] < scores[best]:
-                    best = j
-            labels[members[i]] = near[first + cluster, best]
+            labels[members[i]] = near[first + cluster, _lowest(vectors[i], columns, norms, scores)[0]]
 
 
 @compiled("void(float32[:, ::1], float64[::1], uint16[:, ::1], int64, int64, int32[::1], float64[::1])")
@@ -377,10 +354,10 @@ def relocate(
         for i in range(edges[source], edges[source + 1]):
             if second[members[i]]:
                 labels[members[i]] = moved
-        row[:] = near[source]
         near[moved, 0] = moved
         filled = 1
         for j in range(count):
+            row[j] = near[source, j]  # copying a slice would compile for seconds
             if filled < count and row[j] != moved:
                 near[moved, filled] = row[j]
                 filled += 1

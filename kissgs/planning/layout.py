@@ -28,6 +28,8 @@ from kissgs.settings import EncodeSettings
 MIN_BLOCK = 8
 MIN_CONFIGURATIONS = 4
 CHANNELS_PER_TASK = 4
+CONVERGED = 1e-4
+"""Share of its squared distance by which a pass must reduce a block's, or be its last."""
 
 
 def plas(
@@ -35,8 +37,7 @@ def plas(
     pool: Workers,
     *,
     seed: int,
-    decay: float = 0.95,
-    threshold: float = 1e-4,
+    decay: float,
     start_radius: int | None = None,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Int32[np.ndarray, " cells"]:
@@ -52,7 +53,7 @@ def plas(
         size = max(min(width + 1, side) // 2 * 2, MIN_BLOCK)
         configuration = 0
         while True:
-            gained = _improve(items, placed, target, side, size, rng, threshold, pool)
+            gained = _improve(items, placed, target, side, size, rng, pool)
             configuration += 1
             if configuration >= MIN_CONFIGURATIONS and gained <= 0:
                 break
@@ -75,7 +76,6 @@ def _improve(
     side: int,
     size: int,
     rng: np.random.Generator,
-    threshold: float,
     pool: Workers,
 ) -> float:
     """Sort every block of one randomly shifted tiling to convergence; modify ``placed``, return the improvement."""
@@ -88,7 +88,7 @@ def _improve(
 
     def work(task: int) -> float:
         tiling = np.array([side, down, right, size, edges[task], edges[task + 1]], dtype=np.int64)
-        return float(kernels.plas_blocks(items, placed, target, tiling, seed, threshold))
+        return float(kernels.plas_blocks(items, placed, target, tiling, seed, CONVERGED))
 
     return sum(pool.map(work, range(len(edges) - 1)))
 
@@ -97,15 +97,22 @@ def box_blur(image: Float32[np.ndarray, "H W C"], radius: int, pool: Workers) ->
     """Average squares of ``2*radius + 1`` cells, wrapping around horizontally and mirrored vertically."""
     from kissgs.planning import kernels
 
-    def work(first: int) -> np.ndarray:
-        part = np.ascontiguousarray(image[:, :, first : first + CHANNELS_PER_TASK])
-        rows, blurred = np.empty_like(part), np.empty_like(part)
-        kernels.box_blur_rows(part, radius, rows, np.empty((1, part.shape[2])))
-        kernels.box_blur_columns(rows, radius, blurred, np.empty((part.shape[1], part.shape[2])))
-        return blurred
+    height, width, channels = image.shape
+    wrapped = np.arange(-radius, width + radius + 1) % width
+    period = max(2 * (height - 1), 1)
+    mirrored = np.abs(np.arange(-radius, height + radius + 1)) % period
+    mirrored = np.minimum(mirrored, period - mirrored)
 
-    parts = pool.map(work, range(0, image.shape[2], CHANNELS_PER_TASK))
-    return np.concatenate(parts, axis=2)
+    def work(first: int) -> np.ndarray:
+        part = image[:, :, first : first + CHANNELS_PER_TASK]
+        for places in (wrapped, mirrored):
+            part = np.ascontiguousarray(part.transpose(1, 0, 2))
+            blurred = np.empty_like(part)
+            kernels.box_blur(part, places, blurred)
+            part = blurred
+        return part
+
+    return np.concatenate(pool.map(work, range(0, channels, CHANNELS_PER_TASK)), axis=2)
 
 
 # Arrange vectors on a square grid by their principal axes, so that neighbours are similar.

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -38,7 +37,7 @@ from kissgs.planning.quantize import (
 )
 from kissgs.planning.rate_distortion import ColorRefit, plan_rate_distortion
 from kissgs.planning.rd_fields import OUTLIERS, largest_errors
-from kissgs.planning.rotation_forms import choose_forms
+from kissgs.planning.rotation_forms import SHAPE_COLUMNS, choose_forms
 from kissgs.planning.sh_codebook import FEW, fit_codebook, size_weights
 from kissgs.settings import EncodeSettings
 
@@ -114,14 +113,13 @@ def refined_order(
         order[places] = chosen[_block_order(means[chosen], pixels[chosen])]
 
     for done in range(ROUNDS):
+
+        def report_done(fraction: float, done: int = done) -> None:
+            report((done + fraction) / ROUNDS)
+
         blocks = _blocks(ends, BLOCK if done % 2 == 0 else BLOCK // 2)
-        pool.map(refine, blocks, partial(_report_round, report, done))
+        pool.map(refine, blocks, report_done)
     return _with_equal_positions_in_order(order, means)
-
-
-def _report_round(report: Callable[[float], None], done: int, fraction: float) -> None:
-    """Report a fraction of a round, after so many rounds."""
-    report((done + fraction) / ROUNDS)
 
 
 def _pixels(means: UInt16[np.ndarray, "M 3"], colors: UInt8[np.ndarray, "M 3"]) -> UInt8[np.ndarray, "M 6"]:
@@ -186,6 +184,9 @@ def _with_equal_positions_in_order(
 FINEST = 1e-4
 """Step of values that may take all levels of a table."""
 
+PAPER_TOPS = {"opacities": 255, "scales": 255, "quaternions": 99, "f_dc": 255}
+"""Largest level of each field in the paper, in every channel."""
+
 
 def plan_uniform(
     splats: Splats, kept: Int[np.ndarray, " M"], planning: Planning, groups: UInt16[np.ndarray, " N"] | None = None
@@ -208,17 +209,24 @@ def plan_uniform(
     size = max(len(chosen) / settings.gaussians_per_codebook_entry, FEW)
     codebook = fit_codebook(source, chosen, weights, size, planning)
     return_free_memory()
+    steps = {
+        "opacities": settings.opacity_step,
+        "scales": settings.scale_step,
+        "quaternions": settings.quat_step,
+        "f_dc": settings.sh0_step,
+    }
     if container.tables is not None:
+        if not settings.shared_step_size:
+            steps = dict.fromkeys(steps, FINEST)
         means, colors = source.means[cells], source.sh0[cells]
-        fields, errors = _table_fields(means, colors, shapes[:], bits, settings, container.tables)
+        fields, errors = _table_fields(means, colors, shapes[:], bits, steps, container.tables)
     else:
-        fields = {
-            "means": quantize_means(selected(source.means, cells), bits=bits, pool=pool),
-            "opacities": _quantize(shapes.opacities, settings.opacity_step, settings, pool),
-            "scales": _quantize(shapes.scales, settings.scale_step, settings, pool),
-            "quaternions": _quantize(shapes.quats, settings.quat_step, settings, pool, paper_top=99),
-            "f_dc": _quantize(selected(sh0, cells), settings.sh0_step, settings, pool),
-        }
+        rows: dict[str, Rows] = {name: shapes.field(name) for name in SHAPE_COLUMNS}
+        rows["f_dc"] = selected(sh0, cells)
+        fields = {"means": quantize_means(selected(source.means, cells), bits=bits, pool=pool)}
+        for name, step in steps.items():
+            top = 255 if settings.shared_step_size else PAPER_TOPS[name]
+            fields[name] = quantize(rows[name], step=step, shared=settings.shared_step_size, max_top=top, pool=pool)
         errors = {name: half_steps(field) for name, field in fields.items()}
         errors["means"] = half_steps(fields["means"], 1 << (16 - bits))
     return EncodingPlan(
@@ -238,25 +246,19 @@ def _table_fields(
     colors: Float32[np.ndarray, "cells 3"],
     values: Float64[np.ndarray, "cells 8"],
     bits: int,
-    settings: EncodeSettings,
+    steps: Mapping[str, float],
     tables: ByteTables,
 ) -> tuple[dict[str, Quantized], dict[str, list[float]]]:
-    """Return the levels by field, and the largest errors, for a container with tables.
-
-    Without ``shared_step_size``, every table has as many values as it may, and rotations have all their levels.
-    """
+    """Return the levels by field, and the largest errors, for a container with tables."""
     equal = np.ones(len(means))
-    steps = (settings.opacity_step, settings.scale_step, settings.quat_step, settings.sh0_step)
-    if not settings.shared_step_size:
-        steps = (FINEST, FINEST, FINEST, FINEST)
-    opacity, scale, rotation, color = (step * equal for step in steps)
+    each = {name: step * equal for name, step in steps.items()}
     unit = log_extent(means) / MEANS_TOP
     wanted = rd_fields.stored_values(values, tables)
-    shapes = rd_fields.rounded_shapes(wanted, equal, (opacity, scale, rotation), tables)
+    shapes = rd_fields.rounded_shapes(wanted, equal, each, tables)
     fields = {
         **rd_fields.finished_shapes(shapes, values[:, 0], tables),
         "means": rd_fields.means_field(means, max(unit, 1e-30) * 2.0 ** (16 - bits)),
-        "f_dc": rd_fields.color_field(colors.astype(np.float64), color, equal),
+        "f_dc": rd_fields.color_field(colors.astype(np.float64), each["f_dc"], equal),
     }
     return fields, largest_errors(fields, values, means, colors)
 
@@ -271,12 +273,6 @@ def _neutral(sh_degree: int) -> Splats:
         sh0=np.zeros((1, 3), np.float32),
         shN=np.zeros((1, SH_REST_COUNTS[sh_degree], 3), np.float32),
     )
-
-
-def _quantize(values: Rows, step: float, settings: EncodeSettings, pool: Workers, *, paper_top: int = 255) -> Quantized:
-    if settings.shared_step_size:
-        return quantize(values, step=step, pool=pool)
-    return quantize(values, step=step, shared=False, max_top=paper_top, pool=pool)
 
 
 INVISIBLE_LOGIT = -5.5373

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float32, Int, Int32, UInt16
+from kissgs.core.array_types import Bool, Float32, Int, UInt16
 from kissgs.core.positions import signed_log
 from kissgs.core.resources import Workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
@@ -59,21 +60,45 @@ REFIT_GAIN = 0.17
 """PSNR gain per iteration of the colour refit, decibels: below the measured mean, so that it holds for most scenes."""
 
 
-def choose_lambda(
-    usual: float,
-    costs: Costs,
-    sh_model: CodebookErrorModel,
-    settings: EncodeSettings,
-    view_uncertainty: float,
-    refits: int,
-) -> tuple[float, float]:
-    """Return the lambda of the settings, and that of the default quality."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorModel:
+    """Estimate of the mean squared error of a scene by lambda."""
+
+    costs: Costs
+    sh_model: CodebookErrorModel
+    prune_bits: float  # largest number of bits that the removal of a Gaussian may cost
+    ratio: float  # smallest number of Gaussians per codebook entry
+    view_uncertainty: float
+
+    def error_at(self, rd_lambda: float) -> float:
+        """Estimate the mean squared error of the scene planned with ``rd_lambda``."""
+        costs, count = self.costs, len(self.costs.color)
+        pruned = costs.removal[costs.pruned_by_rd(rd_lambda, self.prune_bits)]
+        rounding = GROWTH * DIMENSIONS * (count - len(pruned)) * rd_lambda / (2 * np.log(2))
+        other_views = 10 ** (OTHER_VIEWS_DB * self.view_uncertainty / 10)
+        uncompensated = SH_UNCOMPENSATED + SH_UNCOMPENSATED_GROWTH * self.view_uncertainty
+        sh_error = self.sh_model.error(max(self.sh_model.best_size(rd_lambda, count, self.ratio), 1))
+        return float(other_views * (rounding + GROWTH * pruned.sum()) + uncompensated * sh_error)
+
+    def lambda_for(self, error: float) -> float:
+        """Return the lambda at which the mean squared error is about ``error``, or 1.1 times the smallest possible one.
+
+        At any lambda, the error of the largest codebook remains.
+        """
+        low, high = np.log(1e-22), np.log(1e-2)
+        error = max(error, MIN_ERROR_RATIO * self.error_at(1e-22))
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            small = self.error_at(float(np.exp(middle))) < error
+            low, high = (middle, high) if small else (low, middle)
+        return float(np.exp(low))
+
+
+def choose_lambda(usual: float, model: ErrorModel, settings: EncodeSettings, refits: int) -> tuple[float, float]:
+    """Return the lambda of the settings, and that of the default quality, whose error is ``usual``."""
 
     def for_error(error: float, quality_offset_db: float) -> float:
-        """Return the lambda at which the squared error is about ``quality_offset_db`` decibels below ``error``."""
-        error *= 10 ** (-(quality_offset_db - REFIT_GAIN * refits) / 10)
-        bits, ratio = prune_threshold(settings, view_uncertainty), settings.gaussians_per_codebook_entry
-        return lambda_for(error, costs, sh_model, bits, ratio, view_uncertainty)
+        return model.lambda_for(error * 10 ** (-(quality_offset_db - REFIT_GAIN * refits) / 10))
 
     default_lambda = for_error(usual, 0.0)
     if settings.rd_lambda is not None:
@@ -81,11 +106,6 @@ def choose_lambda(
     if settings.psnr is not None:
         return for_error(10 ** (-settings.psnr / 10), 0.0), default_lambda
     return for_error(usual, settings.quality_offset_db), default_lambda
-
-
-def prune_threshold(settings: EncodeSettings, view_uncertainty: float) -> float:
-    """Return the largest number of bits that the removal of a Gaussian may cost."""
-    return settings.prune_threshold_bits * (1 - view_uncertainty)
 
 
 def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_model: CodebookErrorModel) -> float:
@@ -137,46 +157,6 @@ def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs,
     return total + PAPER_SH_GROWTH * sh_model.unweighted * (sh_model.entries / entries) ** SH_SHRINK
 
 
-def error_at(
-    rd_lambda: float,
-    costs: Costs,
-    sh_model: CodebookErrorModel,
-    threshold_bits: float,
-    ratio: float,
-    view_uncertainty: float,
-) -> float:
-    """Estimate the mean squared error of a scene that is planned with ``rd_lambda``."""
-    count = len(costs.color)
-    pruned = costs.removal[costs.pruned_by_rd(rd_lambda, threshold_bits)]
-    rounding = GROWTH * DIMENSIONS * (count - len(pruned)) * rd_lambda / (2 * np.log(2))
-    other_views = 10 ** (OTHER_VIEWS_DB * view_uncertainty / 10)
-    uncompensated = SH_UNCOMPENSATED + SH_UNCOMPENSATED_GROWTH * view_uncertainty
-    sh_error = sh_model.error(max(sh_model.best_size(rd_lambda, count, ratio), 1))
-    return float(other_views * (rounding + GROWTH * pruned.sum()) + uncompensated * sh_error)
-
-
-def lambda_for(
-    error: float,
-    costs: Costs,
-    sh_model: CodebookErrorModel,
-    threshold_bits: float,
-    ratio: float,
-    view_uncertainty: float,
-) -> float:
-    """Return the lambda at which the mean squared error is about ``error``.
-
-    The error aimed at is at least 1.1 times the smallest possible one: at any lambda, the error of the largest codebook
-    remains.
-    """
-    low, high = np.log(1e-22), np.log(1e-2)
-    error = max(error, MIN_ERROR_RATIO * error_at(1e-22, costs, sh_model, threshold_bits, ratio, view_uncertainty))
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        small = error_at(float(np.exp(middle)), costs, sh_model, threshold_bits, ratio, view_uncertainty) < error
-        low, high = (middle, high) if small else (low, middle)
-    return float(np.exp(low))
-
-
 def implied_lambda(error: float, count: int) -> float:
     """Return the lambda for which ``error`` is the expected mean squared error of rounding ``count`` Gaussians."""
     return 2 * float(np.log(2)) * error / (GROWTH * DIMENSIONS * max(count, 1))
@@ -206,21 +186,28 @@ def plan_rate_distortion(
     planning.report("rate_distortion")
     scene = PlannedScene(len(splats), len(kept), splats.sh_degree, splats.origin, splats.antialiased)
     uncertainty = sensitivity.view_uncertainty
-    costs = _costs_of(splats, kept, sensitivity, pool)
+    costs = Costs.of(sensitivity, splats, pool)
+    return_free_memory()
+    costs = costs.keep(kept) if len(kept) < len(splats) else costs
     sh_model = codebook_error_model(splats, kept, sensitivity, settings, pool)
     refits = settings.color_refit_iterations if recolor is not None else 0
+    prune_bits = settings.prune_threshold_bits * (1 - uncertainty)
+    model = ErrorModel(costs, sh_model, prune_bits, settings.gaussians_per_codebook_entry, uncertainty)
     usual = default_error(costs, splats, kept, sh_model)
-    rd_lambda, default_lambda = choose_lambda(usual, costs, sh_model, settings, uncertainty, refits)
+    rd_lambda, default_lambda = choose_lambda(usual, model, settings, refits)
     slack = max(1.0, float(np.sqrt(rd_lambda / default_lambda)))
-    pruned = costs.pruned_by_rd(rd_lambda, prune_threshold(settings, uncertainty), default_lambda)
+    pruned = costs.pruned_by_rd(rd_lambda, prune_bits, default_lambda)
     note = _pruning_note(pruned, costs)
-    kept, costs = _without(pruned, kept, costs)
-    del pruned
-    condense = container.tables is None and not keep_costs
-    if condense:
+    if pruned.any():
+        remaining = np.flatnonzero(~pruned).astype(np.int32)
+        kept, costs = kept.take(remaining), costs.keep(remaining)
+        del remaining
+    del pruned, model
+    keeps = container.tables is not None or keep_costs
+    if not keeps:
         costs = costs.of_rounding()
-    criterion = RdCriterion(costs, costs.classes(settings.step_classes, selected(splats.means, kept)), rd_lambda)
-    criterion = criterion.condensed() if condense else criterion
+    classes = costs.classes(settings.step_classes, selected(splats.means, kept))
+    criterion = RdCriterion.of(costs, classes, rd_lambda, keep=keeps)
     del costs
     return_free_memory()
 
@@ -228,10 +215,8 @@ def plan_rate_distortion(
     grid = layout_grid(splats.means, kept, 16, settings, pool, report, criterion.classes, groups)
     grid = grid.with_padding_last() if container.padding_last else grid
     order = grid.cells[grid.mask]
-    rank = _ranks(order, kept, len(splats))
+    criterion = criterion.take(_ranks(order, kept, len(splats)))
     del kept
-    criterion = criterion.take(rank)
-    del rank
     return_free_memory()
 
     shapes, form_error = choose_forms(splats, grid.cells, grid.side, planning)
@@ -266,24 +251,7 @@ def plan_rate_distortion(
     )
 
 
-def _costs_of(splats: Splats, kept: Int[np.ndarray, " M"], sensitivity: Sensitivity, pool: Workers) -> Costs:
-    """Return the costs of the Gaussians ``kept``."""
-    costs = Costs.of(sensitivity, splats, pool)
-    return_free_memory()
-    return costs.keep(kept) if len(kept) < len(splats) else costs
-
-
-def _without(
-    pruned: Bool[np.ndarray, " M"], kept: Int[np.ndarray, " M"], costs: Costs
-) -> tuple[Int[np.ndarray, " k"], Costs]:
-    """Return the remaining Gaussians and their costs, in the memory of ``costs``."""
-    if not pruned.any():
-        return kept, costs
-    remaining = np.flatnonzero(~pruned).astype(np.int32)
-    return kept.take(remaining), costs.keep(remaining)
-
-
-def _ranks(order: Int[np.ndarray, " M"], kept: Int[np.ndarray, " M"], count: int) -> Int32[np.ndarray, " M"]:
+def _ranks(order: Int[np.ndarray, " M"], kept: Int[np.ndarray, " M"], count: int) -> Int[np.ndarray, " M"]:
     """Return the place in ``kept`` of each Gaussian of ``order``; the scene has ``count`` Gaussians."""
     place = np.empty(count, np.int32)
     place[kept] = np.arange(len(kept), dtype=np.int32)

@@ -12,7 +12,7 @@ from kissgs.core.array_types import Bool, Float32, Float64, Int, Integer, UInt8,
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import Splats
-from kissgs.planning.quantize import Rows, for_each_block, sorted_order
+from kissgs.planning.quantize import Computed, Rows, for_each_block, sorted_order
 
 FLOOR = 1e-3
 """Smallest sensitivity, in units of the median, so that Gaussians that no camera saw keep a bounded error."""
@@ -178,31 +178,31 @@ def step(cost: float, rd_lambda: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RdCriterion:
-    """Costs, sensitivity classes and lambda, by which the levels of Gaussians are chosen."""
+    """Steps, sensitivity classes and lambda, by which the levels of Gaussians are chosen."""
 
-    costs: Costs
-    classes: Integer[np.ndarray, " M"]  # sensitivity class of each, from 0; no class is empty
     rd_lambda: float
-    steps: Mapping[str, list[float]] | None = None  # optimal step of each class for the attributes of ``costs``
+    classes: Integer[np.ndarray, " M"]  # sensitivity class of each, from 0; no class is empty
+    steps: Mapping[str, list[float]]  # optimal step of each class, by attribute
+    least: Mapping[str, float]  # smallest cost, by attribute
+    costs: Costs | None  # None where nothing needs them any more
 
-    def condensed(self) -> RdCriterion:
-        """Return the steps and only the smallest costs, for what needs no more."""
-        steps = {name: self.steps_of(name) for name in ROUNDED}
-        least = {name: np.array([getattr(self.costs, name).min(initial=np.inf)]) for name in Costs.__slots__}
-        return RdCriterion(Costs(**least), self.classes, self.rd_lambda, steps)
+    @classmethod
+    def of(cls, costs: Costs, classes: Integer[np.ndarray, " M"], rd_lambda: float, *, keep: bool) -> RdCriterion:
+        """Return the criterion of these costs, with or without the costs themselves."""
+        steps, least = {}, {}
+        for name in ROUNDED:
+            cost, channels = getattr(costs, name), 3 if name == "rotation" else 1  # an error about each of three axes
+            means = ((channels * cost[classes == c]).mean() for c in range(int(classes.max()) + 1))
+            steps[name] = [step(float(mean), rd_lambda) for mean in means]
+            least[name] = float(cost.min())
+        return cls(rd_lambda, classes, steps, least, costs if keep else None)
 
     def take(self, order: Int[np.ndarray, " M"]) -> RdCriterion:
         """Return the criterion with the Gaussians in another order."""
-        costs = self.costs.take(order) if self.steps is None else self.costs
+        costs = None if self.costs is None else self.costs.take(order)
         return replace(self, costs=costs, classes=self.classes.take(order))
 
-    def steps_of(self, name: str) -> list[float]:
-        """Return the optimal step of each class for an attribute; a rotation has an error about each of three axes."""
-        if self.steps is not None:
-            return self.steps[name]
-        return self.class_steps(getattr(self.costs, name), 3 if name == "rotation" else 1)
-
-    def class_steps(self, cost: Float64[np.ndarray, " M"], channels: int = 1) -> list[float]:
-        """Return the optimal step of each class for ``channels`` times the mean of ``cost``, error per squared unit."""
-        number = int(self.classes.max()) + 1
-        return [step(float((channels * cost[self.classes == c]).mean()), self.rd_lambda) for c in range(number)]
+    def each_step(self, name: str, coarsest: Float64[np.ndarray, " M"] | Rows) -> Computed:
+        """Return the step of an attribute of each Gaussian: the best one of its class, at most ``coarsest``."""
+        best = np.array(self.steps[name])
+        return Computed(len(self.classes), lambda rows: np.minimum(best[self.classes[rows]], coarsest[rows]))

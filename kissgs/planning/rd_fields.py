@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from math import ceil
@@ -37,7 +37,7 @@ from kissgs.planning.quantize import (
     without_unused,
 )
 from kissgs.planning.rd_criterion import RdCriterion
-from kissgs.planning.rotation_forms import KEPT, PERMUTATIONS, StoredShapes
+from kissgs.planning.rotation_forms import KEPT, PERMUTATIONS, SHAPE_COLUMNS, StoredShapes
 from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook
 
 # RDO quantisation: levels of the smallest squared image error plus lambda · bits.
@@ -86,38 +86,26 @@ ROUNDS = 3
 CHUNK = 1 << 14
 """Gaussians per task."""
 
-SHAPE_FIELDS = ("opacities", "scales", "quaternions")
-"""Fields whose levels are chosen jointly."""
 
-
-def quantize_by_class(
+def quantize_by_steps(
     values: Float[np.ndarray, "M C"] | Rows,
-    optimal: Sequence[float],
-    classes: Integer[np.ndarray, " M"],
-    coarsest: Float64[np.ndarray, " M"] | Rows,
+    steps: Float64[np.ndarray, " M"] | Rows,
     pool: Workers | None = None,
 ) -> Quantized:
-    """Round to the nearest of the levels that each sensitivity class uses: multiples of one step for all channels.
-
-    ``optimal`` is the best step of each class; no step is above ``coarsest`` of the Gaussian.
-    """
+    """Round to the nearest multiples of each Gaussian's own step, the same for all its channels."""
     smallest, largest = row_range(values, pool)
     low32 = smallest.astype(np.float32) + np.float32(0)
     low = low32.astype(np.float64)
     extent = largest.astype(np.float64) - low
     widest = float(extent.max(initial=0))
-    count, best = len(values), np.array(optimal)
-
-    def steps(rows: slice) -> Float64[np.ndarray, " n"]:
-        return np.minimum(best[classes[rows]], coarsest[rows])
-
-    least = min(for_each_block(count, lambda rows: float(steps(rows).min()), pool))
+    count = len(values)
+    least = min(for_each_block(count, lambda rows: float(steps[rows].min()), pool))
     finest = max(least, widest / 255, 1e-30)
     top = int(min(max(ceil(widest / finest - 1e-3), 1), 255))
     levels, stride = np.empty((count, len(low)), np.uint8), np.empty(count, np.uint8)
 
     def round_to_levels(rows: slice) -> None:
-        spacing = np.clip(np.rint(steps(rows) / finest), 1, 255)
+        spacing = np.clip(np.rint(steps[rows] / finest), 1, 255)
         multiples = spacing[:, None]
         found = np.rint((values[rows] - low) / finest / multiples) * multiples
         found = np.where(found > top, np.floor(top / multiples) * multiples, found)
@@ -144,14 +132,14 @@ def rdo_quantize(
     """
     from kissgs.planning import rdo_kernels
 
-    costs, classes = criterion.costs, criterion.classes
-    levels = np.concatenate([parts[name].levels for name in SHAPE_FIELDS], axis=1)
+    classes = criterion.classes
+    levels = np.concatenate([parts[name].levels for name in SHAPE_COLUMNS], axis=1)
     omitted = parts["omitted"].levels[:, 0] if "omitted" in parts else None
-    floor = np.array([float(cost.min(initial=np.inf)) for cost in (costs.opacity, costs.scale, costs.rotation)])
+    floor = np.array([criterion.least[name] for name in ("opacity", "scale", "rotation")])
 
     for _ in range(ROUNDS):
         rate_table = criterion.rd_lambda * level_bits(levels, classes, pool)
-        values_of_levels, ends = _values_of_levels([parts[name] for name in SHAPE_FIELDS])
+        values_of_levels, ends = _values_of_levels([parts[name] for name in SHAPE_COLUMNS])
         if tables is not None:
             ends[0] = tables.first_drawn, tables.last_drawn
 
@@ -181,13 +169,13 @@ def rdo_quantize(
             levels[rows] = chosen
 
         for_each_block(len(levels), choose, pool, block=CHUNK)
-        if tables is not None:
+        if criterion.costs is not None and tables is not None:
             bounds = largest["scales"][:], largest["growth"][:]
             table = parts["scales"].table[:, 0].astype(np.float32)
-            moved = refit_table(table, levels[:, 1:4], values[:][:, 1:4], costs.scale, bounds)
+            moved = refit_table(table, levels[:, 1:4], values[:][:, 1:4], criterion.costs.scale, bounds)
             parts = {**parts, "scales": replace(parts["scales"], table=moved.astype(np.float64)[:, None])}
     chosen = np.split(levels, [1, 4], axis=1)
-    found = {name: replace(parts[name], levels=own) for name, own in zip(SHAPE_FIELDS, chosen, strict=True)}
+    found = {name: replace(parts[name], levels=own) for name, own in zip(SHAPE_COLUMNS, chosen, strict=True)}
     return {**parts, **found}
 
 
@@ -249,7 +237,7 @@ def stored_values(values: Float64[np.ndarray, "M 8"], tables: ByteTables) -> Flo
 def rounded_shapes(
     values: Float64[np.ndarray, "M 8"],
     weights: Float64[np.ndarray, " M"],
-    steps: tuple[Float64[np.ndarray, " M"], Float64[np.ndarray, " M"], Float64[np.ndarray, " M"]],
+    steps: Mapping[str, Float64[np.ndarray, " M"]],
     tables: ByteTables,
 ) -> dict[str, Quantized]:
     """Round opacity, log-scales and quaternion of :func:`stored_values` to steps of each Gaussian's own.
@@ -257,9 +245,9 @@ def rounded_shapes(
     ``weights`` are squared image errors per squared unit of the log-scales.
     """
     quats = values[:, 4:]
-    opacities = nearest_levels(tables.opacity_logits, _on_lattice(values[:, :1], steps[0]))
-    finest = float(steps[1].min())
-    scales = _on_lattice(values[:, 1:4], np.clip(np.rint(steps[1] / finest), 1, 255) * finest)
+    opacities = nearest_levels(tables.opacity_logits, _on_lattice(values[:, :1], steps["opacities"]))
+    finest = float(steps["scales"].min())
+    scales = _on_lattice(values[:, 1:4], np.clip(np.rint(steps["scales"] / finest), 1, 255) * finest)
     scale_table = fit_table(scales.ravel(), np.repeat(weights, 3), finest)
     omitted = rotation_forms.omitted_components(quats)
     small = rotation_forms.stored_components(quats, omitted)
@@ -269,7 +257,8 @@ def rounded_shapes(
         ),
         "scales": Quantized(nearest_levels(scale_table, scales), scale_table.astype(np.float64)[:, None]),
         "quaternions": Quantized(
-            rotation_forms.lattice_levels(small, rotation_forms.strides(steps[2])), rotation_forms.TABLE[:, None]
+            rotation_forms.lattice_levels(small, rotation_forms.strides(steps["quaternions"])),
+            rotation_forms.TABLE[:, None],
         ),
         "omitted": Quantized(omitted[:, None], np.arange(4.0)[:, None]),
     }
@@ -285,13 +274,6 @@ def finished_shapes(
     scales = fields["scales"]
     used = without_unused(scales.table[:, 0].astype(np.float32), scales.levels)
     return {**fields, "opacities": replace(fields["opacities"], levels=opacities), "scales": table_field(*used)}
-
-
-def criterion_steps(
-    name: str, criterion: RdCriterion, coarsest: Float64[np.ndarray, " M"]
-) -> Float64[np.ndarray, " M"]:
-    """Return the step of each Gaussian's attribute: the best one of its class, at most ``coarsest``."""
-    return np.minimum(np.array(criterion.steps_of(name))[criterion.classes], coarsest)
 
 
 def color_field(
@@ -359,31 +341,22 @@ class RdFields:
 
     def shapes(self, values: StoredShapes, hessians: Rows) -> dict[str, Quantized]:
         """Quantise opacity, log-scales and rotation."""
-        criterion, largest, tables = self.criterion, self.largest, self.planning.container.tables
+        criterion, tables, pool = self.criterion, self.planning.container.tables, self.planning.pool
         wanted: StoredShapes | Float64[np.ndarray, "M 8"] = values
-        if tables is None:
-            fields = {
-                field: quantize_by_class(
-                    rows, criterion.steps_of(name), criterion.classes, largest[field], self.planning.pool
-                )
-                for rows, name, field in (
-                    (values.opacities, "opacity", "opacities"),
-                    (values.scales, "scale", "scales"),
-                    (values.quats, "rotation", "quaternions"),
-                )
-            }
+        steps = {
+            field: criterion.each_step(name, self.largest[field])
+            for name, field in (("opacity", "opacities"), ("scale", "scales"), ("rotation", "quaternions"))
+        }
+        if tables is None or criterion.costs is None:
+            fields = {name: quantize_by_steps(values.field(name), steps[name], pool) for name in SHAPE_COLUMNS}
         else:
-            logits = values.opacities[:][:, 0].astype(np.float64)
+            logits = values.field("opacities")[:][:, 0].astype(np.float64)
             wanted = stored_values(values[:], tables)
-            opacity, scale, rotation = (
-                criterion_steps(name, criterion, largest[field][:])
-                for name, field in (("opacity", "opacities"), ("scale", "scales"), ("rotation", "quaternions"))
+            fields = rounded_shapes(
+                wanted, criterion.costs.scale, {name: some[:] for name, some in steps.items()}, tables
             )
-            fields = rounded_shapes(wanted, criterion.costs.scale, (opacity, scale, rotation), tables)
         if self.planning.settings.rdo_quantization:
-            fields = rdo_quantize(
-                wanted, fields, hessians, values.forms, criterion, largest, self.planning.pool, tables
-            )
+            fields = rdo_quantize(wanted, fields, hessians, values.forms, criterion, self.largest, pool, tables)
             if tables is None:
                 fields = {name: field.from_zero() for name, field in fields.items()}
         return fields if tables is None else finished_shapes(fields, logits, tables)
@@ -397,7 +370,7 @@ class RdFields:
         usual = means_bits(splats, order, self.planning.settings.means_tolerance, pool)
         most = np.clip(16 - usual + coarser, 0, 8)
         unit = max(log_extent(means, pool), 1e-30) / MEANS_TOP
-        steps = criterion.steps_of("position")
+        steps = criterion.steps["position"]
         if self.planning.container.tables is not None:
             each = np.array(steps)[criterion.classes]
             return means_field(means[:], np.minimum(each, unit * 2.0**most / np.sqrt(2)))
@@ -406,13 +379,12 @@ class RdFields:
 
     def colors(self, base: Float32[np.ndarray, "M 3"]) -> tuple[Quantized, int]:
         """Quantise base colours; return them and the number of clipped outliers."""
-        criterion, coarsest = self.criterion, self.largest["f_dc"]
-        if self.planning.container.tables is not None:
-            steps = criterion_steps("color", criterion, coarsest[:])
-            return color_field(base.astype(np.float64), steps, criterion.costs.color), 0
-        optimal = criterion.steps_of("color")
-        clipped = clip_outliers(base, step=min(optimal), share=OUTLIERS)
-        levels = quantize_by_class(clipped, optimal, criterion.classes, coarsest, self.planning.pool)
+        criterion = self.criterion
+        steps = criterion.each_step("color", self.largest["f_dc"])
+        if self.planning.container.tables is not None and criterion.costs is not None:
+            return color_field(base.astype(np.float64), steps[:], criterion.costs.color), 0
+        clipped = clip_outliers(base, step=min(criterion.steps["color"]), share=OUTLIERS)
+        levels = quantize_by_steps(clipped, steps, self.planning.pool)
         return levels, 0 if clipped is base else int((clipped != base).any(axis=1).sum())
 
 

@@ -99,6 +99,9 @@ PERMUTATIONS = np.repeat([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1),
 
 CHUNK = 1 << 16
 
+SHAPE_COLUMNS = {"opacities": slice(0, 1), "scales": slice(1, 4), "quaternions": slice(4, 8)}
+"""Columns of opacity logit, log-scales and quaternion, by field of the container."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredShapes:
@@ -114,37 +117,22 @@ class StoredShapes:
 
     def __getitem__(self, rows: slice) -> Float64[np.ndarray, "n 8"]:
         """Return opacity logit, log-scales and quaternion of some rows."""
-        quats, scales = self._turned(rows)
-        values = np.empty((len(quats), 8))
-        values[:, 0] = self.splats.opacities.take(self.index[rows])
-        values[:, 1:4], values[:, 4:] = scales, quats
-        return values
+        index = self.index[rows]
+        quats, scales = apply_forms(
+            unit_quats(self.splats, index), self.splats.scales.take(index, axis=0), self.forms[rows]
+        )
+        opacities = self.splats.opacities.take(index)[:, None]
+        return np.concatenate([opacities, scales, quats / quats[:, :1] if self.w_is_one else quats], axis=1)
 
     def take(self, chosen: Int[np.ndarray, " K"] | Bool[np.ndarray, " M"]) -> StoredShapes:
         """Return the rows ``chosen``."""
         return StoredShapes(self.splats, self.index[chosen], self.forms[chosen], self.w_is_one)
 
-    @property
-    def opacities(self) -> Computed:
-        """Opacity logits, one column, float32."""
-        return selected(self.splats.opacities[:, None], self.index)
-
-    @property
-    def scales(self) -> Computed:
-        """Log-scales, three columns, float32."""
-        return Computed(len(self), lambda rows: self._turned(rows)[1])
-
-    @property
-    def quats(self) -> Computed:
-        """Quaternions, four columns, float64."""
-        return Computed(len(self), lambda rows: self._turned(rows)[0])
-
-    def _turned(self, rows: slice) -> tuple[Float64[np.ndarray, "n 4"], Float32[np.ndarray, "n 3"]]:
-        index = self.index[rows]
-        quats, scales = apply_forms(
-            unit_quats(self.splats, index), self.splats.scales.take(index, axis=0), self.forms[rows]
-        )
-        return (quats / quats[:, :1] if self.w_is_one else quats), scales
+    def field(self, name: str) -> Computed:
+        """Return the columns of one of :data:`SHAPE_COLUMNS`."""
+        if name == "opacities":  # needs no rotations
+            return selected(self.splats.opacities[:, None], self.index)
+        return Computed(len(self), lambda rows: self[rows][:, SHAPE_COLUMNS[name]])
 
 
 def choose_forms(
@@ -178,11 +166,9 @@ def choose_forms(
 
 def unit_quats(splats: Splats, index: Int[np.ndarray, " M"]) -> Float64[np.ndarray, "M 4"]:
     """Return the rotations of some Gaussians; float32 lengths are exact to 1e-7 only."""
-    from kissgs.planning import kernels
-
-    unit = np.empty((len(index), 4))
-    kernels.normalize(splats.quats.take(index, axis=0), unit)
-    return unit
+    quats = splats.quats.take(index, axis=0).astype(np.float64)
+    w, x, y, z = quats.T
+    return np.asarray(quats / np.sqrt(w * w + x * x + y * y + z * z)[:, None])
 
 
 def apply_forms(
@@ -215,7 +201,7 @@ def pras_forms(
     side: int,
     pool: Workers,
     *,
-    decay: float = 0.95,
+    decay: float,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> UInt8[np.ndarray, " N"]:
     """Choose forms that make neighbours on the grid similar: the closest to 8-bit proxies, blurred less and less.

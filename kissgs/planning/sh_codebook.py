@@ -73,8 +73,10 @@ def fit_codebook(
         chosen,
         weights,
         max(round(most), 1) if is_list else codebook_side(most) ** 2,
+        settings,
         pool,
-        _kmeans_options(settings, settings.sh_step if settings.shared_step_size else 0.0, from_zero=is_list),
+        lattice=settings.sh_step if settings.shared_step_size else 0.0,
+        from_zero=is_list,
         metric=metric,
         report=planning.report("codebook"),
     )
@@ -104,17 +106,6 @@ def fit_codebook(
     else:
         levels = quantize(rows, step=1, shared=False, max_top=PAPER_TOP)
     return Codebook(side, levels, position[clusters.labels], half_steps(levels))
-
-
-def _kmeans_options(settings: EncodeSettings, lattice: float, *, from_zero: bool = False) -> kmeans.KMeansOptions:
-    return kmeans.KMeansOptions(
-        seed=settings.seed,
-        iterations=settings.sh_kmeans_iterations,
-        neighbors=settings.sh_neighbors,
-        tolerance=settings.sh_tolerance,
-        lattice=lattice,
-        from_zero=from_zero,
-    )
 
 
 def nearest_square(size: float) -> int:
@@ -242,8 +233,9 @@ def codebook_error_model(
         some,
         sensitivity_weights(sensitivity, some, splats),
         entries,
+        settings,
         pool,
-        _kmeans_options(settings, 0.0),
+        lattice=0.0,
         metric=metric,
     )
     lost, most = vectors[some] - clusters.centroids[clusters.labels], MAX_DISPLAYED_ERROR / SH_MEAN_SQUARE

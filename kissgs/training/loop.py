@@ -63,7 +63,8 @@ class Regularizer(Protocol):
         """Return the term to add to the loss of ``step``, a scalar; None for nothing."""
 
     def update(self, step: int, scene: TrainableScene) -> None:
-        """Update the state after ``step``."""
+        """Update the state after ``step``; most have none."""
+        return
 
 
 @dataclass(frozen=True, slots=True)

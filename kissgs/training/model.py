@@ -29,6 +29,13 @@ from kissgs.rendering.cpu.frame import Gradients
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.tensors import tensors_of
 
+try:
+    import torch
+    from torch import Tensor
+    from torch.optim.adam import adam as torch_adam
+except ModuleNotFoundError as error:
+    raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
+
 # Numba kernel of Adam: gradients of some rows, of all or both, in one pass over parameters and moments.
 #
 # Kingma and Ba, "Adam: A Method for Stochastic Optimization" (ICLR 2015), algorithm 1, with beta1 = 0.9, beta2 = 0.999
@@ -103,13 +110,6 @@ def adam(
         for i in range(len(here)):
             here[i] = min(max(here[i] - slopes[i], smallest), largest)
 
-
-try:
-    import torch
-    from torch import Tensor
-    from torch.optim.adam import adam as torch_adam
-except ModuleNotFoundError as error:
-    raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 """Constants of Adam; the kernel has the same."""
@@ -284,12 +284,6 @@ def _step_by_torch(leaf: _Leaf, rate: float, smallest: float, largest: float) ->
 
 
 # ``GaussianModel``: a scene with trainable parameters.
-
-try:
-    import torch
-    from torch import Tensor
-except ModuleNotFoundError as error:
-    raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
 
 BOUNDS = {
     "means": (-0.999 * MEAN_LIMIT, 0.999 * MEAN_LIMIT),  # float32 could round up

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from kissgs.cameras.views import View, Views
+from kissgs.cameras.views import View, Views, black
 from kissgs.cameras.virtual.samples import close_ups, random_poses, scattered_cameras, scene_views
 from kissgs.core.array_types import Float32, Shaped
 from kissgs.core.progress import Progress, silent
@@ -143,21 +143,12 @@ def _grey(level: float) -> Float32[np.ndarray, "3"]:
 
 
 def evaluation_only(views: Views | None) -> SupervisionViews:
-    """Return the evaluation views of a capture, none of which trains or scores.
-
-    Without a capture there are none at all.
-    """
+    """Return the evaluation views of a capture, if there is one, and none that trains or scores."""
+    nothing = SupervisionViews(train=(), score=(), test=(), background=black(), source="")
     if views is None:
-        return SupervisionViews(train=(), score=(), test=(), background=np.zeros(3, np.float32), source="")
-    return SupervisionViews(
-        train=(),
-        score=(),
-        test=_evaluation_views(views),
-        background=views.background,
-        source=views.source,
-        captured=True,
-        note=_note(views),
-    )
+        return nothing
+    test, note = _evaluation_views(views), _note(views)
+    return replace(nothing, test=test, background=views.background, source=views.source, captured=True, note=note)
 
 
 def _note(views: Views) -> str:

@@ -1,12 +1,12 @@
 """POPSpa. Oracle: its parts called one by one, the same work without interruption, and renderings of the original."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from helpers.training_scenes import around, cloud, same, targets_of
+from helpers.tuning_scenes import Interrupted, stopping_after
 from PIL import Image
 
 import kissgs
@@ -109,21 +109,6 @@ def test_the_result_depends_on_the_seed_but_not_on_threads():
     assert same(found[0].splats, found[1].splats)
     assert same(found[0].splats, found[2].splats)
     assert not same(found[0].splats, Popspa(cloud(300, 2), settings(seed=1), five_views())(50).splats)
-
-
-class Interrupted(Exception):
-    pass
-
-
-def stopping_after(steps):
-    """Return a progress receiver that raises once this many training steps are done."""
-    remaining = itertools.count(steps - 1, -1)
-
-    def progress(stage, fraction, note=""):
-        if note and next(remaining) < 0:
-            raise Interrupted
-
-    return progress
 
 
 @pytest.mark.parametrize("steps", [0, 3, 4, 9, 13, 15])

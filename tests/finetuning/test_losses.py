@@ -1,5 +1,6 @@
 """Rate and total variation losses. Oracle: entropies and differences computed one by one in Python; WebP files."""
 
+import functools
 import io
 import math
 from collections import Counter
@@ -23,8 +24,13 @@ from kissgs.finetuning.quantized_scene import (
 from kissgs.sog.encode import SOG
 
 
+@functools.cache
+def plan_of(count, degree, preset):
+    return chosen(cloud(count, degree), preset)
+
+
 def quantized(count=400, degree=1, preset="balanced"):
-    return QuantizedScene(chosen(cloud(count, degree), preset), degree)
+    return QuantizedScene(plan_of(count, degree, preset), degree)
 
 
 def round_latents(scene):
@@ -104,7 +110,6 @@ def test_the_gradient_of_the_codebooks_rate_is_that_of_its_bits():
 def test_equal_entries_have_no_bits():
     scene = quantized(degree=1)
     rate = CodebookRate(scene.planes["f_rest_centroids"])
-    latents = scene.latents["f_rest_centroids"].detach()
     base = scene.planes["f_rest_centroids"].base_multiples.float()
     latents = (base[:1] - base).clone().requires_grad_()
     rate.count(latents)

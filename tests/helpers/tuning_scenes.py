@@ -18,12 +18,12 @@ class Interrupted(Exception):
     """Raised from a progress callback."""
 
 
-def stopping_after(steps):
-    """Return a progress callback that raises :class:`Interrupted` after some steps of fine-tuning."""
+def stopping_after(steps, stage=None):
+    """Return a progress callback that raises :class:`Interrupted` after some training steps, of a stage or of all."""
     remaining = itertools.count(steps - 1, -1)
 
-    def progress(stage, fraction, note=""):
-        if stage == "finetune" and note and next(remaining) < 0:
+    def progress(now, fraction, note=""):
+        if stage in (None, now) and note and next(remaining) < 0:
             raise Interrupted
 
     return progress

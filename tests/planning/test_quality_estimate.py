@@ -7,21 +7,18 @@ import pytest
 from helpers.codec_scenes import random_scene
 from helpers.random_sensitivity import random_sensitivity
 
-from kissgs.planning.rate_distortion import MIN_ERROR_RATIO, default_error, error_at, lambda_for
+from kissgs.planning.rate_distortion import MIN_ERROR_RATIO, ErrorModel, default_error
 from kissgs.planning.rd_criterion import Costs
 from kissgs.planning.sh_codebook import CodebookErrorModel
 
 
 def test_lambda_for_gives_the_requested_error():
     splats = random_scene(4000, 3, seed=1)
-    costs = Costs.of(random_sensitivity(splats), splats)
     sh_model = CodebookErrorModel(1024, 1e-6, 2e-6)
-    for error in (1e-6, 1e-4):
-        rd_lambda = lambda_for(error, costs, sh_model, 10, 7, 0.2)
-        np.testing.assert_allclose(error_at(rd_lambda, costs, sh_model, 10, 7, 0.2), error, rtol=0.05)
-    least = error_at(1e-22, costs, sh_model, 10, 7, 0.2)  # what the largest codebook leaves
-    rd_lambda = lambda_for(least / 100, costs, sh_model, 10, 7, 0.2)
-    np.testing.assert_allclose(error_at(rd_lambda, costs, sh_model, 10, 7, 0.2), MIN_ERROR_RATIO * least, rtol=0.05)
+    model = ErrorModel(Costs.of(random_sensitivity(splats), splats), sh_model, 10, 7, 0.2)
+    least = model.error_at(1e-22)  # what the largest codebook leaves
+    for error, wanted in ((1e-6, 1e-6), (1e-4, 1e-4), (least / 100, MIN_ERROR_RATIO * least)):
+        np.testing.assert_allclose(model.error_at(model.lambda_for(error)), wanted, rtol=0.05)
     sizes = [sh_model.best_size(rd_lambda, 100_000, 7) for rd_lambda in (1e-14, 1e-12, 1e-10)]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[0] <= round(100_000 / 7)

@@ -1,6 +1,7 @@
-"""Oracle: brute force over all levels, and the decoder's rule (observed minimum and maximum stand for the ranges)."""
+"""Oracle: brute force over levels and partitions, and the rule of decoders (the observed ends stand for the ranges)."""
 
 import math
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -11,14 +12,20 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as stnp
 
 from kissgs.core.positions import signed_exp, signed_log
+from kissgs.planning import quantize as module
 from kissgs.planning.quantize import (
     MEANS_TOP,
     Quantized,
     even_table,
+    fit_table,
     means_bits,
+    nearest_levels,
     observed_range,
     quantize,
     quantize_means,
+    refit_table,
+    table_field,
+    without_unused,
 )
 
 quick = examples(60)
@@ -66,13 +73,6 @@ def test_every_value_gets_the_nearest_of_all_levels(values, step, shared, max_to
 
 
 @quick
-@given(tables(), st.floats(1e-3, 100), st.booleans())
-def test_what_is_written_decodes_to_the_same_values(values, step, shared):
-    quantized = quantize(values, step=step, shared=shared)
-    np.testing.assert_allclose(decoded(quantized), dequantize(quantized), rtol=1e-6, atol=1e-6)
-
-
-@quick
 @given(tables(), st.floats(1e-3, 100))
 def test_a_shared_step_is_shared_and_as_asked_for(values, step):
     quantized = quantize(values, step=step)
@@ -98,18 +98,14 @@ def test_without_a_shared_step_every_channel_spans_all_levels(values, max_top):
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_constant_channels_are_exact_whatever_stands_beside_them(shared):
-    values = np.array([[0.1, 5], [0.1, -7], [0.1, 1e6]], dtype=np.float32)
-    quantized = quantize(values, step=0.5, shared=shared)
-    assert (decoded(quantized)[:, 0].astype(np.float32) == np.float32(0.1)).all()
-    assert quantized.low[0] == quantized.high[0]
-
-
-@pytest.mark.parametrize("value", [0.0, -0.0, 1e-45, -3.75, 1e30])
-def test_wholly_constant_images_are_exact(value):
-    quantized = quantize(np.full((5, 3), value, np.float32), step=0.1)
-    assert (quantized.levels == 0).all()
-    assert (decoded(quantized) == np.float32(value)).all()
+@pytest.mark.parametrize("value", [0.0, -0.0, 1e-45, -3.75, 0.1, 1e30])
+def test_constant_channels_are_exact_whatever_stands_beside_them(value, shared):
+    alone, beside = np.full((5, 1), value, np.float32), np.float32([[5], [-7], [1e6], [1], [2]])
+    for values in (alone, np.concatenate([alone, beside], axis=1)):
+        quantized = quantize(values, step=0.1, shared=shared)
+        assert (decoded(quantized)[:, 0].astype(np.float32) == np.float32(value)).all()
+        assert quantized.low[0] == quantized.high[0]
+    assert (quantize(alone, step=0.1, shared=shared).levels == 0).all()
 
 
 def test_ranges_that_vanish_in_float32_are_constant():
@@ -143,7 +139,7 @@ def test_values_on_a_lattice_keep_it():
 
 @quick
 @given(tables(min_rows=3), st.integers(0, 10), st.booleans())
-def test_ranges_are_right_after_extremes_were_removed(values, removed, shared):
+def test_written_ranges_decode_to_the_same_values_also_after_extremes_were_removed(values, removed, shared):
     """A crop or a level of detail drops Gaussians after quantising: decoders then see other extremes."""
     whole = quantize(values, step=0.5, shared=shared)
     keep = np.argsort(whole.levels.max(axis=1), kind="stable")[: len(values) - min(removed, len(values) - 1)]
@@ -202,3 +198,77 @@ def test_signed_log_and_its_inverse(values):
     wanted = [math.copysign(math.log1p(abs(float(value))), value) for value in values]
     np.testing.assert_allclose(logs, wanted, rtol=1e-15)
     np.testing.assert_allclose(signed_exp(logs), values.astype(np.float64), rtol=1e-12)
+
+
+# Tables of values.
+
+
+def table_error(table, values, weights):
+    return float(weights @ np.square(values[:, None] - table).min(axis=1))
+
+
+def best_error(values, weights, size):
+    """Return the error of the best partition of the ascending values into ``size`` runs."""
+    best = np.inf
+    for cuts in combinations(range(1, len(values)), size - 1):
+        runs = np.split(np.arange(len(values)), cuts)
+        table = np.array([np.average(values[run], weights=weights[run]) for run in runs])
+        best = min(best, table_error(table, values, weights))
+    return best
+
+
+def test_few_points_are_all_kept_whatever_the_distance_between_them():
+    values = np.array([1e6, 0.1, 0.2, 0.2, -3.0])
+    np.testing.assert_allclose(fit_table(values, np.ones(5), 0.1), [-3, 0.1, 0.2, 1e6], rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.quick(3)
+def test_joined_points_are_nearly_as_good_as_the_best_partition(seed, monkeypatch):
+    monkeypatch.setattr(module, "SIZE", 4)
+    monkeypatch.setattr(module, "WIDEST", 1.0)
+    rng = np.random.default_rng(seed)
+    values, weights = np.sort(rng.normal(size=12)), rng.exponential(size=12) + 0.1
+    table = fit_table(values, weights, 1e-6)
+    assert len(table) == 4
+    assert table_error(table, values, weights) <= 1.6 * best_error(values, weights, 4)
+
+
+@given(st.integers(0, 1000), st.floats(1e-4, 1), st.booleans())
+def test_tables_are_ascending_bounded_and_near(seed, step, with_zero):
+    rng = np.random.default_rng(seed)
+    values = np.concatenate([rng.normal(size=600), rng.normal(size=3) * 1e3])
+    table = fit_table(values, rng.exponential(size=603), step, with_zero=with_zero)
+    assert 1 <= len(table) <= 256
+    assert (np.diff(table) > 0).all()
+    assert not with_zero or 0 in table
+    worst = np.abs(values[:, None] - table).min(axis=1).max()
+    assert worst <= max(step / 2, np.ptp(values) / 120) * 1.001
+
+
+def test_nearest_levels_are_nearest():
+    table = np.array([-1, 0, 0.5, 4], np.float32)
+    values = np.random.default_rng(0).uniform(-3, 6, (200, 3))
+    wanted = np.abs(values[..., None] - table).argmin(axis=-1)
+    assert (nearest_levels(table, values) == wanted).all()
+
+
+def test_a_moved_table_has_a_smaller_error_and_keeps_the_bounds():
+    rng = np.random.default_rng(1)
+    values, weights, bound = rng.normal(size=(300, 3)), rng.exponential(size=300), np.full(300, 0.3)
+    table = np.linspace(-4, 4, 20).astype(np.float32)
+    levels = nearest_levels(table, values).astype(np.int64)
+    moved = refit_table(table, levels, values, weights, (bound, bound))
+    before, after = (np.square(t[levels] - values).sum(axis=1) @ weights for t in (table, moved))
+    assert after < before
+    assert np.abs(moved[levels] - values).max() <= 0.3 + 1e-6
+    tight = np.abs(table[levels] - values).max(axis=1)  # nothing may move
+    still = refit_table(table, levels, values, weights, (tight, tight))
+    assert (np.abs(still[levels] - values).max(axis=1) <= tight + 1e-6).all()
+
+
+def test_unused_values_are_left_out_and_the_rest_stands_for_the_same():
+    table, levels = np.array([1, 2, 3.1234567], np.float32), np.array([[2, 0], [0, 0]], np.uint8)
+    shorter, renumbered = without_unused(table, levels)
+    assert (shorter[renumbered] == table[levels]).all()
+    assert table_field(shorter, renumbered).values().tolist() == [[float(np.float32(3.12346)), 1], [1, 1]]

@@ -15,7 +15,7 @@ from kissgs.planning.rd_fields import (
     UNSEEN,
     VIRTUAL,
     largest_changes,
-    quantize_by_class,
+    quantize_by_steps,
     rdo_quantize,
 )
 
@@ -42,13 +42,19 @@ def test_a_step_costs_what_a_bit_does():
     assert around[1] < min(around[0], around[2])
 
 
+def criterion_of(cost, classes, rd_lambda):
+    """A criterion where every attribute has this cost."""
+    costs = Costs(**{name: np.broadcast_to(np.float64(cost), classes.shape) for name in Costs.__slots__})
+    return RdCriterion.of(costs, classes, rd_lambda, keep=False)
+
+
 def test_levels_of_a_class_are_multiples_of_its_step():
     rng = np.random.default_rng(0)
     values, classes = rng.normal(size=(3000, 3)), np.repeat([0, 1, 2], 1000)
-    cost = np.repeat([1.0, 0.1, 0.004], 1000)
-    splats = random_scene(3000, 0)
-    criterion = RdCriterion(Costs.of(random_sensitivity(splats), splats), classes, 1e-4)
-    found = quantize_by_class(values, criterion.class_steps(cost), classes, np.full(3000, 2.0))
+    criterion = criterion_of(np.repeat([1.0, 0.1, 0.004], 1000), classes, 1e-4)
+    about_three_axes = np.array(criterion.steps["scale"]) / 3**0.5
+    np.testing.assert_allclose(criterion.steps["rotation"], about_three_axes)
+    found = quantize_by_steps(values, criterion.each_step("scale", np.full(3000, 2.0)))
     each = (found.high.astype(float) - found.low) / found.top
     errors = np.abs(found.low + found.levels * each - values)
     for c, wanted in enumerate((1, 3, 16)):
@@ -59,24 +65,24 @@ def test_levels_of_a_class_are_multiples_of_its_step():
     assert found.levels.min() == 0
 
 
-def test_without_a_rate_cost_levels_are_the_nearest_along_each_axis():
-    rng = np.random.default_rng(1)
-    count = 400
+def shape_values(rng, count):
+    """Opacity logits, log-scales and quaternions near the identity."""
     quats = rng.normal(size=(count, 4)) * 0.2 + [1, 0, 0, 0]
-    values = np.concatenate([rng.normal(size=(count, 4)), quats / np.linalg.norm(quats, axis=1, keepdims=True)], axis=1)
-    parts = parts_of(values)
-    splats = random_scene(count, 0)
-    costs = Costs.of(random_sensitivity(splats), splats)
+    return np.concatenate([rng.normal(size=(count, 4)), quats / np.linalg.norm(quats, axis=1, keepdims=True)], axis=1)
+
+
+def rdo_quantized(values, form, cost, rd_lambda):
+    """Levels of Gaussians of one class whose Hessian is ``form``; and those of uniform steps."""
+    count, parts = len(values), parts_of(values)
+    hessians, criterion = np.tile(packed_hessian(form), (count, 1)), criterion_of(cost, np.zeros(count, int), rd_lambda)
     with Workers(1) as pool:
-        found = rdo_quantize(
-            values,
-            parts,
-            np.tile(packed_hessian(np.diag([1.0] * 4 + [0] * 3)), (count, 1)),
-            np.zeros(count, np.uint8),
-            RdCriterion(costs, np.zeros(count, np.int64), 1e-30),
-            anything(count),
-            pool,
-        )
+        found = rdo_quantize(values, parts, hessians, np.zeros(count, np.uint8), criterion, anything(count), pool)
+    return found, parts
+
+
+def test_without_a_rate_cost_levels_are_the_nearest_along_each_axis():
+    values = shape_values(np.random.default_rng(1), 400)
+    found, parts = rdo_quantized(values, np.diag([1.0] * 4 + [0] * 3), 1e-12, 1e-30)
     for name, wanted in (("opacities", values[:, :1]), ("scales", values[:, 1:4])):
         part = parts[name]
         each = (part.high.astype(float) - part.low) / part.top
@@ -86,28 +92,10 @@ def test_without_a_rate_cost_levels_are_the_nearest_along_each_axis():
 
 def test_rdo_quantisation_never_costs_more_than_the_nearest_level():
     """Error and bits together, the bits as the levels that were chosen then have them; and close to all pairs tried."""
-    rng = np.random.default_rng(2)
-    count, rd_lambda = 3000, 1e-3
-    quats = rng.normal(size=(count, 4)) * 0.2 + [1, 0, 0, 0]
-    values = np.concatenate([rng.normal(size=(count, 4)), quats / np.linalg.norm(quats, axis=1, keepdims=True)], axis=1)
+    values, rd_lambda = shape_values(np.random.default_rng(2), 3000), 1e-3
     form = np.diag([1.0, 0.5, 0.5, 0.5, 0, 0, 0])
     form[0, 1] = form[1, 0] = 0.4  # an error of the opacity makes up for one of the first scale
-    parts = parts_of(values)
-    splats = random_scene(count, 0)
-    costs = replace(
-        Costs.of(random_sensitivity(splats), splats),
-        **{name: np.full(count, 1e-9) for name in ("opacity", "scale", "rotation")},
-    )
-    with Workers(1) as pool:
-        found = rdo_quantize(
-            values,
-            parts,
-            np.tile(packed_hessian(form), (count, 1)),
-            np.zeros(count, np.uint8),
-            RdCriterion(costs, np.zeros(count, np.int64), rd_lambda),
-            anything(count),
-            pool,
-        )
+    found, parts = rdo_quantized(values, form, 1e-9, rd_lambda)
 
     def decoded(chosen):
         return np.concatenate([part.values() for part in chosen.values()], axis=1)
@@ -117,7 +105,7 @@ def test_rdo_quantisation_never_costs_more_than_the_nearest_level():
         bits = 0.0
         for column in np.concatenate([part.levels for part in chosen.values()], axis=1).T:
             counts = np.bincount(column)
-            bits -= (counts[counts > 0] * np.log2(counts[counts > 0] / count)).sum()
+            bits -= (counts[counts > 0] * np.log2(counts[counts > 0] / len(values))).sum()
         return np.einsum("ni,ij,nj->", off, form[:4, :4], off) + rd_lambda * bits
 
     assert total(found) < 0.85 * total(parts)

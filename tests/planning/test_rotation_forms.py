@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from helpers.codec_scenes import covariances, equivalents, product, random_scene, unit
+from helpers.codec_scenes import covariances, equivalents, random_scene, unit
 from helpers.examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from kissgs.core.resources import blas_workers
-from kissgs.planning import kernels
+from kissgs.planning import kernels, rotation_forms
 from kissgs.planning.layout import box_blur
 from kissgs.planning.rotation_forms import (
     PERMUTATIONS,
@@ -53,40 +53,16 @@ def test_the_forms_are_those_of_the_cube():
     assert ours == theirs
 
 
-def test_the_set_is_closed():
-    """A form of a form is a form: every product of two table rows is a row, up to its sign, with the same axes."""
-    matrices = Rotation.from_quat(ROTATIONS, scalar_first=True).as_matrix()
-    np.testing.assert_allclose(np.linalg.norm(ROTATIONS, axis=1), 1, atol=1e-15)
-    for i in range(24):
-        products = product(ROTATIONS[i], ROTATIONS)
-        match = np.abs(products @ ROTATIONS.T) > 1 - 1e-9
-        assert (match.sum(axis=1) == 1).all()
-        assert (np.abs(matrices[i]).argmax(axis=0) == PERMUTATIONS[i]).all()
-
-
-def test_upright_has_the_largest_w_of_all_forms(gaussians):
-    quats, scales = gaussians
-    best = equivalents(quats, scales)[0][:, :, 0].max(axis=0)
-    chosen, _ = apply_forms(quats, scales, canonical_forms(quats))
-    np.testing.assert_allclose(chosen[:, 0], best, atol=1e-8)
-    assert chosen[:, 0].min() >= np.cos(np.deg2rad(62.8) / 2) - 1e-6
-
-
 def test_upright_does_not_depend_on_the_form_that_came_in(gaussians):
     """All 48 forms of a Gaussian are stored alike, so its neighbours' form tells nothing about it."""
     quats, scales = gaussians
     wanted = apply_forms(quats, scales, canonical_forms(quats))
+    assert (canonical_forms(wanted[0]) == 0).all()
+    assert (canonical_forms(np.array([[1.0, 0, 0, 0], [-1, 0, 0, 0]])) == [0, 24]).all()
     for other_quats, other_scales in in_all_forms(quats, scales):
         found = apply_forms(other_quats, other_scales, canonical_forms(other_quats))
         np.testing.assert_allclose(found[0], wanted[0], atol=1e-7)
         assert (found[1] == wanted[1]).all()
-
-
-def test_upright_twice_is_upright_once(gaussians):
-    quats, scales = gaussians
-    once, _ = apply_forms(quats, scales, canonical_forms(quats))
-    assert (canonical_forms(once) == 0).all()
-    assert (canonical_forms(np.array([[1.0, 0, 0, 0], [-1, 0, 0, 0]])) == [0, 24]).all()
 
 
 @examples(50)
@@ -173,3 +149,45 @@ def test_covariance_error_of_extreme_sizes_is_finite(gaussians, size):
     quats = gaussians[0]
     scales = np.full((256, 3), size, np.float32) * np.float32([1, -1, 1])
     assert covariance_error(quats, scales, *apply_forms(quats, scales, canonical_forms(quats))) < 1e-6
+
+
+# Rotations as three components.
+
+
+def angles(p, q):
+    return 2 * np.arccos(np.clip(np.abs((p * q).sum(axis=1)), 0, 1))
+
+
+@pytest.fixture
+def turns():
+    random = unit(np.random.default_rng(2).normal(size=(500, 4))).astype(np.float64)
+    half = np.sqrt(0.5)
+    corners = [[half, half, 0, 0], [0.5, 0.5, 0.5, 0.5], [0, 0, 0, -1], [-half, 0, 0, half], [1, 0, 0, 0]]
+    return np.concatenate([random, np.array(corners)])
+
+
+def test_decoded_rotations_are_near_and_of_length_one(turns):
+    omitted = rotation_forms.omitted_components(turns)
+    signed = rotation_forms.with_sign(turns, omitted)
+    levels = rotation_forms.lattice_levels(rotation_forms.stored_components(signed, omitted), 1)
+    found = rotation_forms.whole(rotation_forms.TABLE[levels], omitted)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-12)
+    assert np.degrees(angles(found, turns)).max() < 2
+    missing = np.take_along_axis(found, omitted[:, None].astype(np.int64), axis=1)
+    assert (missing >= 0).all()
+    assert (np.abs(found[:, 1:]) <= np.sqrt(0.5) + 1e-12)[omitted == 0].all()
+
+
+def test_coarse_levels_are_multiples_and_exist(turns):
+    omitted = rotation_forms.omitted_components(turns)
+    small = rotation_forms.stored_components(rotation_forms.with_sign(turns, omitted), omitted)
+    levels = rotation_forms.lattice_levels(small, np.full(len(turns), 16)).astype(np.int64)
+    assert rotation_forms.fits(levels).all()
+    assert ((levels - 127) % 16 == 0).mean() > 0.9
+
+
+def test_canonical_forms_leave_out_w(turns):
+    forms = canonical_forms(turns)
+    turned, _ = apply_forms(turns, np.zeros((len(turns), 3), np.float32), forms)
+    assert (rotation_forms.omitted_components(turned) == 0).all()
+    assert (turned[:, 0] > 0.85).all()

@@ -98,8 +98,7 @@ def test_the_stored_form_is_the_largest_w_of_the_24_rotations(count):
     np.testing.assert_array_equal(free[:][:, :4], stored[:, :4])
 
 
-@pytest.mark.parametrize("tolerance", [0.01, 0.04, 0.5])
-@pytest.mark.parametrize("count", BORDERS)
+@pytest.mark.parametrize(("count", "tolerance"), [*((count, 0.04) for count in BORDERS), (BLOCK, 0.01), (BLOCK, 0.5)])
 def test_precision_of_positions_follows_the_median_gaussian(count, tolerance):
     splats = random_scene(count, 0, seed=count)
     size = np.sort(splats.scales, axis=1)[:, 1:].mean(axis=1, dtype=float)

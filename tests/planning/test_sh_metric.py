@@ -16,7 +16,7 @@ from kissgs.planning import kmeans
 from kissgs.planning.clustering import UNIFORM_WEIGHT, Clustering, ShMetric, Vectors, sorted_by_label
 from kissgs.planning.sh_codebook import codebook_error_model
 
-OPTIONS = kmeans.KMeansOptions(seed=0, iterations=3, neighbors=32, tolerance=0.0, lattice=0.0)
+SETTINGS = kissgs.Settings.research("balanced", sh_kmeans_iterations=3, sh_neighbors=32, sh_tolerance=0.0).encode
 
 
 def seen_directions(count, spread, seed=0, number=12):
@@ -122,7 +122,7 @@ def test_clustering_under_the_metric_errs_less_where_cameras_are_and_does_not_de
     found = {}
     for name, used, threads in (("plain", None, 1), ("metric", metric, 1), ("threads", metric, 3)):
         with Workers(threads) as pool:
-            clusters = kmeans.fit(vectors, np.arange(count), ones, 64, pool, OPTIONS, metric=used)
+            clusters = kmeans.fit(vectors, np.arange(count), ones, 64, SETTINGS, pool, lattice=0.0, metric=used)
         found[name] = vectors - clusters.centroids[clusters.labels]
     np.testing.assert_array_equal(found["metric"], found["threads"])
     errors = {name: direct_errors(lost, directions, weights, degree).sum() for name, lost in found.items()}

@@ -58,10 +58,7 @@ def test_damaged_checkpoints_are_rejected(tmp_path):
 def test_a_save_is_due_after_the_interval(tmp_path, monkeypatch, seconds, due):
     monkeypatch.setattr(checkpoint, "SAVE_INTERVAL", seconds)
     assert Checkpoint(tmp_path / "c.npz", "key").due == due
-    assert not Checkpoint(None, "key").due
-
-
-def test_nothing_is_saved_without_a_path():
-    checkpoint_ = Checkpoint(None, "")
-    checkpoint_.save(STATE)
-    assert checkpoint_.load() is None
+    nowhere = Checkpoint(None, "key")
+    nowhere.save(STATE)
+    assert nowhere.load() is None
+    assert not nowhere.due
