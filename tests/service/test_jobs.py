@@ -71,16 +71,10 @@ def test_training_needs_torch(monkeypatch):
     assert parse_options('{"encode": {"target_size": "1MB"}}').kind == "balanced+search"
     monkeypatch.undo()
     assert parse_options('{"encode": {"max_psnr_drop": 0.5}}').kind == "balanced+compact+finetune+search"
+    for compact, resumable in (({"ratio": 0.2}, True), ({"count": 9}, True), ({"max_psnr_drop": 0.2}, False)):
+        assert parse_options(json.dumps({"compact": compact})).resumable == resumable
+        assert not parse_options(json.dumps({"preset": "fast", "compact": compact})).resumable
     assert not parse_options('{"encode": {"psnr": 40}, "compact": {"auto_count": true}}').resumable
-
-
-@pytest.mark.parametrize(
-    ("compact", "resumable"),
-    [({"ratio": 0.2}, True), ({"count": 9}, True), ({"max_psnr_drop": 0.2}, False), ({}, False)],
-)
-def test_resumable_options(compact, resumable):
-    assert parse_options(json.dumps({"compact": compact})).resumable == resumable
-    assert not parse_options(json.dumps({"preset": "fast", "compact": compact})).resumable
 
 
 def test_evaluating(service):
@@ -119,6 +113,7 @@ def test_an_idempotency_key_makes_one_job(service):
             ("e.ply.spz", "e.ply"),
         ),
         *(("…", "…"), ("\u202etxt", "txt"), ("", "scene"), (".ply", "scene")),
+        *(("n" * 300 + ".ply", "n" * 100), ("a\r\nX: 1\0.ply", "aX 1"), ('<b>".ply', "b"), ("/", "scene")),
     ],
 )
 def test_names_are_sanitised(given, kept):

@@ -8,7 +8,7 @@ from helpers.job_rows import add
 
 from service.core.models import ENDED, State
 from service.jobs.status import QueueEstimator, job_status
-from service.storage.job_records import LimitExceeded, Store
+from service.storage.job_records import Store
 
 ALLOWED = {
     *itertools.product([State.QUEUED], [State.RUNNING, State.FAILED, State.CANCELLED]),
@@ -139,27 +139,6 @@ def test_work_bytes_count_while_a_job_runs(store):
     assert store.disk_bytes() == 120
 
 
-def test_limits(store):
-    for _ in range(3):
-        add(store, "alice")
-    with pytest.raises(LimitExceeded, match="owner"):
-        add(store, "alice")
-    for _ in range(7):
-        add(store)
-    with pytest.raises(LimitExceeded, match="queue"):
-        add(store)
-
-
-def test_idempotency_keys_are_per_owner(store):
-    first = add(store, "alice", idempotency_key="k")
-    add(store, "bob", idempotency_key="k")
-    with pytest.raises(LimitExceeded, match="key"):
-        add(store, "alice", idempotency_key="k")
-    add(store, "alice")
-    assert store.by_idempotency_key("alice", "k").id == first.id
-    assert store.by_idempotency_key("alice", "x") is None
-
-
 def test_queries(store):
     jobs = [add(store, owner) for owner in ("alice", "bob", "alice")]
     assert store.disk_bytes() == 9_000_000_000
@@ -183,16 +162,3 @@ def test_queries(store):
     last = add(store).number
     store.forget(last)
     assert add(store).number > last  # clients use them as cursors of lists
-
-
-def test_jobs_survive_reopening(tmp_path):
-    first = Store(tmp_path / "jobs.sqlite", lambda: 5.0)
-    number = add(first, name="Schloß \u4e2d", options={"preset": "fast", "encode": {"seed": 2**31 - 1}}).number
-    first.heartbeat()
-    first.close()
-    second = Store(tmp_path / "jobs.sqlite", lambda: 6.0)
-    (found,) = second.in_state(State.QUEUED)
-    assert (found.number, found.name, found.options["encode"]) == (number, "Schloß \u4e2d", {"seed": 2**31 - 1})
-    assert second.meta_value("time") == 5.0
-    assert found.upload_bytes == 5_000_000_000
-    second.close()
