@@ -100,6 +100,6 @@ def command(folder, **settings):
 
 
 def database(folder, *statements):
-    with contextlib.closing(sqlite3.connect(folder / "jobs.sqlite")) as found, found:
+    with contextlib.closing(sqlite3.connect(folder / "jobs.sqlite", timeout=300)) as found, found:
         for statement in statements:
             found.execute(statement)

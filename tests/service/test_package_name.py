@@ -12,10 +12,9 @@ from service.__main__ import main
 
 def test_the_installed_name(tmp_path):
     """An absolute import of the service works in a checkout, and fails in a wheel, where it has another name."""
-    names = [
-        f"kissgs_{'.'.join(path.relative_to(ROOT).with_suffix('').parts)}" for path in (ROOT / "service").rglob("*.py")
-    ]
-    code = f"import sys, importlib; [importlib.import_module(name) for name in {names}]; sys.exit('service' in sys.modules)"
+    sources = (path.relative_to(ROOT).with_suffix("") for path in (ROOT / "service").rglob("*.py"))
+    imported = ", ".join(f"kissgs_{'.'.join(path.parts).removesuffix('.__init__')}" for path in sources)
+    code = f"import sys, {imported}; sys.exit('service' in sys.modules)"
     subprocess.run([sys.executable, "-P", "-c", code], cwd=tmp_path, check=True)
 
 

@@ -13,7 +13,7 @@ from helpers.format_scenes import made_scene
 from helpers.reference_sog import sog_files, webp, zip_of
 from helpers.splat_transform import convert, needs_splat_transform
 from helpers.web_scenes import array_of, in_node, job, scene_of, ulps
-from helpers.web_tools import Site, put_value
+from helpers.web_tools import put_value
 from PIL import Image
 
 import kissgs
@@ -24,13 +24,6 @@ MAX_ULPS = 1
 """Largest difference of values of JavaScript and Python, ulps: both compute in float64 and round once."""
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
-
-@pytest.fixture(scope="module")
-def site():
-    site = Site()
-    yield site
-    site.close()
 
 
 def sog_job(source, **more):

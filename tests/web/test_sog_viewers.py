@@ -9,7 +9,7 @@ import logging
 
 import numpy as np
 import pytest
-from helpers.viewers import chromium, opened, psnr, scattered, seen_from
+from helpers.viewers import opened, psnr, scattered, seen_from
 
 import kissgs
 from kissgs.io.ply import write_ply
@@ -22,12 +22,6 @@ from kissgs.rendering.camera import Camera
 TO_RASTERISER = {"spark": 44, "playcanvas": 35}
 TO_ITS_PLY = 46  # the same values from a .ply: other roundings within the viewer, and ties in its sorting
 log = logging.getLogger(__name__)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module", params=["spark", "playcanvas"])

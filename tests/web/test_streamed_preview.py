@@ -6,7 +6,7 @@ import logging
 import numpy as np
 import pytest
 from helpers.streamed_scenes import FAST, small_sizes
-from helpers.viewers import chromium, image_of, opened, pinhole, psnr, scattered, seen_from
+from helpers.viewers import image_of, opened, pinhole, psnr, scattered, seen_from
 
 import kissgs
 from kissgs.core.splats import ATTRIBUTES, Splats
@@ -19,8 +19,8 @@ log = logging.getLogger(__name__)
 
 
 @pytest.fixture(scope="module")
-def viewer():
-    with chromium() as browser, opened("streaming", browser) as (viewer, site):
+def viewer(browser):
+    with opened("streaming", browser) as (viewer, site):
         yield viewer.page, site
 
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.viewers import chromium, pinhole, psnr
-from helpers.web_tools import DECODER, Site
+from helpers.viewers import pinhole, psnr
+from helpers.web_tools import DECODER
 
 import kissgs
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
@@ -71,18 +71,15 @@ window.draw = async ({ scene, cameras, background = "#000000", file = null }) =>
 
 
 @pytest.fixture(scope="module")
-def page():
+def page(browser, site):
     errors = []
-    site = Site()
-    site.files |= {"/": PAGE.encode(), "/page.js": PROGRAM.encode()}
-    site.headers["/"] = {"Content-Type": "text/html"}
-    with chromium() as browser:
-        page = browser.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.goto(f"{site.url}/")
-        yield page
-    site.close()
+    site.files |= {"/page.html": PAGE.encode(), "/page.js": PROGRAM.encode()}
+    page = browser.new_page()
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.goto(f"{site.url}/page.html")
+    yield page
+    page.close()
     assert errors == []
 
 
