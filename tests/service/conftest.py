@@ -21,7 +21,7 @@ def service(tmp_path_factory):
 
 @pytest.fixture(scope="package")
 def job(service):
-    """Status of a job that has succeeded, after all those before it."""
+    """Status of a job that has succeeded."""
     return service.ended(service.submit())
 
 

@@ -27,13 +27,13 @@ JOBS = {
     "a loss by pruning": {"encode": FEW, "compact": {"max_psnr_drop": 3, **TRAINED}},
     "a size, tuned": {"encode": {"target_size": 6000, **FEW}, "finetune": TUNED},
     "merged": {"encode": FEW, "compact": {"ratio": 0.5, "method": "merge"}},
-    "tuned": {"encode": FEW, "finetune": TUNED},
     "a size": {"encode": {"target_size": 6000, **FEW}, "finetune": UNTUNED},
     "a size by training": {"encode": {"target_size": 6000, **FEW}, "compact": VIEWS, "finetune": EITHER},
     "time alone": {"time_limit": LONG, "encode": FEW, "finetune": EITHER},
     "a loss by training": {"encode": LOSS, "compact": VIEWS, "finetune": EITHER},
     "as many as a loss needs": {"encode": LOSS, "compact": {"auto_count": True, **TRAINED}, "finetune": UNTUNED},
     "time and tuning": {"time_limit": LONG, "encode": FEW, "finetune": TUNED},
+    "tuned": {"encode": FEW, "finetune": TUNED},
 }
 
 

@@ -106,6 +106,7 @@ def unreachable():
         yield f"http://127.0.0.1:{unused.getsockname()[1]}"
 
 
+@pytest.mark.quick(0)
 def test_an_unreachable_service(unreachable, scene, tmp_path, monkeypatch):
     monkeypatch.setattr(client, "RETRY_SECONDS", 0.0)
     with kissgs.Remote(unreachable) as remote, pytest.raises(kissgs.RemoteError, match="cannot reach"):
@@ -275,7 +276,7 @@ def test_invalid_commands(scene):
         assert len(done.stderr.splitlines()) == 1
 
 
-def test_interrupting_the_command_cancels_the_job(service, job, scene):
+def test_interrupting_the_command_cancels_the_job(service, scene):
     words = ["remote", "compress", scene, "-p", "fast", "--set", f"seed={HELD_SEED}", "--server", service.url]
     running = subprocess.Popen([KISSGS, *words], stderr=subprocess.PIPE, text=True)
     wait_until(lambda: newest(service)["state"] == "running")

@@ -118,7 +118,6 @@ def odd(path, value):
 
 
 @pytest.mark.parametrize("accepted", [True, False])
-@pytest.mark.quick(1)
 def test_odd_metadata(accepted):
     rows = [row for row in ODD if row[-1] == accepted]
     messages = check_agreement([odd(path, value) for path, value, _ in rows])
