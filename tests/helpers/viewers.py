@@ -66,6 +66,15 @@ def image_of(text, camera):
     return pixels.reshape(camera.height, camera.width, 4)[::-1, :, :3] / 255
 
 
+def page_camera(view, size=(200, 100), focal=100.0):
+    """Return the camera of a 4 x 4 view matrix, with y up and z backwards, in the form of our page."""
+    width, height = size
+    projection = [[2 * focal / width, 0, 0, 0], [0, 2 * focal / height, 0, 0], [0, 0, -1, -0.02], [0, 0, -1, 0]]
+    eye = -view[:3, :3].T @ view[:3, 3]
+    matrix = (np.array(projection) @ view).T.ravel()
+    return {"matrix": matrix.tolist(), "eye": eye.tolist(), "focal": focal, "pixels": width * height}
+
+
 class Viewer:
     """Page of a viewer, which draws files."""
 

@@ -116,16 +116,6 @@ def test_a_container_of_sog(service, tmp_path):
     assert answer.content == (tmp_path / "expected.ply").read_bytes()
 
 
-def test_an_idempotency_key_belongs_to_one_format(service):
-    first = service.submit(options=SOG, **{"Idempotency-Key": "format-1"})
-    assert service.submit(options=SOG, **{"Idempotency-Key": "format-1"})["id"] == first["id"]
-    headers = {"Idempotency-Key": "format-1"}
-    problem(service.http.post("/v1/jobs", content=SMALL, params={"options": FAST}, headers=headers), 422, "key-reused")
-    default = service.submit(**{"Idempotency-Key": "format-2"})
-    explicit = json.dumps({"preset": "fast", "format": "sogxt"})
-    assert service.submit(options=explicit, **{"Idempotency-Key": "format-2"})["id"] == default["id"]
-
-
 @pytest.mark.parametrize("value", ["spz", "", ["sog"]])
 def test_other_formats_are_refused(service, value):
     answer = service.http.post("/v1/jobs", content=SMALL, params={"options": json.dumps({"format": value})})

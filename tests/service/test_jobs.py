@@ -88,16 +88,16 @@ def test_evaluating(service):
 
 
 def test_an_idempotency_key_makes_one_job(service):
+    formats = [json.dumps({"preset": "fast", "format": name}) for name in ("sogxt", "sog")]
     first = service.submit(**{"Idempotency-Key": "key-1"})
-    again = service.submit(**{"Idempotency-Key": "key-1"})
-    assert first["id"] == again["id"]
+    for options in (FAST, formats[0]):  # which is the default
+        assert service.submit(options=options, **{"Idempotency-Key": "key-1"})["id"] == first["id"]
     other = service.submit(**{"Idempotency-Key": "key-2"})
     assert other["id"] != first["id"]
     service.cancel(other)
-    for data, options in ((SMALL, "{}"), (scene_bytes(seed=1), FAST)):
-        answer = service.http.post(
-            "/v1/jobs", content=data, params={"options": options}, headers={"Idempotency-Key": "key-1"}
-        )
+    headers = {"Idempotency-Key": "key-1"}
+    for data, options in ((SMALL, "{}"), (SMALL, formats[1]), (scene_bytes(seed=1), FAST)):
+        answer = service.http.post("/v1/jobs", content=data, params={"options": options}, headers=headers)
         problem(answer, 422, "key-reused")
     assert service.uploads() == []
 

@@ -4,7 +4,7 @@ import itertools
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from helpers.job_rows import add
+from helpers.data_folders import add_a_row as add
 
 from service.core.models import ENDED, State
 from service.jobs.status import QueueEstimator, job_status

@@ -11,8 +11,8 @@ import time
 from functools import partial
 
 import pytest
+from helpers.data_folders import add_a_row as add
 from helpers.data_folders import database as execute
-from helpers.job_rows import add
 from helpers.running import wait_until
 from helpers.service import SLOW, SMALL, Service, problem, read_response, scene_bytes
 

@@ -91,22 +91,28 @@ def test_a_header_is_still_checked_before_the_body(tmp_path):
         asyncio.run(receive_scene(tmp_path, head[:-1], head[-1:], complete=False))
 
 
-def parsed(*packets, content_type=BOUNDARY):
+def events_of(*packets):
+    """Return the beginnings of the parts of a form, and the bytes between them."""
+
     async def chunks():
         for packet in packets:
             yield packet
 
     async def collect():
-        fields, name = {}, None
-        async for event in parts(content_type, chunks()):
-            match event:
-                case PartBegin(name, _):
-                    fields[name] = b""
-                case bytes():
-                    fields[name] += event
-        return fields
+        return [event async for event in parts(BOUNDARY, chunks())]
 
     return asyncio.run(collect())
+
+
+def parsed(*packets):
+    fields, name = {}, None
+    for event in events_of(*packets):
+        match event:
+            case PartBegin(name, _):
+                fields[name] = b""
+            case bytes():
+                fields[name] += event
+    return fields
 
 
 FIELDS = {"options": b"{}", "file": b"ply\n"}
@@ -222,14 +228,7 @@ NAMES = {
 
 def file_names(parameters):
     form = b'--b\r\nContent-Disposition: form-data; name="file"; %s\r\n\r\n\r\n--b--\r\n' % parameters.encode()
-
-    async def chunks():
-        yield form
-
-    async def collect():
-        return [event.filename async for event in parts(BOUNDARY, chunks())]
-
-    return asyncio.run(collect())
+    return [event.filename for event in events_of(form)]
 
 
 @pytest.mark.parametrize("given", NAMES)
