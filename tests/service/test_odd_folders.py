@@ -148,9 +148,10 @@ def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
         assert (found.state, found.problem["code"]) == (State.FAILED, "output")
         assert found.problem["detail"].endswith("cannot be written: directory not empty; try again later")
         is_permanent = context.worker.completion.is_permanent
-        assert not is_permanent(OSError(errno.ENOSPC, "no space left on device"))
+        errors = [OSError(number, "") for number in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR, errno.ENOENT)]
+        assert [is_permanent(error) for error in (*errors, OSError(errno.ENOSPC, ""))] == [True] * 4 + [False]
         context.storage.jobs.rename(tmp_path / "away")  # which may come back
-        assert not is_permanent(OSError(errno.ENOENT, ""))
+        assert not any(map(is_permanent, errors))
         (tmp_path / "away").rename(context.storage.jobs)
 
 

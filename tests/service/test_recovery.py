@@ -204,3 +204,9 @@ def test_a_damaged_result(two_jobs, damage, state, caplog):
         context.storage.remove_work(job)
         assert sorted(path.name for path in (folder / "jobs" / job).iterdir()) == ["result", "scene.ply"]
         assert json.loads((context.storage.result(job) / "summary.json").read_text()) == summary
+
+
+def test_a_missing_result(two_jobs):
+    folder, waiting, _ = two_jobs
+    with service(folder) as context, pytest.raises(FileNotFoundError, match="its result is missing"):
+        context.storage.keep_result(waiting, folder / "jobs" / waiting)

@@ -5,6 +5,7 @@ import itertools
 import json
 
 import numpy as np
+import pytest
 from helpers.viewers import page_camera
 from helpers.web_tools import run_node
 
@@ -92,6 +93,7 @@ def test_damaged_manifests():
         assert tree["error"].startswith("The list of this scene's files is damaged: ")
 
 
+@pytest.mark.quick(0)
 def test_a_manifest_of_very_many_leaves_and_files():
     """The whole is one flat list of leaves, each with its own file."""
     count = 130_000

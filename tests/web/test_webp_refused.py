@@ -161,7 +161,7 @@ def corpus():
 
 
 @pytest.mark.parametrize("part", range(PARTS))
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_changed_bytes(part, corpus, tmp_path):
     """Any change gives an error of one sentence or an image, the same as libwebp's if that decodes the file."""
     rng = np.random.default_rng(part)
