@@ -66,7 +66,7 @@ def outcome_on(cluster, local=None, finetune=False, **settings):
 
 
 def test_a_node_that_cannot_work_loses_the_start_and_is_named_in_the_log_only(caplog):
-    """On this machine, another start would meet the same."""
+    """Another start on this machine would meet the same."""
     message = "the machine secret-7 cannot use the folder of the work: no such file"
     unusable = Outcome("error", code="node-unusable", message=message, node="10.0.0.7")
     elsewhere = outcome_on(Cluster(unusable))
