@@ -13,7 +13,7 @@ from helpers.viewers import pinhole, psnr, seen_from, skewed
 from helpers.web_tools import DECODER
 
 import kissgs
-from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
+from kissgs.core.splats import SH_REST_COUNTS
 
 pytestmark = pytest.mark.skipif(not (DECODER / "vendor").exists(), reason="scripts/vendor has not run")
 
@@ -138,8 +138,7 @@ def test_images_agree_with_the_rasteriser(page, degree):
 
 def test_a_white_background(page):
     scene = kissgs.sample_scene(3000, sh_degree=1)
-    near = np.linalg.norm(scene.means, axis=1) < 2  # no sky
-    splats = Splats(**{name: getattr(scene, name)[near] for name in ATTRIBUTES})
+    splats = scene.select(np.linalg.norm(scene.means, axis=1) < 2)  # no sky
     (drawn,) = draw(page, splats, [FRONT], background="#ffffff")
     log.info("on white: %.1f dB", psnr(drawn, expected(splats, FRONT, background=(1, 1, 1))))
     assert psnr(drawn, expected(splats, FRONT, background=(1, 1, 1))) > 40

@@ -159,13 +159,13 @@ def codes_of_one_and_two_symbols():
         writer = Writer(16, 16)
         writer.put(0, 3)
         codes = [write(writer), *(writer.simple(symbol) for symbol in (7, 255, 128, 0))]
-        for value in np.random.default_rng(1).choice(list(codes[0].values()), 256):
+        for value in np.random.default_rng(1).choice(list(codes[0]), 256):
             writer.symbol(codes[0], int(value))
         return writer
 
     def one_bit(writer):
         writer.put(0b0001, 4)  # read upwards: simple, one symbol, of one bit, 0
-        return {(1, 0): 0}
+        return {0: (1, 0)}
 
     def only(length, symbol):
         return lambda writer: writer.code([0] * symbol + [length], 280)
