@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from helpers.data_folders import add_a_job, finish_a_job, listing, names, service
 from helpers.running import wait_until
-from helpers.service import FAST, SLOW, SMALL, problem, scene_bytes
+from helpers.service import SLOW, SMALL, problem, scene_bytes
 
 from kissgs.runners import Outcome
 from service.core.models import State
@@ -175,7 +175,7 @@ def test_readiness(start, monkeypatch):
         if replacement == "a file":
             folder.unlink()
         (it.folder / "away").rename(folder)  # over an empty folder, too
-        assert it.http.post("/v1/jobs", content=SMALL, params={"options": FAST}).status_code == 202
+        assert it.ended(it.submit())["state"] == "succeeded"
 
 
 def test_a_folder_that_cannot_be_written_to(start):
