@@ -7,10 +7,13 @@ import threading
 import time
 
 import pytest
-from helpers.data_folders import opened
+from helpers.data_folders import finish_a_job, opened
+from helpers.data_folders import service as opened_service
 from helpers.running import is_alive, wait_until
 from helpers.service import FAST, SLOW, Service, ServiceProcess, problem, scene_bytes
+from sqlalchemy.exc import OperationalError
 
+from service.core.models import State
 from service.core.settings import SettingsError
 from service.http.server import config_of
 from service.storage.job_files import RESERVE_BYTES
@@ -126,6 +129,27 @@ def test_a_full_disk_without_a_reserve_says_how_much_to_free(tiny_disk):
         service.restart()
         fill(tiny_disk)
         assert service.http.delete(ended["links"]["self"]).status_code == 204
+
+
+@pytest.mark.parametrize("needed", ["jobs", "reserve", "nothing that there is"])
+def test_the_record_of_a_deletion_finds_space(tmp_path, monkeypatch, needed):
+    """On a full disk, only removed files or the reserve give the space that a record takes."""
+    with opened_service(tmp_path / "data") as context:
+        job_id = finish_a_job(context)
+        job, move = context.store.get(job_id), context.store.move
+
+        def full(*arguments, **values):
+            paths = {"jobs": context.storage.jobs / job_id, "reserve": tmp_path / "data" / "reserve"}
+            if paths.get(needed, tmp_path).exists():
+                raise OperationalError("", {}, Exception("database or disk is full"))
+            return move(*arguments, **values)
+
+        monkeypatch.setattr(context.store, "move", full)
+        may_fail = pytest.raises(OperationalError) if needed not in ("jobs", "reserve") else contextlib.nullcontext()
+        with may_fail:
+            context.worker.completion.expire(job.number, job_id)
+        assert (context.store.get(job_id).state == State.EXPIRED) == (needed in ("jobs", "reserve"))
+        assert not (context.storage.jobs / job_id).exists()
 
 
 def test_a_short_job_ends_before_the_service_stops(start_process):
