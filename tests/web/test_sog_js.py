@@ -81,8 +81,8 @@ def test_containers_of_splat_transform(degree, tmp_path):
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.quick(2)
 def test_both_versions(version, degree):
-    """Extreme values, no Gaussians, images of any shape."""
-    scenes = [sog_files(made_scene(count, degree), version=version) for count in (0, 1, 65)]
+    """Extreme values, no Gaussians, more labels than a byte has, images of any shape."""
+    scenes = [sog_files(made_scene(count, degree), version=version) for count in (0, 1, 300)]
     scenes += [sog_files(made_scene(65, degree), version=version, width=w, height=h) for w, h in ((65, 1), (7, 30))]
     for report, some in zip(in_node(*map(sog_job, scenes)), scenes, strict=True):
         assert_equal(report, some)
