@@ -133,7 +133,7 @@ def test_a_full_disk_without_a_reserve_says_how_much_to_free(tiny_disk):
 
 @pytest.mark.parametrize("needed", ["jobs", "reserve", "nothing that there is"])
 def test_the_record_of_a_deletion_finds_space(tmp_path, monkeypatch, needed):
-    """On a full disk, only removed files or the reserve give the space that a record takes."""
+    """Only removed files or the reserve give the space that a record takes on a full disk."""
     with opened_service(tmp_path / "data") as context:
         job_id = finish_a_job(context)
         job, move = context.store.get(job_id), context.store.move
