@@ -77,12 +77,12 @@ def warmup() -> None:
     """Compile and cache all kernels, and measure the speed of this machine, by which --time chooses what to do."""
     from kissgs.compaction import merging  # noqa: F401
     from kissgs.core import numba_kernels
-    from kissgs.finetuning import planes  # noqa: F401
     from kissgs.planning import kernels, kmeans_kernels, rdo_kernels  # noqa: F401
     from kissgs.rendering import ssim_kernels  # noqa: F401
     from kissgs.rendering.cpu import backward, neighbours, sensitivity  # noqa: F401
 
     if find_spec("torch"):  # without it nothing is trained
+        from kissgs.finetuning import planes  # noqa: F401
         from kissgs.training import model  # noqa: F401
 
     with progress_bar(False) as progress:

@@ -32,7 +32,7 @@ def port(monkeypatch):
         listener.bind(("127.0.0.1", 0))
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         config = server.config_of(application)
-        config.lifespan = "off"
+        config.lifespan, config.timeout_keep_alive = "off", 1
         running = uvicorn.Server(config)
         thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
         thread.start()
