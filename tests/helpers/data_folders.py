@@ -39,17 +39,22 @@ def service(folder):
         context.close()
 
 
+def add_a_row(store, owner="", *, max_queue=10, max_owner=3, **values):
+    """Add a queued job to the table alone; return it."""
+    fixed = {"name": "scene", "options": {"preset": "fast"}, "preset": "fast", "evaluate": False}
+    fixed |= {"gaussians": 20_000, "sh_degree": 1, "upload_sha256": "0" * 64, "fingerprint": "f"}
+    fixed |= {"upload_bytes": 5_000_000_000, "disk_bytes": 3_000_000_000}
+    job = Job(id=uuid.uuid4().hex, owner=owner, **{**fixed, **values})
+    return store.add(job, max_queue=max_queue, max_owner=max_owner)
+
+
 def add_a_job(context, scene=b"ply"):
     """Add a queued job; return its id."""
-    job_id = uuid.uuid4().hex
+    sizes = {"gaussians": 3, "upload_bytes": len(scene), "disk_bytes": len(scene)}
+    job_id = add_a_row(context.store, max_queue=1000, max_owner=1000, **sizes).id
     upload = context.storage.new_upload()
     upload.write_bytes(scene)
     context.storage.adopt(upload, job_id)
-    job = Job(
-        id=job_id, owner="", name="scene", options={"preset": "fast"}, preset="fast", evaluate=False, gaussians=3,
-        sh_degree=0, upload_bytes=3, upload_sha256="0" * 64, fingerprint="0", disk_bytes=3,
-    )  # fmt: skip
-    context.store.add(job, max_queue=1000, max_owner=1000)
     return job_id
 
 
@@ -100,6 +105,6 @@ def command(folder, **settings):
 
 
 def database(folder, *statements):
-    with contextlib.closing(sqlite3.connect(folder / "jobs.sqlite")) as found, found:
+    with contextlib.closing(sqlite3.connect(folder / "jobs.sqlite", timeout=300)) as found, found:
         for statement in statements:
             found.execute(statement)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from helpers import extreme_scenes
-from helpers.extreme_scenes import Arrays
+from helpers.extreme_scenes import Arrays, changed, cloud, seen_from, sized, with_values
 from kissgs.rendering.camera import Camera
 
 BOUNDS = {
@@ -59,22 +61,28 @@ KEPT = "kept as it is"
 EXTREMES = [
     Extreme("ordinary", "a cloud of 12 Gaussians of SH degree 1", KEPT, extreme_scenes.cloud),
     # Positions
-    Extreme("micrometre", "a world 1e-6 across", KEPT, extreme_scenes.micrometre, extreme_scenes.microscope),
-    Extreme("megametre", "a world 1e6 across", KEPT, extreme_scenes.megametre, extreme_scenes.from_afar),
+    Extreme("micrometre", "a world 1e-6 across", KEPT, lambda: sized(1e-6), extreme_scenes.microscope),
+    Extreme(
+        "megametre",
+        "a world 1e6 across",
+        KEPT,
+        lambda: sized(1e6),
+        lambda: seen_from([3e5, -4e5, -3e6], [0, 0, 0], 0.8),
+    ),
     Extreme(
         "far-away",
         "a world of 1, 1e6 from the origin",
         "kept, but float32 has no more than 16 places in 1 there",
-        extreme_scenes.displaced,
-        extreme_scenes.displaced_camera,
+        lambda: changed(means=cloud()["means"] + [1e6, -1e6, 1e6]),
+        lambda: seen_from([1e6 + 0.3, -1e6 - 0.4, 1e6 - 3], [1e6, -1e6, 1e6], 0.8),
         bounds={"step": 5e-2},  # positions cannot move, so the next images differ a little
     ),
     Extreme(
         "two-axes-away",
         "a world of 1, 1000 from the origin along two axes",
         "kept; a container's steps are 0.13 there, which the report says: origin=auto keeps positions",
-        extreme_scenes.offset_of_two_axes,
-        extreme_scenes.offset_camera,
+        lambda: changed(means=cloud()["means"] + [1000, 1000, 0]),
+        lambda: seen_from([1000.3, 999.6, -3], [1000, 1000, 0], 0.8),
     ),
     Extreme(
         "long-scan",
@@ -85,29 +93,34 @@ EXTREMES = [
     Extreme("1e15", "positions from 1e-6 to 1e15", "kept; nothing beyond 1e10 is drawn", extreme_scenes.up_to_1e15),
     Extreme(
         *("beyond-1e15", "positions beyond ±1e15", "removed: renderers' float32 squares overflow soon after"),
-        extreme_scenes.beyond_1e15,
+        lambda: with_values("means", 1.1e15, -1e20, 3.4e38),
         changes={"far_away": 3},
     ),
     Extreme(
         *("outlier", "one position of 1e6", "kept; a position's step grows as 1 + abs(x): the others hardly suffer"),
-        extreme_scenes.outlier,
+        lambda: with_values("means", 1e6),
     ),
-    Extreme("line", "all on a line", "kept; the two constant coordinates within the common step", extreme_scenes.line),
-    Extreme("one-place", "all in one place", KEPT, extreme_scenes.one_place),
+    Extreme(
+        "line",
+        "all on a line",
+        "kept; the two constant coordinates within the common step",
+        lambda: changed(means=cloud()["means"] * [1, 0, 0] + [0, 0.25, 0.5]),
+    ),
+    Extreme("one-place", "all in one place", KEPT, lambda: changed(means=[0.1, -0.2, 0.3])),
     # Shapes
     Extreme(
         "points",
         "log-scales of -30",
         "kept; drawn as the 0.3 px² dot that the dilation makes of them",
-        extreme_scenes.points,
+        lambda: changed(scales=-30),
     ),
-    Extreme("fog", "log-scales of 30", "kept; drawn as fog of one colour", extreme_scenes.fog),
+    Extreme("fog", "log-scales of 30", "kept; drawn as fog of one colour", lambda: changed(scales=30, opacities=-1)),
     Extreme(
         *(
             "scales-beyond",
             "log-scales beyond ±30, ±inf too (logarithm of 0)",
             "clamped to ±30",
-            extreme_scenes.scales_beyond,
+            lambda: with_values("scales", 100, -100, np.inf, -np.inf, 30.001, -3e38),
         ),
         changes={"clamped_scales": 6},
     ),
@@ -115,28 +128,38 @@ EXTREMES = [
         *("needles", "needles, 1e13 to 1e26 times longer than wide", "kept; drawn from sums of squares: no digit lost"),
         extreme_scenes.needles,
     ),
-    Extreme("discs", "discs of no thickness", KEPT, extreme_scenes.discs),
-    Extreme("balls", "all scales alike", "exact", extreme_scenes.balls),
+    Extreme("discs", "discs of no thickness", KEPT, lambda: changed(scales=[-1.5, -1.5, -30])),
+    Extreme("balls", "all scales alike", "exact", lambda: changed(scales=-1.75)),
     # Opacities
     Extreme(
         *(
             "infinite-logits",
             "opacity logits of ±inf",
             "set to those of 1e-6 and 1 - 1e-6",
-            extreme_scenes.infinite_logits,
+            lambda: with_values("opacities", *[np.inf, -np.inf] * 4),
         ),
         changes={"infinite_opacities": 8},
     ),
     Extreme(
-        *("saturated", "opacity logits of ±14 to ±3e38", "set to the same two", extreme_scenes.saturated),
+        *(
+            "saturated",
+            "opacity logits of ±14 to ±3e38",
+            "set to the same two",
+            lambda: with_values("opacities", 14, -14, 40, -40, 1000, -1000, 3e38, -3e38),
+        ),
         changes={"saturated_opacities": 8},
     ),
     Extreme(
         *("transparent", "all transparent"),
         "left out of the container, not drawn, gradient and score 0",
-        extreme_scenes.transparent,
+        lambda: changed(opacities=-13),
     ),
-    Extreme("opaque", "all opaque", "drawn with alpha 0.99 at most; what is behind scores 0", extreme_scenes.opaque),
+    Extreme(
+        "opaque",
+        "all opaque",
+        "drawn with alpha 0.99 at most; what is behind scores 0",
+        lambda: changed(opacities=13.5, scales=cloud()["scales"] + 0.8),
+    ),
     # Rotations
     Extreme(
         *("no-rotation", "quaternions of length 0", "replaced by no rotation", extreme_scenes.no_rotation),
@@ -147,12 +170,17 @@ EXTREMES = [
             "short-quaternions",
             "quaternions of length 1e-38",
             "normalised, in float64",
-            extreme_scenes.short_quaternions,
+            lambda: changed(quats=cloud()["quats"] * 1e-38),
         ),
         changes={"unnormalised_quats": 12},
     ),
     Extreme(
-        *("long-quaternions", "quaternions of length 1e38", "normalised, in float64", extreme_scenes.long_quaternions),
+        *(
+            "long-quaternions",
+            "quaternions of length 1e38",
+            "normalised, in float64",
+            lambda: changed(quats=cloud()["quats"] * 1e38),
+        ),
         changes={"unnormalised_quats": 12},
     ),
     # No numbers
@@ -171,16 +199,32 @@ EXTREMES = [
         "denormal",
         "all values denormal",
         "kept; rotations normalised",
-        extreme_scenes.denormal,
+        lambda: {name: values * 1e-42 for name, values in cloud().items()},
         changes={"unnormalised_quats": 12},
     ),
     # Colours
     Extreme("loud", "SH coefficients of 1e6", "kept; errors are of the brightest", extreme_scenes.loud),
-    Extreme("too-loud", "SH coefficients beyond ±1e6", "clamped", extreme_scenes.too_loud, changes={"clamped_sh": 4}),
+    Extreme(
+        "too-loud",
+        "SH coefficients beyond ±1e6",
+        "clamped",
+        lambda: with_values("sh0", 1.1e6, -3e38, 1e9) | {"shN": with_values("shN", *[0.1] * 3, -2e6)["shN"]},
+        changes={"clamped_sh": 4},
+    ),
     Extreme("denormal-sh", "SH coefficients of 1e-42", KEPT, extreme_scenes.denormal_sh),
     # Statistics
-    Extreme("constant", "channels that are constant", "exact", extreme_scenes.constant),
-    Extreme("alike", "all Gaussians alike", "one entry of the codebook; exact but for positions", extreme_scenes.alike),
+    Extreme(
+        "constant",
+        "channels that are constant",
+        "exact",
+        lambda: changed(quats=[1, 0, 0, 0], scales=[-1.5, -2, -2.5], opacities=0.25, sh0=0.75, shN=-0.125),
+    ),
+    Extreme(
+        "alike",
+        "all Gaussians alike",
+        "one entry of the codebook; exact but for positions",
+        lambda: {name: values[np.full(12, 2)] for name, values in cloud().items()},
+    ),
     Extreme(
         "cauchy", "heavy tails: every attribute Cauchy", "kept within the bounds of cleaning", extreme_scenes.cauchy
     ),
@@ -213,7 +257,13 @@ EXTREMES = [
         for degree in (0, 1, 2, 3)
     ),
     # In images
-    Extreme("ties", "equal depths", "drawn in the scene's order", extreme_scenes.ties, extreme_scenes.straight),
+    Extreme(
+        "ties",
+        "equal depths",
+        "drawn in the scene's order",
+        lambda: changed(means=cloud()["means"] * [1, 1, 0]),
+        extreme_scenes.straight,
+    ),
     Extreme(
         *("near-ties", "depths that float32 cannot tell apart", "drawn in the scene's order"),
         extreme_scenes.near_ties,
@@ -228,5 +278,10 @@ EXTREMES = [
         *("near-plane", "on the camera plane, behind it, and about 0.01 before it", "nearer than 0.01: not drawn"),
         extreme_scenes.near_plane,
     ),
-    Extreme("beside", "none in the image", "not drawn, gradient and score 0", extreme_scenes.beside),
+    Extreme(
+        "beside",
+        "none in the image",
+        "not drawn, gradient and score 0",
+        lambda: changed(means=cloud()["means"] + [0, 500, 0]),
+    ),
 ]

@@ -106,15 +106,14 @@ class Preview:
         screenshot = self.page.locator("#stage").screenshot(animations="disabled")
         return np.asarray(Image.open(io.BytesIO(screenshot)).convert("RGB")).astype(int)
 
-    def still_image(self, seconds=300, still=3):
-        """Return a screenshot when ``still`` of them, 0.2 s apart, are equal, so that Spark has finished sorting."""
-        end = time.monotonic() + seconds
-        seen = [self.pixels()]
+    def still_image(self, seconds=300):
+        """Return a screenshot when no frame has been requested for 0.4 s, so that Spark has finished sorting."""
+        end, frames = time.monotonic() + seconds, -1
         while time.monotonic() < end:
-            self.page.wait_for_timeout(200)
-            seen = [*seen[1 - still :], self.pixels()]
-            if len(seen) == still and all(np.array_equal(seen[0], other) for other in seen[1:]):
-                return seen[-1]
+            before, frames = frames, self.page.evaluate("resourceCounts().frames")
+            if frames == before:
+                return self.pixels()
+            self.page.wait_for_timeout(400)
         raise AssertionError("the image keeps changing")
 
     def error_message(self, *words):

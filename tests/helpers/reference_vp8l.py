@@ -20,11 +20,11 @@ def stream_of(data):
 
 
 def codes_of(lengths):
-    """Return the symbols of a canonical code by (length, code), shortest first."""
+    """Return (length, code) of each symbol of a canonical code, shortest first."""
     code, last, found = 0, 0, {}
     for length, symbol in sorted((length, symbol) for symbol, length in enumerate(lengths) if length):
         code <<= length - last
-        found[length, code] = symbol
+        found[symbol] = length, code
         code, last = code + 1, length
     return found
 
@@ -85,9 +85,9 @@ class Writer:
 
     def symbol(self, codes, symbol):
         if len(codes) == 1:
-            assert symbol in codes.values()
+            assert symbol in codes
             return
-        length, code = next(key for key, found in codes.items() if found == symbol)
+        length, code = codes[symbol]
         self.bits += [code >> i & 1 for i in reversed(range(length))]
 
     def literal_codes(self, cache=0, lengths=False):

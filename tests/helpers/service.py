@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import copy
 import io
 import json
 import logging
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from fastapi import FastAPI
 
 import kissgs
 import kissgs.runners
@@ -86,6 +88,7 @@ class Service:
         logger.addHandler(self._handler)
         logger.setLevel(logging.INFO)
         with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(FastAPI, "openapi", _openapi)
             if not self.processes:
                 patch.setattr(kissgs.runners, "LocalRunner", ThreadRunner)
             app = create_app(settings)
@@ -204,6 +207,16 @@ class Service:
         connection = socket.create_connection(("127.0.0.1", self.port), timeout=300)
         connection.sendall(data)
         return connection
+
+
+_generate, _generated = FastAPI.openapi, {}
+
+
+def _openapi(app: FastAPI) -> dict:
+    """Return the OpenAPI document, which takes most of the time of a start, and is the same for all services."""
+    if not _generated:
+        _generated.update(copy.deepcopy(_generate(app)))
+    return copy.deepcopy(_generated)
 
 
 class _Server(Server):

@@ -9,7 +9,7 @@ import pytest
 
 from helpers.web_tools import DECODER, Site
 from kissgs.core.splats import Splats
-from kissgs.rendering.camera import look_at
+from kissgs.rendering.camera import Camera, look_at
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 QUIET = ["--no-sandbox", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
@@ -42,10 +42,17 @@ def scattered(count, degree):
     return Splats(**{name: np.ascontiguousarray(value, np.float32) for name, value in values.items()})
 
 
-def seen_from(position, size):
-    return look_at(
-        np.array(position, float), np.zeros(3), np.array([0, -1.0, 0]), fov=0.9, width=size[0], height=size[1]
-    )
+def seen_from(position, size=(300, 200), target=(0, 0, 0)):
+    place, at = np.array(position, float), np.array(target, float)
+    return look_at(place, at, np.array([0, -1.0, 0]), fov=0.9, width=size[0], height=size[1])
+
+
+def skewed(camera, right=0.07, up=0.05):
+    """Return a camera whose principal point is moved by shares of the image, and whose pixels are not square."""
+    K = camera.K.copy()
+    K[0, 0] *= 1.25
+    K[:2, 2] += (right * camera.width, -up * camera.height)
+    return Camera(camera.viewmat, K, camera.width, camera.height)
 
 
 def pinhole(camera):
@@ -57,6 +64,15 @@ def image_of(text, camera):
     """Return the image of 0 to 1 that a viewer sent as text."""
     pixels = np.frombuffer(base64.b64decode(text), np.uint8)
     return pixels.reshape(camera.height, camera.width, 4)[::-1, :, :3] / 255
+
+
+def page_camera(view, size=(200, 100), focal=100.0):
+    """Return the camera of a 4 x 4 view matrix, with y up and z backwards, in the form of our page."""
+    width, height = size
+    projection = [[2 * focal / width, 0, 0, 0], [0, 2 * focal / height, 0, 0], [0, 0, -1, -0.02], [0, 0, -1, 0]]
+    eye = -view[:3, :3].T @ view[:3, 3]
+    matrix = (np.array(projection) @ view).T.ravel()
+    return {"matrix": matrix.tolist(), "eye": eye.tolist(), "focal": focal, "pixels": width * height}
 
 
 class Viewer:

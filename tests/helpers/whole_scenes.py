@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from kissgs import Camera, Splats, render, sample_scene
+from kissgs.core.splats import concatenate
 
 KINDS = ("all around", "close up", "farther off", "across")
 BACKGROUNDS = (0.0, 0.5, 1.0)
@@ -18,21 +19,14 @@ BACKGROUNDS = (0.0, 0.5, 1.0)
 
 def moved(splats: Splats, *, by: tuple[float, float, float] = (0, 0, 0), scale: float = 1.0) -> Splats:
     """Return a copy, scaled about the origin and then translated."""
-    return Splats(
-        means=(splats.means.astype(np.float64) * scale + by).astype(np.float32),
-        quats=splats.quats,
-        scales=splats.scales + np.float32(np.log(scale)),
-        opacities=splats.opacities,
-        sh0=splats.sh0,
-        shN=splats.shN,
-    )
+    means = (splats.means.astype(np.float64) * scale + by).astype(np.float32)
+    return replace(splats, means=means, scales=splats.scales + np.float32(np.log(scale)))
 
 
 def joined(*parts: Splats) -> Splats:
     """Return all parts in one scene, in random order."""
-    order = np.random.default_rng(5).permutation(sum(len(part) for part in parts))
-    names = ("means", "quats", "scales", "opacities", "sh0", "shN")
-    return Splats(**{name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names})
+    whole = concatenate(parts)
+    return whole.select(np.random.default_rng(5).permutation(len(whole)))
 
 
 def surface(points: np.ndarray, normals: np.ndarray, size: float, seed: int) -> Splats:
@@ -90,10 +84,9 @@ def wall() -> Splats:
 
 def huge_opaque() -> Splats:
     """Return a scene with an enormous opaque Gaussian beside it."""
-    one = sample_scene(1)
-    giant = Splats(
+    giant = replace(
+        sample_scene(1),
         means=np.array([[150, 0, 0]], np.float32),
-        quats=one.quats,
         scales=np.full((1, 3), np.log(40), np.float32),
         opacities=np.full(1, 8, np.float32),
         sh0=np.full((1, 3), 0.4, np.float32),

@@ -182,7 +182,7 @@ def test_no_job_starts_without_a_node_that_is_large_enough(on_the_cluster, whole
         wait_until(lambda: f"no job is started: {expected}" in service.log.read_text())
 
 
-@pytest.mark.quick(0)  # with a cluster of its own making, in tests/service/test_lost_starts.py
+@pytest.mark.quick(0)  # with a cluster of its own making, in tests/service/test_outcomes.py
 def test_training_without_the_gpu_that_it_requests_fails_and_does_not_wait(on_the_cluster, tmp_path):
     with Service(tmp_path / "data", **on_the_cluster, KISSGS_JOB_GPUS=1) as service:
         status = service.ended(service.submit(SMALL, json.dumps({"preset": "fast", "finetune": {"enabled": True}})))

@@ -44,19 +44,15 @@ def seconds(records=None, gaussians=SCENE, started=None, **options):
     return QueueEstimator(records or Records(), 1).current().seconds_left(job)
 
 
-@pytest.fixture
-def no_torch(monkeypatch):
-    monkeypatch.setattr("service.http.submission.can_train", lambda: False)
-    monkeypatch.setattr("service.jobs.status.can_train", lambda: False)
-
-
 @pytest.mark.parametrize("options", [{}, {"encode": {"target_size": "3MB"}}, {"finetune": {"enabled": True}}])
 def test_a_limited_job_takes_its_time_and_the_start(options):
     assert seconds(**options) > 31
     assert seconds(time_limit="30s", **options) == 31
 
 
-def test_more_time_than_it_takes_changes_nothing(no_torch):
+def test_more_time_than_it_takes_changes_nothing(monkeypatch):
+    monkeypatch.setattr("service.http.submission.can_train", lambda: False)
+    monkeypatch.setattr("service.jobs.status.can_train", lambda: False)
     assert seconds(time_limit="10h") == seconds() == usual_seconds("balanced", False, SCENE)
     assert seconds(time_limit="10h", preset="fast") == seconds(preset="fast")
 

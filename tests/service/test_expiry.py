@@ -4,14 +4,12 @@ import asyncio
 import time
 
 import pytest
-from helpers.data_folders import add_a_job
+from helpers.data_folders import add_a_job, opened
 from helpers.running import wait_until
 from helpers.service import SMALL, problem
 
 import kissgs
 from service.core.models import State
-from service.core.settings import ServiceSettings
-from service.http.app import build
 from service.jobs.expiry import ExpiryTask
 
 
@@ -30,8 +28,7 @@ def test_expiry(start):
 
 def test_clock_jumps(tmp_path, monkeypatch):
     """A jump of the clock by a year neither expires jobs early nor makes durations negative."""
-    monkeypatch.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
-    context = build(ServiceSettings.from_environment())
+    context = opened(tmp_path / "data")
     job_id = add_a_job(context, SMALL)
     real = time.time
     for jump in (365 * 86400, -365 * 86400):
@@ -43,7 +40,7 @@ def test_clock_jumps(tmp_path, monkeypatch):
         assert 0 <= found.finished_at - found.started_at < 60
         assert 0 <= found.started_at - found.created_at < 60
     context.close()
-    restarted = build(ServiceSettings.from_environment())  # a year back: the time continues
+    restarted = opened(tmp_path / "data")  # a year back: the time continues
     assert 0 <= restarted.clock() - found.finished_at < 60
     restarted.close()
 

@@ -7,14 +7,15 @@ import threading
 import time
 
 import pytest
-from helpers.data_folders import opened
+from helpers.data_folders import finish_a_job, opened
+from helpers.data_folders import service as opened_service
 from helpers.running import is_alive, wait_until
 from helpers.service import FAST, SLOW, Service, ServiceProcess, problem, scene_bytes
 from sqlalchemy.exc import OperationalError
 
+from service.core.models import State
 from service.core.settings import SettingsError
 from service.http.server import config_of
-from service.jobs.worker import JobCompletion
 from service.storage.job_files import RESERVE_BYTES
 
 BIG = scene_bytes(20_000, 3)
@@ -83,26 +84,36 @@ def fill(folder):
                     pass
 
 
-def test_a_full_disk_prevents_neither_deletion_nor_a_start(tiny_disk):
-    """Deletion once failed, although the message advised it, and so did a start with a job waiting."""
+def test_a_full_disk_does_not_prevent_deletion(tiny_disk):
+    """Deletion once failed, although the message advised it. The space is that of the files, and then the reserve."""
+    with Service(tiny_disk / "data") as service:
+        service.log = tiny_disk.parent / "log"
+        ended, running = service.ended(service.submit()), service.hold()
+        waiting = [service.submit(scene_bytes(10, 0)) for _ in range(2)]
+        for job in (ended, *waiting, running):
+            fill(tiny_disk)
+            assert service.http.delete(job["links"]["self"]).status_code == 204
+        (tiny_disk / "filler").unlink()
+        assert service.ended(service.submit())["state"] == "succeeded"
+
+
+@pytest.mark.quick(0)
+def test_a_full_disk_prevents_no_start(tiny_disk):
+    """It once did, with a job waiting."""
     service = ServiceProcess(tiny_disk / "data")
     service.log = tiny_disk.parent / "log"
     with service:
-        ended = service.ended(service.submit())
         running = service.running(service.submit(MEDIUM, SLOW))
-        others = [service.submit(scene_bytes(10, 0)) for _ in range(3)]
+        others = [service.submit(scene_bytes(10, 0)) for _ in range(2)]
         fill(tiny_disk)
-        assert service.http.delete(ended["links"]["self"]).status_code == 204
-        fill(tiny_disk)
-        assert service.http.delete(others[0]["links"]["self"]).status_code == 204
         service.kill(signal.SIGKILL)
         fill(tiny_disk)
         service.restart()
         assert service.status(running)["state"] in ("queued", "running")
-        for job in (running, others[1]):
+        for job in (running, others[0]):
             assert service.http.delete(job["links"]["self"]).status_code == 204
         (tiny_disk / "filler").unlink()
-        assert service.ended(others[2])["state"] == "succeeded"
+        assert service.ended(others[1])["state"] == "succeeded"
 
 
 def test_a_full_disk_without_a_reserve_says_how_much_to_free(tiny_disk):
@@ -120,38 +131,25 @@ def test_a_full_disk_without_a_reserve_says_how_much_to_free(tiny_disk):
         assert service.http.delete(ended["links"]["self"]).status_code == 204
 
 
-class FullDisk:
-    """Store and storage on one disk, where a record takes space that only removed files or the reserve give."""
+@pytest.mark.parametrize("needed", ["jobs", "reserve", "nothing that there is"])
+def test_the_record_of_a_deletion_finds_space(tmp_path, monkeypatch, needed):
+    """Only removed files or the reserve give the space that a record takes on a full disk."""
+    with opened_service(tmp_path / "data") as context:
+        job_id = finish_a_job(context)
+        job, move = context.store.get(job_id), context.store.move
 
-    def __init__(self, *, files, reserve):
-        self.files, self.reserve, self.free = files, reserve, False
-        self.records = []
+        def full(*arguments, **values):
+            paths = {"jobs": context.storage.jobs / job_id, "reserve": tmp_path / "data" / "reserve"}
+            if paths.get(needed, tmp_path).exists():
+                raise OperationalError("", {}, Exception("database or disk is full"))
+            return move(*arguments, **values)
 
-    def move(self, number, state, **values):
-        if not self.free:
-            raise OperationalError("", {}, Exception("database or disk is full"))
-        self.records.append(state)
-        return True
-
-    def remove_job(self, job_id):
-        self.free |= self.files
-        self.files = False
-        return True
-
-    def free_reserve(self):
-        freed, self.reserve = self.reserve, False
-        self.free |= freed
-        return freed
-
-
-@pytest.mark.parametrize(("files", "reserve"), [(True, False), (False, True)])
-def test_the_record_of_a_deletion_finds_space(files, reserve):
-    disk = FullDisk(files=files, reserve=reserve)
-    completion = JobCompletion(None, disk, disk, None, None)
-    completion.expire(1, "id")
-    assert (disk.records, disk.files) == (["expired"], False)
-    with pytest.raises(OperationalError):
-        JobCompletion(None, nothing := FullDisk(files=False, reserve=False), nothing, None, None).expire(1, "id")
+        monkeypatch.setattr(context.store, "move", full)
+        may_fail = pytest.raises(OperationalError) if needed not in ("jobs", "reserve") else contextlib.nullcontext()
+        with may_fail:
+            context.worker.completion.expire(job.number, job_id)
+        assert (context.store.get(job_id).state == State.EXPIRED) == (needed in ("jobs", "reserve"))
+        assert not (context.storage.jobs / job_id).exists()
 
 
 def test_a_short_job_ends_before_the_service_stops(start_process):

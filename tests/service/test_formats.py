@@ -1,4 +1,4 @@
-"""Uploads of other formats; oracle: the library's own compression of the same file."""
+"""Formats of uploads and of containers; oracle: the library's own compression of the same file."""
 
 import json
 
@@ -8,7 +8,7 @@ from helpers.reference_gltf import attributes, data_uri, document, glb_bytes
 from helpers.reference_sog import sog_files, zip_of
 from helpers.reference_splat import ksplat_bytes, splat_bytes
 from helpers.reference_spz import spz_bytes
-from helpers.service import FAST, problem
+from helpers.service import FAST, SMALL, problem
 from helpers.streamed_scenes import KINDS
 
 import kissgs
@@ -25,14 +25,18 @@ FILES = {
 }
 
 
+def send(service, name, data):
+    return service.http.post("/v1/jobs", files={"file": (name, data)}, data={"options": FAST})
+
+
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.quick(2)
 def test_uploads_of_every_format(service, name, tmp_path):
     kind, data = FILES[name]
-    if kind != "sog":
-        answer = service.http.post("/v1/jobs", files={"file": (name, data)}, data={"options": FAST})
-    else:
+    if kind == "sog":
         answer = service.http.post("/v1/jobs", content=data, params={"options": FAST, "name": name})
+    else:
+        answer = send(service, name, data)
     assert answer.status_code == 202, answer.text
     status = service.ended(answer.json())
     assert status["state"] == "succeeded", status
@@ -49,8 +53,7 @@ def test_uploads_of_every_format(service, name, tmp_path):
 def test_a_splat_that_begins_like_json(service):
     """The first byte of the file is a brace, and none of its first 512 bytes is zero."""
     data = b"{" + bytes(range(1, 32)) * 17
-    answer = service.http.post("/v1/jobs", files={"file": ("a.splat", data[: 16 * 32])}, data={"options": FAST})
-    assert service.ended(answer.json())["source_format"] == "splat"
+    assert service.ended(send(service, "a.splat", data[: 16 * 32]).json())["source_format"] == "splat"
 
 
 ROOT, BUFFER = document(attributes(SCENE))
@@ -68,8 +71,7 @@ REFUSED = {  # what is damaged is tested in tests/io; here, that the sentence na
 
 @pytest.mark.parametrize("kind", REFUSED)
 def test_refused_files_get_one_sentence(service, kind):
-    name, data = REFUSED[kind]
-    answer = service.http.post("/v1/jobs", files={"file": (name, data)}, data={"options": FAST})
+    answer = send(service, *REFUSED[kind])
     found = problem(answer, 422, answer.json()["code"])
     assert found["code"] in ("invalid-scene", "unsupported")
     assert "the upload" in found["detail"] or "the scene has 30,000 Gaussians" in found["detail"]
@@ -79,15 +81,44 @@ def test_refused_files_get_one_sentence(service, kind):
 
 def test_damage_behind_the_headers_fails_the_job(service):
     """Headers are checked on arrival, the rest by the job."""
-    data = FILES["a3.spz"][1]
-    answer = service.http.post("/v1/jobs", files={"file": ("a.spz", data[:-60])}, data={"options": FAST})
-    status = service.ended(answer.json())
+    status = service.ended(send(service, "a.spz", FILES["a3.spz"][1][:-60]).json())
     assert status["state"] == "failed"
     assert status["problem"]["code"] == "invalid-scene"
     assert "is cut short" in status["problem"]["detail"]
 
 
 def test_the_limits_name_the_formats(service):
-    assert service.http.get("/v1/limits").json()["formats"] == [
-        "ply", "sog", "spz", "splat", "ksplat", "glb", "compressed.ply", "spz.glb",
-    ]  # fmt: skip
+    limits = service.http.get("/v1/limits").json()
+    assert limits["formats"] == ["ply", "sog", "spz", "splat", "ksplat", "glb", "compressed.ply", "spz.glb"]
+    assert limits["containers"] == ["sogxt", "sog"]
+
+
+# The option ``format`` ----------------------------------------------------------------------------------------------
+
+SOG = json.dumps({"preset": "fast", "format": "sog"})
+
+
+def test_a_container_of_sog(service, tmp_path):
+    local = kissgs.compress(SMALL, settings=Settings.from_preset("fast"), container="sog")
+    job = service.ended(service.submit(options=SOG))
+    assert job["options"]["format"] == "sog"
+    answer = service.http.get(job["links"]["result"])
+    assert answer.content == local.to_zip()
+    assert answer.headers["content-type"] == "application/octet-stream"
+    assert answer.headers["content-disposition"].startswith('attachment; filename="a scene.sog"')
+    assert job["sizes"]["container"] == len(answer.content)
+    assert job["sizes"]["files"] == local.report.file_bytes
+    for name, data in local.files.items():
+        assert service.http.get(job["links"]["files"].replace("{name}", name)).content == data
+    answer = service.http.get(job["links"]["decoded"])
+    assert 'filename="a scene.decoded.ply"' in answer.headers["content-disposition"]
+    kissgs.decompress(local.to_zip(), tmp_path / "expected.ply")
+    assert answer.content == (tmp_path / "expected.ply").read_bytes()
+
+
+@pytest.mark.parametrize("value", ["spz", "", ["sog"]])
+def test_other_formats_are_refused(service, value):
+    answer = service.http.post("/v1/jobs", content=SMALL, params={"options": json.dumps({"format": value})})
+    found = problem(answer, 422, "invalid-request")
+    assert "format" in found["detail"]
+    assert "'sogxt' or 'sog'" in str(found["errors"])

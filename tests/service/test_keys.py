@@ -19,21 +19,11 @@ def guarded(start):
 
 
 def test_a_missing_or_unknown_key(guarded):
-    for headers in (
-        {},
-        bearer("kissgs_x"),
-        {"Authorization": "Bearer"},
-        {"Authorization": "Basic a2lzc2dzX2E="},
-        bearer("é"),
-    ):
-        raw = {name: value.encode() for name, value in headers.items()}
-        for method, path in (
-            ("POST", "/v1/jobs"),
-            ("POST", "/v1/compress"),
-            ("GET", "/v1/jobs"),
-            ("GET", "/v1/jobs/" + "0" * 32),
-        ):
-            answer = guarded.http.request(method, path, headers=raw)
+    refused = "GET /v1/jobs", "POST /v1/jobs", "POST /v1/compress", "GET /v1/jobs/" + "0" * 32
+    for given in (None, "Bearer kissgs_x", "Bearer", "Basic a2lzc2dzX2E=", "Bearer é"):
+        headers = {} if given is None else {"Authorization": given.encode()}
+        for request in refused:
+            answer = guarded.http.request(*request.split(), headers=headers)
             problem(answer, 401, "unauthorized")
             assert answer.headers["www-authenticate"].startswith("Bearer")
     for open_to_all in ("/", "/livez", "/readyz", "/version", "/v1/limits", "/v1/presets", "/openapi.json"):
@@ -71,14 +61,14 @@ def test_jobs_of_one_key_are_limited(guarded):
     answer = guarded.http.post("/v1/jobs", content=SMALL, headers=bearer("kissgs_a2"))
     assert problem(answer, 429, "too-many-jobs")["retryable"]
     assert "retry-after" in answer.headers
-    assert guarded.http.post("/v1/jobs", content=SMALL, headers=bob).status_code == 202
+    assert guarded.http.post("/v1/jobs", content=SMALL, params={"options": FAST}, headers=bob).status_code == 202
 
 
 def test_pages_of_other_sites_are_refused(service, start):
     """Browsers send forms to other sites without a preflight request, but with the origin of the page."""
-    form = {"file": ("x.ply", SMALL)}
+    form = {"files": {"file": ("x.ply", SMALL)}, "data": {"options": FAST}}
     for origin in ("https://evil.example", "null", service.url.replace("127.0.0.1", "localhost")):
-        answer = service.http.post("/v1/jobs", files=form, headers={"Origin": origin})
+        answer = service.http.post("/v1/jobs", **form, headers={"Origin": origin})
         problem(answer, 403, "foreign")
     for method, path in (("POST", "/v1/jobs/" + "0" * 32 + "/cancel"), ("DELETE", "/v1/jobs/" + "0" * 32)):
         problem(service.http.request(method, path, headers={"Origin": "https://evil.example"}), 403, "foreign")
@@ -86,13 +76,14 @@ def test_pages_of_other_sites_are_refused(service, start):
     for origin, host in (("LOCALHOST", "localhost"), ("localhost", "LocalHost")):  # host names are case-insensitive
         accepted.append({"Origin": f"http://{origin}:{service.port}", "Host": f"{host}:{service.port}"})
     for headers in accepted:
-        answer = service.http.post("/v1/jobs", files=form, headers=headers)
+        answer = service.http.post("/v1/jobs", **form, headers=headers)
         assert answer.status_code == 202
         service.cancel(answer.json())
     asked = {"Origin": "https://good.example", "Access-Control-Request-Method": "POST"}
     assert "access-control-allow-origin" not in service.http.get("/version", headers=asked).headers
     allowed = start(KISSGS_CORS_ORIGINS="https://Good.example", KISSGS_NAMES="splats.example.org")
-    assert allowed.http.post("/v1/jobs", files=form, headers={"Origin": "https://good.example"}).status_code == 202
+    answer = allowed.http.post("/v1/jobs", **form, headers={"Origin": "https://good.example"})
+    assert answer.status_code == 202
     assert allowed.http.get("/version", headers=asked).headers["access-control-allow-origin"] == "https://good.example"
     other = allowed.http.get("/version", headers={**asked, "Origin": "https://example.com"})
     assert "access-control-allow-origin" not in other.headers

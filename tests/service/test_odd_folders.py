@@ -10,10 +10,12 @@ from pathlib import Path
 
 import pytest
 from helpers.data_folders import add_a_job, finish_a_job, listing, names, service
-from helpers.service import FAST, SLOW, SMALL, problem, scene_bytes
+from helpers.running import wait_until
+from helpers.service import SLOW, SMALL, problem, scene_bytes
 
 from kissgs.runners import Outcome
 from service.core.models import State
+from service.jobs import container
 from service.jobs.expiry import ExpiryTask
 
 
@@ -145,42 +147,35 @@ def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
         found = context.store.get(job.id)
         assert (found.state, found.problem["code"]) == (State.FAILED, "output")
         assert found.problem["detail"].endswith("cannot be written: directory not empty; try again later")
-
-
-def test_permanent_errors(tmp_path, monkeypatch):
-    monkeypatch.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
-    with service(tmp_path / "data") as context:
-        recorder = context.worker.completion
-        permanent = [OSError(error, "") for error in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR, errno.ENOENT)]
-        assert all(map(recorder.is_permanent, permanent))
-        assert not recorder.is_permanent(OSError(errno.ENOSPC, "no space left on device"))
-        context.storage.jobs.rename(tmp_path / "away")
-        assert not any(map(recorder.is_permanent, permanent))
+        is_permanent = context.worker.completion.is_permanent
+        errors = [OSError(number, "") for number in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR, errno.ENOENT)]
+        assert [is_permanent(error) for error in (*errors, OSError(errno.ENOSPC, ""))] == [True] * 4 + [False]
+        context.storage.jobs.rename(tmp_path / "away")  # which may come back
+        assert not any(map(is_permanent, errors))
         (tmp_path / "away").rename(context.storage.jobs)
 
 
 # Folders that disappear ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "change"), [("jobs", "moved away"), ("incoming", "a file"), ("jobs", "another folder")]
-)
-def test_readiness(start, name, change):
+def test_readiness(start, monkeypatch):
+    monkeypatch.setattr(container, "READY_SECONDS", 0.0)
     it = start()
-    folder = it.folder / name
-    folder.rename(it.folder / "away")
-    if change == "a file":
-        folder.write_text("")
-    if change == "another folder":
-        folder.mkdir()
-    ready = it.http.get("/readyz")
-    assert (ready.status_code, ready.json()["ready"]) == (503, False)
-    reason = "is missing; restore it" if change == "moved away" else "was replaced; restart the service"
-    assert ready.json()["checks"]["disk"] == f"the data folder cannot be used: its folder {name} {reason}"
-    if change != "moved away":
-        folder.unlink() if change == "a file" else folder.rmdir()
-    (it.folder / "away").rename(folder)
-    assert it.http.post("/v1/jobs", content=SMALL, params={"options": FAST}).status_code == 202
+    for name, replacement in (("jobs", None), ("incoming", "a file"), ("jobs", "another folder")):
+        folder = it.folder / name
+        folder.rename(it.folder / "away")
+        if replacement == "a file":
+            folder.write_text("")
+        elif replacement == "another folder":
+            folder.mkdir()
+        ready = it.http.get("/readyz")
+        assert (ready.status_code, ready.json()["ready"]) == (503, False)
+        reason = "was replaced; restart the service" if replacement else "is missing; restore it"
+        assert ready.json()["checks"]["disk"] == f"the data folder cannot be used: its folder {name} {reason}"
+        if replacement == "a file":
+            folder.unlink()
+        (it.folder / "away").rename(folder)  # over an empty folder, too
+        assert it.ended(it.submit())["state"] == "succeeded"
 
 
 def test_a_folder_that_cannot_be_written_to(start):
@@ -201,10 +196,7 @@ def test_no_job_fails_while_the_folder_of_jobs_is_missing(start):
     running, waiting = it.submit(scene_bytes(6_000, 2)), [it.submit(), it.submit()]
     it.running(running)
     (it.folder / "jobs").rename(it.folder / "away")
-    end = time.monotonic() + 300
-    while it.children():
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_until(lambda: not it.children(), 300)
     time.sleep(1.5)
     assert it.status(running)["state"] in ("running", "queued")
     assert [it.status(job)["state"] for job in waiting] == ["queued", "queued"]

@@ -2,26 +2,22 @@
 
 import asyncio
 import hashlib
-import os
 import re
 import sys
 
 import pytest
+from helpers.data_folders import service as opened_service
 from helpers.service import SMALL
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from service import cli
 from service.core.schemas import Health
 from service.core.settings import ServiceSettings, SettingsError
-from service.http.app import build
 from service.jobs import container
 
 
 @pytest.fixture
-def environment(monkeypatch):
-    for name in os.environ:
-        if name.startswith("KISSGS_"):
-            monkeypatch.delenv(name)
+def environment(no_variables, monkeypatch):
     return monkeypatch
 
 
@@ -137,7 +133,8 @@ def test_readiness_is_checked_every_two_seconds(monkeypatch):
     asyncio.run(ask_twice())
 
 
-def test_an_ended_worker_is_not_ready(tmp_path, environment):
+@pytest.mark.usefixtures("no_variables")
+def test_an_ended_worker_is_not_ready(tmp_path):
     async def scenario():
         context.worker.start()
         await asyncio.sleep(0.01)
@@ -146,10 +143,8 @@ def test_an_ended_worker_is_not_ready(tmp_path, environment):
         await asyncio.sleep(0.01)
         return context.worker.health_problem()
 
-    environment.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
-    context = build(ServiceSettings.from_environment())
-    assert asyncio.run(scenario()) == "worker 0 has ended"
-    context.close()
+    with opened_service(tmp_path / "data") as context:
+        assert asyncio.run(scenario()) == "worker 0 has ended"
 
 
 def test_metrics(start):

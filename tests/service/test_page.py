@@ -5,7 +5,7 @@ import json
 
 import pytest
 from helpers.preview_browser import VENDOR
-from helpers.service import FAST, SLOW, SMALL
+from helpers.service import FAST, SLOW, SMALL, Service
 from helpers.viewers import NO_GPU, chromium
 
 
@@ -13,6 +13,14 @@ from helpers.viewers import NO_GPU, chromium
 def browser():
     with chromium(NO_GPU) as browser:
         yield browser
+
+
+@pytest.fixture(scope="module")
+def busy(tmp_path_factory):
+    """Service whose worker is busy, so that jobs wait until they are cancelled."""
+    with Service(tmp_path_factory.mktemp("busy") / "data", KISSGS_WORKERS=1) as service:
+        service.hold()
+        yield service
 
 
 @pytest.fixture
@@ -91,8 +99,8 @@ def test_upload_compression_and_download(visit, service, local, tmp_path):
     assert download.value.suggested_filename == "my scene.sog"
 
 
-def test_goals_and_a_time_limit(visit, service):
-    page = visit()
+def test_goals_and_a_time_limit(visit, busy):
+    page = visit(busy)
     choose(page)
     page.get_by_text("300 Gaussians").wait_for()
     goal, keep = page.get_by_label("Goal"), page.get_by_label("Gaussians", exact=True)
@@ -129,8 +137,8 @@ def test_goals_and_a_time_limit(visit, service):
     keep.select_option("Keep all")
     page.get_by_role("button", name="Compress").click()
     page.locator("#job-title").wait_for()
-    job = newest(service)
-    service.cancel(job)
+    job = newest(busy)
+    busy.cancel(job)
     assert (job["options"]["time_limit"], job["options"]["encode"]["target_size"]) == (30, 8000)
     assert (job["options"]["compact"]["auto_count"], job["options"]["finetune"]["enabled"]) == (False, False)
 
@@ -169,14 +177,14 @@ REPEATED = {
 
 
 @pytest.fixture
-def repeat(visit, service):
+def repeat(visit, busy):
     """``repeat(options)`` cancels a job with options and prefers them on the page; returns the job and the page."""
 
     def begin(options):
-        job = service.submit(options=json.dumps(options))
-        service.http.post(job["links"]["cancel"])
-        page = visit()
-        page.goto(f"{service.url}/#{job['id']}")
+        job = busy.submit(options=json.dumps(options))
+        busy.cancel(job)
+        page = visit(busy)
+        page.goto(f"{busy.url}/#{job['id']}")
         page.get_by_role("button", name="Try again").click()
         return job, page
 
@@ -185,21 +193,21 @@ def repeat(visit, service):
 
 @pytest.mark.parametrize("name", REPEATED)
 @pytest.mark.quick(1)
-def test_a_repeated_job_has_the_same_options(repeat, service, name):
-    assert_options_are_kept(service, *repeat(REPEATED[name]))
+def test_a_repeated_job_has_the_same_options(repeat, busy, name):
+    assert_options_are_kept(busy, *repeat(REPEATED[name]))
 
 
-def assert_options_are_kept(service, job, page):
+def assert_options_are_kept(busy, job, page):
     choose(page)
     page.get_by_text("300 Gaussians").wait_for()
     page.get_by_role("button", name="Compress").click()
     page.locator("#job-title").wait_for()
-    again = newest(service)
-    service.http.post(f"/v1/jobs/{again['id']}/cancel")
+    again = newest(busy)
+    busy.cancel(again)
     assert (again["id"] != job["id"], again["options"]) == (True, job["options"])
 
 
-def test_goals_that_the_form_lacks_are_described_and_can_be_replaced(repeat, service):
+def test_goals_that_the_form_lacks_are_described_and_can_be_replaced(repeat, busy):
     job, page = repeat(SEVERAL_GOALS)
     goal, limit = page.locator("#goal"), page.locator("#time")
     label = "As in the earlier job"
@@ -213,7 +221,7 @@ def test_goals_that_the_form_lacks_are_described_and_can_be_replaced(repeat, ser
     assert page.locator("#amount").input_value() == "0.1"
     goal.select_option(label)
     assert page.locator("#amount").is_hidden()
-    assert_options_are_kept(service, job, page)
+    assert_options_are_kept(busy, job, page)
 
 
 def test_unsuitable_files_are_rejected(visit, service):

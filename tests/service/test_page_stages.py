@@ -14,7 +14,9 @@ FEW = {"sensitivity_views": 4, "sensitivity_view_size": 48}
 VIEWS = {"views": 24, "view_size": 48}
 TRAINED = {"sparsify_steps": 4, "refine_steps": 4, "prune_rounds": 2, **VIEWS}
 TUNED = {"enabled": True, "steps": 4, **VIEWS}
+EITHER = {**TUNED, "enabled": None}
 UNTUNED = {"enabled": False}
+LOSS = {"max_psnr_drop": 3, **FEW}
 
 JOBS = {
     "fast": {"preset": "fast"},
@@ -25,25 +27,13 @@ JOBS = {
     "a loss by pruning": {"encode": FEW, "compact": {"max_psnr_drop": 3, **TRAINED}},
     "a size, tuned": {"encode": {"target_size": 6000, **FEW}, "finetune": TUNED},
     "merged": {"encode": FEW, "compact": {"ratio": 0.5, "method": "merge"}},
-    "tuned": {"encode": FEW, "finetune": TUNED},
     "a size": {"encode": {"target_size": 6000, **FEW}, "finetune": UNTUNED},
-    "a size by training": {
-        "encode": {"target_size": 6000, **FEW},
-        "compact": VIEWS,
-        "finetune": {**TUNED, "enabled": None},
-    },
-    "time alone": {"time_limit": LONG, "encode": FEW, "finetune": {**TUNED, "enabled": None}},
-    "a loss by training": {
-        "encode": {"max_psnr_drop": 3, **FEW},
-        "compact": VIEWS,
-        "finetune": {**TUNED, "enabled": None},
-    },
-    "as many as a loss needs": {
-        "encode": {"max_psnr_drop": 3, **FEW},
-        "compact": {"auto_count": True, **TRAINED},
-        "finetune": UNTUNED,
-    },
+    "a size by training": {"encode": {"target_size": 6000, **FEW}, "compact": VIEWS, "finetune": EITHER},
+    "time alone": {"time_limit": LONG, "encode": FEW, "finetune": EITHER},
+    "a loss by training": {"encode": LOSS, "compact": VIEWS, "finetune": EITHER},
+    "as many as a loss needs": {"encode": LOSS, "compact": {"auto_count": True, **TRAINED}, "finetune": UNTUNED},
     "time and tuning": {"time_limit": LONG, "encode": FEW, "finetune": TUNED},
+    "tuned": {"encode": FEW, "finetune": TUNED},
 }
 
 

@@ -1,56 +1,70 @@
-"""The preview of a job in Chromium; oracle: the container decoded in Python."""
+"""The preview of a job in Chromium; oracles: the container decoded in Python, and a ``.ply`` that Spark reads."""
 
 import hashlib
 import io
+import json
 import zipfile
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from helpers.format_scenes import made_scene
 from helpers.preview_browser import assert_readout, colours, psnr
-from helpers.service import scene_bytes
+from helpers.reference_sog import sog_files, zip_of
+from helpers.service import FAST, scene_bytes
 from PIL import Image
 
 import kissgs
 
-GAUSSIANS = 1500
 KEYS = ":".join(("alice", hashlib.sha256(b"secret").hexdigest()))
 
 
-@pytest.fixture(scope="module")
-def job(service):
-    return service.ended(service.submit(scene_bytes(GAUSSIANS, 3)))
+@dataclass
+class Shown:
+    """A job, and its container, decoded."""
+
+    job: dict
+    files: dict[str, bytes]
+    splats: kissgs.Splats
+
+    def levels(self, name):
+        return np.asarray(Image.open(io.BytesIO(self.files[name])))
+
+
+def shown_job(service, options):
+    job = service.ended(service.submit(scene_bytes(1500, 3), options=options))
+    container = service.http.get(job["links"]["result"]).content
+    with zipfile.ZipFile(io.BytesIO(container)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    return Shown(job, files, kissgs.decompress(container))
 
 
 @pytest.fixture(scope="module")
-def container(service, job):
-    return service.http.get(job["links"]["result"]).content
+def xt(service):
+    return shown_job(service, FAST)
 
 
 @pytest.fixture(scope="module")
-def decoded(container):
-    return kissgs.decompress(container)
+def sog(service):
+    return shown_job(service, json.dumps({"preset": "fast", "format": "sog"}))
 
 
-def test_upload_to_preview(preview, service):
-    tab = preview()
+PLANES = {"xt": (9, {"Mask", "Base colours", "Rotations"}), "sog": (7, {"Positions, high bytes"})}
+ROWS = {"Colours, opacities", "Rotations", "SH codebook", "SH labels", "Metadata"}
+
+
+@pytest.mark.parametrize("kind", ["xt", "sog"])
+def test_a_job(preview, service, request, kind, tmp_path):
+    shown = request.getfixturevalue(kind)
+    job, count = shown.job, len(shown.splats)
+    tab = preview().open(service, job["id"])
     page = tab.page
-    tab.origin = service.url
-    page.goto(service.url)
-    page.locator("#drop").wait_for()
-    upload = {"name": "knot.ply", "mimeType": "application/octet-stream", "buffer": scene_bytes(GAUSSIANS, 1)}
-    page.set_input_files("#file", upload)
-    page.get_by_label("Fast").check()
-    page.get_by_role("button", name="Compress").click()
-    page.get_by_role("link", name="Preview").click()
-    page.locator("#viewport").wait_for()
-    job = service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
-    count = len(kissgs.decompress(service.http.get(job["links"]["result"]).content))
     image = tab.shown(count)
-    assert page.get_by_role("heading", name="knot").is_visible()
-    assert page.title() == "knot · kissgs"
     assert colours(image) > 5000
     assert (image.max(axis=2) > 40).mean() > 0.3
-    assert page.locator("#live").inner_text() == f"knot: {count:,} Gaussians."
+    assert page.get_by_role("heading", name="a scene").is_visible()
+    assert page.title() == "a scene · kissgs"
+    assert page.locator("#live").inner_text() == f"a scene: {count:,} Gaussians."
     facts = page.locator("#statistics .facts").inner_text()
     assert f"{job['sizes']['container']:,}" in facts
     assert f"{job['sizes']['ratio']:.3g}×" in facts
@@ -58,8 +72,21 @@ def test_upload_to_preview(preview, service):
     assert sum(sizes) == pytest.approx(job["sizes"]["container"], rel=0.002)
     shares = [float(text.strip("<% ")) for text in page.locator(".bytes tbody td:nth-child(4)").all_inner_texts()]
     assert sum(shares) == pytest.approx(100, abs=0.6)
-    page.locator("#home").click()
-    page.get_by_text("smaller").first.wait_for()
+    number, names = PLANES[kind]
+    thumbs = page.locator(".thumb span").all_inner_texts()
+    assert (len(thumbs), names - set(thumbs)) == (number, set())
+    if kind == "xt":
+        page.locator("#home").click()
+        page.get_by_text("smaller").first.wait_for()
+        return
+    assert set(page.locator(".bytes tbody th").all_inner_texts()) >= ROWS
+    page.get_by_role("button", name="Compare with original").click()
+    page.get_by_role("slider", name="original").wait_for()
+    page.get_by_role("button", name="End comparison").click()
+    kissgs.save(shown.splats, tmp_path / "scene.ply")
+    read = preview().open(service)
+    read.drop(("scene.ply", (tmp_path / "scene.ply").read_bytes()))
+    assert psnr(read.shown(count)[:-80], tab.still_image()[:-80]) > 40  # below are the buttons, which differ
 
 
 def in_bytes(text):
@@ -68,10 +95,10 @@ def in_bytes(text):
 
 
 @pytest.mark.quick(0)
-def test_keys_and_mouse_move_the_camera(preview, service, job, decoded):
-    tab = preview().open(service, job["id"])
+def test_keys_and_mouse_move_the_camera(preview, service, xt):
+    tab = preview().open(service, xt.job["id"])
     page, press = tab.page, tab.page.keyboard.press
-    home = tab.shown(len(decoded))
+    home = tab.shown(len(xt.splats))
     page.locator("#viewport").focus()
     still = tab.still_image()
     frames = page.evaluate("resourceCounts().frames")
@@ -109,10 +136,10 @@ def red(image):
 
 
 @pytest.mark.quick(0)
-def test_panels_and_help(preview, service, job, decoded):
-    tab = preview().open(service, job["id"])
+def test_panels_and_help(preview, service, xt):
+    tab = preview().open(service, xt.job["id"])
     page = tab.page
-    narrow = tab.shown(len(decoded))
+    narrow = tab.shown(len(xt.splats))
     page.locator("#viewport").focus()
     page.keyboard.press("h")
     assert not page.locator("#panel").is_visible()
@@ -133,10 +160,10 @@ def test_panels_and_help(preview, service, job, decoded):
     assert after < before / 2
 
 
-def test_comparing_with_the_original(preview, service, job, decoded):
-    tab = preview().open(service, job["id"])
+def test_comparing_with_the_original(preview, service, xt):
+    tab = preview().open(service, xt.job["id"])
     page = tab.page
-    before = tab.shown(len(decoded))
+    before = tab.shown(len(xt.splats))
     page.get_by_role("button", name="Compare with original").click()
     handle = page.get_by_role("slider", name="original")
     handle.wait_for()
@@ -194,13 +221,13 @@ def marked(image, before):
 
 
 @pytest.mark.quick(0)
-def test_hovering_over_a_plane(preview, service, job, container, decoded):
-    tab = preview(viewport={"width": 820, "height": 760}).open(service, job["id"])
+def test_hovering_over_a_plane(preview, service, xt):
+    tab = preview(viewport={"width": 820, "height": 760}).open(service, xt.job["id"])
     page = tab.page
-    before = tab.shown(len(decoded))
-    archive = zipfile.ZipFile(io.BytesIO(container))
-    planes = {name: np.asarray(Image.open(archive.open(name))) for name in archive.namelist() if name.endswith("webp")}
-    mask = planes["active_mask.webp"]
+    before = tab.shown(len(xt.splats))
+    decoded, mask = xt.splats, xt.levels("active_mask.webp")
+    labels, levels = xt.levels("f_rest_labels.webp"), xt.levels("scales.webp")
+    book = len(xt.levels("f_rest_centroids.webp")) // 3
     side = len(mask)
     cells = np.flatnonzero(mask.reshape(side * side, -1)[:, 0])
     page.get_by_role("button", name="Scales").click()
@@ -221,10 +248,8 @@ def test_hovering_over_a_plane(preview, service, job, container, decoded):
         readout = point_at(cells[index])
         column, row = cells[index] % side, cells[index] // side
         readout.get_by_text(f"Column {column}, row {row}: Gaussian {index:,}").wait_for()
-        label = planes["f_rest_labels.webp"][row, column]
-        book = len(planes["f_rest_centroids.webp"]) // 3
-        entry = assert_readout(readout, decoded, index, planes["scales.webp"][row, column], rotation=6e-4)
-        assert entry == [label[0] + book * label[1]]
+        entry = assert_readout(readout, decoded, index, levels[row, column], rotation=6e-4)
+        assert entry == [labels[row, column, 0] + book * labels[row, column, 1]]
         markers[index] = marked(tab.still_image(), before)
         assert markers[index][2] < 40
     assert markers[leftmost][0] < markers[rightmost][0] - 50
@@ -240,22 +265,71 @@ def test_hovering_over_a_plane(preview, service, job, container, decoded):
     assert "Entry 0, coefficient 1" in page.locator(".readout").inner_text()
 
 
+@pytest.mark.quick(0)
+def test_pointing_at_planes_of_sog(preview, service, sog):
+    decoded, labels, levels = sog.splats, sog.levels("shN_labels.webp").astype(int), sog.levels("scales.webp")
+    height, width = levels.shape[:2]
+    tab = preview(viewport={"width": 820, "height": 760}).open(service, sog.job["id"])
+    page = tab.page
+    tab.shown(len(decoded))
+    page.get_by_role("button", name="Scales").click()
+
+    def point_at(x, y, columns):
+        canvas = page.locator(".plane canvas")
+        size = canvas.bounding_box()["width"] / columns
+        canvas.hover(position={"x": (x + 0.5) * size, "y": (y + 0.5) * size})
+        return page.locator(".readout")
+
+    for index in (0, 700, len(decoded) - 1):
+        x, y = index % width, index // width
+        readout = point_at(x, y, width)
+        readout.get_by_text(f"Column {x}, row {y}: Gaussian {index:,}").wait_for()
+        entry = assert_readout(readout, decoded, index, levels[y, x], rotation=2e-3)
+        assert entry == [labels[y, x, 0] + 256 * labels[y, x, 1]]
+    if width * height > len(decoded):
+        assert "padding" in point_at(width - 1, height - 1, width).inner_text()
+    page.get_by_role("button", name="SH codebook").click()
+    canvas = page.locator(".plane canvas")
+    canvas.focus()
+    for _ in range(16):
+        canvas.press("ArrowRight")
+    text = page.locator(".readout").inner_text()
+    assert "Entry 1, coefficient 2: " in text  # 15 pixels of entry 0 come first
+    assert "levels " + " ".join(map(str, sog.levels("shN_centroids.webp")[0, 16])) in text
+    used = labels[..., 0].ravel()[: len(decoded)] + 256 * labels[..., 1].ravel()[: len(decoded)] == 1
+    assert f"used by {used.sum():,} Gaussians" in text
+
+
 def flipped(body):
     return body[: len(body) // 2] + bytes([body[len(body) // 2] ^ 0x55]) + body[len(body) // 2 + 1 :]
 
 
+def halved(body):
+    return body[: len(body) // 2]
+
+
+def wrong_magic(body):
+    return b"RIFF" + body[5:]
+
+
 @pytest.mark.parametrize(
-    ("file", "damage"),
+    ("kind", "file", "damage"),
     [
-        ("f_dc.webp", flipped),
-        ("scales.webp", lambda body: body[: len(body) // 2]),
-        ("active_mask.webp", lambda body: b"RIFF" + body[5:]),
-        ("f_rest_centroids.webp", None),
-        ("meta.json", lambda body: body[:-40]),
+        ("xt", "f_dc.webp", flipped),
+        ("sog", "quats.webp", halved),
+        ("xt", "scales.webp", halved),
+        ("xt", "f_rest_centroids.webp", None),
+        ("sog", "shN_centroids.webp", halved),
+        ("sog", "sh0.webp", halved),
+        ("xt", "active_mask.webp", wrong_magic),
+        ("sog", "meta.json", halved),
+        ("xt", "meta.json", halved),
     ],
 )
-@pytest.mark.quick(2)
-def test_the_message_names_a_damaged_file(preview, service, job, file, damage):
+@pytest.mark.quick(3)
+def test_the_message_names_a_damaged_file(preview, service, request, kind, file, damage):
+    """The rest of the scene is drawn, if there are positions."""
+    shown = request.getfixturevalue(kind)
     tab = preview()
 
     def respond(route):
@@ -264,10 +338,14 @@ def test_the_message_names_a_damaged_file(preview, service, job, file, damage):
         route.fulfill(status=status, body=body)
 
     tab.page.route(f"**/files/{file}", respond)
-    tab.open(service, job["id"])
+    tab.open(service, shown.job["id"])
     tab.error_message(file, *(() if damage else ("404",)))
     tab.page.locator("#loading").wait_for(state="hidden")
-    assert tab.page.locator("#viewport:visible, #empty:visible").count() == 1
+    if file in ("meta.json", "active_mask.webp"):
+        assert tab.page.locator("#empty").is_visible()
+    else:
+        tab.shown(len(shown.splats))
+        tab.fact("Loaded in", "cut short")
     if damage is None:
         tab.expect_errors("^404 ", "Failed to load resource.*404")
     tab.page.get_by_role("button", name="Dismiss").click()
@@ -275,20 +353,20 @@ def test_the_message_names_a_damaged_file(preview, service, job, file, damage):
 
 
 @pytest.mark.quick(0)
-def test_the_scene_is_drawn_without_damaged_planes(preview, service, job, decoded):
+def test_the_scene_is_drawn_without_damaged_planes(preview, service, xt):
     tab = preview(viewport={"width": 820, "height": 760})
 
     def opened(damaged=None):
         tab.page.unroute_all()
         if damaged:
             tab.page.route(f"**/files/{damaged}.webp", lambda route: route.fulfill(body=flipped(route.fetch().body())))
-        tab.open(service, job["id"])
+        tab.open(service, xt.job["id"])
         if damaged:
             tab.error_message(f"{damaged}.webp")
             tab.fact("Loaded in", "cut short")
             assert tab.page.locator("#planes .thumb").count() == 8
             tab.page.get_by_role("button", name="Dismiss").click()
-        return tab.shown(len(decoded))
+        return tab.shown(len(xt.splats))
 
     def readout():
         tab.page.locator(".plane canvas").hover(position={"x": 3, "y": 3})
@@ -316,10 +394,10 @@ def test_the_scene_is_drawn_without_damaged_planes(preview, service, job, decode
 
 @pytest.mark.parametrize("file", ["active_mask.webp", "means_bytes_1.webp"])
 @pytest.mark.quick(1)
-def test_without_positions_nothing_is_drawn(preview, service, job, file):
+def test_without_positions_nothing_is_drawn(preview, service, xt, file):
     tab = preview()
     tab.page.route(f"**/files/{file}", lambda route: route.fulfill(body=flipped(route.fetch().body())))
-    tab.open(service, job["id"])
+    tab.open(service, xt.job["id"])
     tab.error_message(file)
     tab.page.locator("#empty").wait_for()
     tab.page.wait_for_timeout(300)
@@ -365,9 +443,9 @@ def test_with_keys(start, preview):
 
 
 @pytest.mark.quick(0)
-def test_one_finger_orbits(preview, service, job, decoded):
-    tab = preview(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True).open(service, job["id"])
-    before = tab.shown(len(decoded))
+def test_one_finger_orbits(preview, service, xt):
+    tab = preview(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True).open(service, xt.job["id"])
+    before = tab.shown(len(xt.splats))
     assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390
     box = tab.page.locator("#viewport").bounding_box()
     x, y = box["x"] + 150, box["y"] + box["height"] / 2
@@ -385,14 +463,54 @@ def test_one_finger_orbits(preview, service, job, decoded):
     assert psnr(tab.still_image()[:-80], before[:-80]) > 60
 
 
-def test_without_the_vendor_folder(preview, service, job, decoded):
+def test_without_the_vendor_folder(preview, service, xt):
     tab = preview()
     tab.page.route("**/vendor/**", lambda route: route.fulfill(status=404, body="none"))
-    tab.open(service, job["id"])
+    tab.open(service, xt.job["id"])
     tab.error_message("not installed", "scripts/vendor")
-    tab.fact("Gaussians", f"{len(decoded):,}")
+    tab.fact("Gaussians", f"{len(xt.splats):,}")
     tab.page.get_by_role("button", name="Opacities").click()
     tab.page.locator(".plane canvas").hover(position={"x": 3, "y": 3})
     assert "Column 0, row 0" in tab.page.locator(".readout").inner_text()
     assert tab.page.locator("#problem").is_visible()
     tab.expect_errors("^404 .*vendor", "Failed to load resource.*404")
+
+
+# Files of SOG --------------------------------------------------------------------------------------------------------
+
+FILES = sog_files(made_scene(65, 1, extremes=False))
+FILES_V1 = sog_files(made_scene(65, 1, extremes=False), version=1)
+
+
+def as_png(files):
+    """Return files whose images are PNG, under names of their own."""
+    meta, changed = files["meta.json"].decode(), {}
+    for name in [name for name in files if name != "meta.json"]:
+        buffer, renamed = io.BytesIO(), f"plane{len(changed)}.png"
+        Image.open(io.BytesIO(files[name])).save(buffer, "PNG")
+        changed[renamed] = buffer.getvalue()
+        meta = meta.replace(name, renamed)
+    return {"meta.json": meta.encode(), **changed}
+
+
+@pytest.mark.quick(0)
+def test_files_of_other_encoders(preview, service):
+    """Version 1, and PNG under other names, give the same image as version 2 does."""
+    tab = preview().open(service)
+    images = []
+    for name, files in (("two", FILES), ("png", as_png(FILES)), ("one", FILES_V1)):
+        tab.drop((f"{name}.sog", zip_of(files)))
+        tab.page.get_by_role("heading", name=name, exact=True).wait_for()
+        images.append(tab.shown(65))
+    assert colours(images[0]) > 500
+    assert psnr(images[1], images[0]) > 60
+    assert psnr(images[2], images[0]) > 35  # other levels
+
+
+def test_an_unsuitable_file(preview, service):
+    tab = preview().open(service)
+    tab.drop(("other.sog", zip_of({"notes.txt": b"hello"})))
+    tab.error_message("no SOG-XT or SOG container", "meta.json")
+    tab.drop(("garden.glb", b"anything"))
+    tab.error_message("does not open glTF", '"kissgs view garden.glb"')
+    assert tab.page.locator("#empty").is_visible()

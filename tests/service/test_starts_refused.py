@@ -17,71 +17,61 @@ from service.core.settings import SettingsError
 pytestmark = pytest.mark.usefixtures("no_variables")
 
 
-def no_database(folder):
-    (folder / "jobs.sqlite").write_bytes(b"this is no database" * 1000)
+def file_of(folder):
+    return folder / "jobs.sqlite"
 
 
 def a_folder_instead(folder):
-    (folder / "jobs.sqlite").unlink()
-    (folder / "jobs.sqlite").mkdir()
+    file_of(folder).unlink()
+    file_of(folder).mkdir()
 
 
-def deleted(folder):
-    (folder / "jobs.sqlite").unlink()
+def truncate(folder):
+    os.truncate(file_of(folder), file_of(folder).stat().st_size // 2 + 700)
 
 
-def emptied(folder):
-    (folder / "jobs.sqlite").write_bytes(b"")
+def delete(folder):
+    file_of(folder).unlink()
 
 
-def rows_deleted(folder):
-    database(folder, "DELETE FROM events", "DELETE FROM jobs", "DELETE FROM meta")
+def executes(*statements):
+    """Return a change of the database."""
+    return lambda folder: database(folder, *statements)
 
 
-def truncated(folder):
-    os.truncate(folder / "jobs.sqlite", (folder / "jobs.sqlite").stat().st_size // 2 + 700)
-
-
-def the_meta_table_dropped(folder):
-    database(folder, "DROP TABLE meta")
-
-
-def a_column_dropped(folder):
-    database(folder, "ALTER TABLE jobs DROP COLUMN note")
-
-
-def a_value_damaged(folder):
-    database(folder, "UPDATE jobs SET options = '{\"preset' WHERE number = 7")
-
-
-def of_an_older_version(folder):
-    database(folder, f"UPDATE meta SET value = {SCHEMA_VERSION - 1} WHERE name = 'schema'", "DROP TABLE events")
-
-
-def of_a_newer_version(folder):
-    database(folder, f"UPDATE meta SET value = {SCHEMA_VERSION + 1} WHERE name = 'schema'")
-
+OF_A_NEWER_VERSION = executes(f"UPDATE meta SET value = {SCHEMA_VERSION + 1} WHERE name = 'schema'")
+OLDER = (f"UPDATE meta SET value = {SCHEMA_VERSION - 1} WHERE name = 'schema'", "DROP TABLE events")
+OTHER_VERSION = "schema version {}, but this service needs " + str(SCHEMA_VERSION)
+NONE_OF_THEM = "is new and has none of them; restore"
 
 REFUSED = {
-    no_database: "file is not a database; restore it",
-    a_folder_instead: "cannot be opened",
-    deleted: "is new and has none of them; restore",
-    emptied: "is new and has none of them; restore",
-    rows_deleted: "is new and has none of them; restore",
-    truncated: "damaged|malformed",
-    the_meta_table_dropped: "damaged: the schema version of its tables is missing",
-    a_column_dropped: "no such column: jobs.note",
-    a_value_damaged: "damaged: ",
-    of_an_older_version: f"schema version {SCHEMA_VERSION - 1}, but this service needs {SCHEMA_VERSION}",
-    of_a_newer_version: f"schema version {SCHEMA_VERSION + 1}, but this service needs {SCHEMA_VERSION}",
+    "no database": (lambda it: file_of(it).write_bytes(b"none" * 5000), "file is not a database; restore it"),
+    "a folder instead": (a_folder_instead, "cannot be opened"),
+    "deleted": (delete, NONE_OF_THEM),
+    "emptied": (lambda it: file_of(it).write_bytes(b""), NONE_OF_THEM),
+    "no rows": (executes(*(f"DELETE FROM {name}" for name in ("events", "jobs", "meta"))), NONE_OF_THEM),
+    "truncated": (truncate, "damaged|malformed"),
+    "no table meta": (executes("DROP TABLE meta"), "damaged: the schema version of its tables is missing"),
+    "a column dropped": (executes("ALTER TABLE jobs DROP COLUMN note"), "no such column: jobs.note"),
+    "a value damaged": (executes("UPDATE jobs SET options = '{\"preset' WHERE number = 7"), "damaged: "),
+    "an older version": (executes(*OLDER), OTHER_VERSION.format(SCHEMA_VERSION - 1)),
+    "a newer version": (OF_A_NEWER_VERSION, OTHER_VERSION.format(SCHEMA_VERSION + 1)),
+    **{
+        f"invalid {name}": (
+            executes(f"INSERT OR REPLACE INTO meta VALUES ('{name}', {value})"),
+            f"damaged: its table meta has no valid {name}",
+        )
+        for name, value in (("identity", "'text'"), ("schema", "x'00ff'"), ("time", "1e999"))
+    },
 }
 
 
-@pytest.mark.parametrize("change", REFUSED, ids=lambda change: change.__name__)
+@pytest.mark.parametrize("change", REFUSED)
 def test_a_refused_start_removes_nothing(jobs_folder, change):
-    change(jobs_folder)
+    damage, message = REFUSED[change]
+    damage(jobs_folder)
     for _ in range(2):  # the first attempt must not change the result of the second
-        assert_refused(jobs_folder, REFUSED[change])
+        assert_refused(jobs_folder, message)
     assert not (jobs_folder / "jobs" / ".orphaned").exists()
 
 
@@ -92,15 +82,6 @@ def assert_refused(folder, message):
         opened(folder)
     assert "\n" not in str(caught.value)
     assert listing(folder).items() >= before.items()
-
-
-def test_a_refused_command_prints_one_line(jobs_folder):
-    deleted(jobs_folder)
-    ended = command(jobs_folder)
-    assert (ended.returncode, ended.stdout) == (2, "")
-    (line,) = ended.stderr.splitlines()
-    assert line.startswith("kissgs-serve: ")
-    assert "job database" in line
 
 
 @pytest.mark.quick(0)
@@ -156,21 +137,19 @@ def test_a_refused_start_keeps_the_journal(tmp_path):
     """The last changes of a killed service are only in the journal, which a refused start must not remove."""
     with service(tmp_path / "own") as context:
         finish_a_job(context)
-        of_a_newer_version(tmp_path / "own")
+        OF_A_NEWER_VERSION(tmp_path / "own")
         shutil.copytree(tmp_path / "own", tmp_path / "killed")
     before = listing(tmp_path / "killed")
     assert {"jobs.sqlite-wal", "jobs.sqlite"} <= {str(name) for name in before}
     ended = command(tmp_path / "killed")
-    assert "schema version" in ended.stderr
+    assert (ended.returncode, ended.stdout) == (2, "")
+    (line,) = ended.stderr.splitlines()
+    assert line.startswith("kissgs-serve: ")
+    assert "job database" in line
+    assert "schema version" in line
     after = listing(tmp_path / "killed")
     for name in ("jobs.sqlite", "jobs.sqlite-wal"):
         assert after[Path(name)] == before[Path(name)]
-
-
-@pytest.mark.parametrize(("name", "value"), [("identity", "'text'"), ("schema", "x'00ff'"), ("time", "1e999")])
-def test_invalid_values_in_the_meta_table(jobs_folder, name, value):
-    database(jobs_folder, f"INSERT OR REPLACE INTO meta VALUES ('{name}', {value})")
-    assert_refused(jobs_folder, f"damaged: its table meta has no valid {name}")
 
 
 def test_the_orphaned_folder_must_be_a_folder(jobs_folder):

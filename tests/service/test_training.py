@@ -20,13 +20,9 @@ from service.jobs import job_process
 pytest.importorskip("torch")
 
 
-def options(steps):
-    changes = {"count": 100, "sparsify_steps": steps, "refine_steps": steps, "views": 24, "view_size": 48}
-    return {"preset": "fast", "compact": changes, "for_research": True}
-
-
 STEPS = 8
-BRIEF = options(STEPS)
+CHANGES = {"count": 100, "sparsify_steps": STEPS, "refine_steps": STEPS, "views": 24, "view_size": 48}
+BRIEF = {"preset": "fast", "compact": CHANGES, "for_research": True}
 DONE = 3
 """Steps of its stage after which training waits."""
 
@@ -116,7 +112,7 @@ def of_another_version(path):
 
 @pytest.mark.parametrize("damage", [damaged, of_another_version])
 @pytest.mark.quick(0)
-def test_unusable_checkpoints_are_replaced(start_process, damage):
+def test_unusable_checkpoints_are_replaced(start_process, expected, damage):
     service = start_process()
     job = service.submit(options=json.dumps(BRIEF))
     service.running(job)
@@ -125,13 +121,12 @@ def test_unusable_checkpoints_are_replaced(start_process, damage):
     service.restart()
     status = service.ended(job)
     assert (status["state"], status["starts"]) == ("succeeded", 2)
-    result = service.http.get(status["links"]["result"]).content
-    assert result == kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(BRIEF)).to_zip()
+    assert service.http.get(status["links"]["result"]).content == expected
 
 
 @pytest.mark.parametrize("saved", [0, 1])
 @pytest.mark.quick(0)
-def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, saved):
+def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, expected, saved):
     """The job succeeds without them, and its report does not reveal paths of the server."""
     from kissgs.training import checkpoint
 
@@ -149,20 +144,10 @@ def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, saved):
     work.mkdir()
     (tmp_path / "scene.ply").write_bytes(SMALL)
     monkeypatch.chdir(tmp_path)
-    task = {
-        "source": "scene.ply",
-        "work": "work",
-        "settings": BRIEF,
-        "format": "sogxt",
-        "container": "scene.zip",
-        "evaluate": False,
-        "checkpoint": "checkpoint.npz",
-        "threads": 0,
-        "device": "cpu",
-    }
+    task = {"source": "scene.ply", "work": "work", "settings": BRIEF, "format": "sogxt", "container": "scene.zip"}
+    task |= {"evaluate": False, "checkpoint": "checkpoint.npz", "threads": 0, "device": "cpu"}
     job_process.compress(task, lambda *event: None)
-    result = (work / "result" / "scene.zip").read_bytes()
-    assert result == kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(BRIEF)).to_zip()
+    assert (work / "result" / "scene.zip").read_bytes() == expected
     report = (work / "result" / "report.json").read_text()
     assert ("no space left" in report) == bool(saved)
     assert str(tmp_path) not in report

@@ -11,7 +11,8 @@ import time
 from functools import partial
 
 import pytest
-from helpers.job_rows import add
+from helpers.data_folders import add_a_row as add
+from helpers.data_folders import database as execute
 from helpers.running import wait_until
 from helpers.service import SLOW, SMALL, Service, problem, read_response, scene_bytes
 
@@ -21,12 +22,6 @@ from service.storage.database import DatabaseReplacedError
 from service.storage.job_records import Store
 
 HEAD = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n"
-
-
-def execute(folder, *statements):
-    with contextlib.closing(sqlite3.connect(folder / "jobs.sqlite", timeout=300)) as database, database:
-        for statement in statements:
-            database.execute(statement)
 
 
 def files(folder):
@@ -42,10 +37,6 @@ def replace(folder):
     copy = folder / "copy"
     shutil.copy(folder / "jobs.sqlite", copy)
     copy.replace(folder / "jobs.sqlite")
-
-
-def change_identity(folder):
-    execute(folder, "UPDATE meta SET value = 7 WHERE name = 'identity'")
 
 
 def overwrite(folder):
@@ -65,12 +56,14 @@ CHANGES = {
     "the data folder removed": (shutil.rmtree, "jobs.sqlite was removed"),
     "the journal removed": (partial(remove, pattern="*-wal"), "jobs.sqlite-wal was removed"),
     "replaced by a copy": (replace, "jobs.sqlite was replaced"),
-    "another database": (change_identity, "replaced by another database"),
-    "events dropped": (lambda folder: execute(folder, "DROP TABLE events"), "no such table: events"),
-    "a column dropped": (
-        lambda folder: execute(folder, "ALTER TABLE jobs DROP COLUMN note"),
-        "no such column: jobs.note",
-    ),
+    **{
+        statement: (lambda folder, statement=statement: execute(folder, statement), reason)
+        for statement, reason in (
+            ("UPDATE meta SET value = 7 WHERE name = 'identity'", "replaced by another database"),
+            ("DROP TABLE events", "no such table: events"),
+            ("ALTER TABLE jobs DROP COLUMN note", "no such column: jobs.note"),
+        )
+    },
     "emptied": (truncate, "empty"),
 }
 
@@ -105,10 +98,7 @@ def test_damage_in_any_page_is_detected(tmp_path, damage):
     execute(tmp_path, "PRAGMA wal_checkpoint(TRUNCATE)")
     assert store.monitor.health_problem() is None
     damage(tmp_path)
-    end = time.monotonic() + 300
-    while store.monitor.health_problem() is None:
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_until(lambda: store.monitor.health_problem() is not None, 300)
     assert "damaged" in store.monitor.health_problem() or "malformed" in store.monitor.health_problem()
 
 
@@ -192,10 +182,7 @@ def test_a_restored_database(start):
     for path in files(service.folder):
         path.rename(away / path.name)
     assert service.http.get("/readyz").status_code == 503
-    end = time.monotonic() + 300
-    while service.children():
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_until(lambda: not service.children(), 300)
     time.sleep(1.5)
     assert service.status(running)["state"] == "running"
     assert service.status(waiting)["state"] == "queued"

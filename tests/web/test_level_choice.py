@@ -4,6 +4,7 @@ import itertools
 import json
 
 import numpy as np
+from helpers.viewers import page_camera
 from helpers.web_tools import run_node
 
 MANY = 10**6
@@ -119,60 +120,33 @@ def test_a_level_in_use_is_kept_until_another_is_clearly_better():
     assert choose(*jobs) == [[0, 1], [1, 0], [0, 1], [1, 0], [0, 0]]
 
 
-def projected(matrix, points):
-    clip = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ matrix.T
-    return clip[:, :3], clip[:, 3]
-
-
 def test_areas_and_the_frustum():
     """Boxes are filled with points; of visible boxes, some are in the image. Areas are those of turned cubes."""
     rng = np.random.default_rng(2)
-    width, height, focal = 300, 200, 250.0
-    views, boxes = [], []
+    size, focal = (300, 200), 250.0
+    views = []
     for _ in range(6):
-        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        eye = rng.normal(0, 2, 3)
         view = np.eye(4)
-        view[:3, :3], view[:3, 3] = turn, -turn @ eye
-        projection = np.array(
-            [[2 * focal / width, 0, 0, 0], [0, 2 * focal / height, 0, 0], [0, 0, -1, -0.02], [0, 0, -1, 0]]
-        )
+        view[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        view[:3, 3] = rng.normal(0, 2, 3)
         lows = rng.uniform(-6, 6, (60, 3))
-        made = [(low, low + rng.uniform(0.05, 2, 3)) for low in lows]
-        matrix = projection @ view
-        boxes.append((matrix, made))
-        views.append(
-            {
-                "matrix": matrix.T.ravel().tolist(),
-                "eye": eye.tolist(),
-                "focal": focal,
-                "pixels": width * height,
-                "boxes": [{"low": low.tolist(), "high": high.tolist()} for low, high in made],
-            }
-        )
-    seen = json.loads(run_node("choose_levels.mjs", json.dumps({"views": views})))["seen"]
+        boxes = [{"low": low.tolist(), "high": (low + rng.uniform(0.05, 2, 3)).tolist()} for low in lows]
+        views.append({**page_camera(view, size, focal), "boxes": boxes})
+    cube = {"low": [-0.5, -0.5, 9.5], "high": [0.5, 0.5, 10.5]}
+    straight = {**page_camera(np.eye(4), size, focal), "matrix": np.eye(4).ravel().tolist(), "boxes": [cube]}
+    *seen, (found,) = json.loads(run_node("choose_levels.mjs", json.dumps({"views": [*views, straight]})))["seen"]
     hidden = 0
-    for (matrix, made), found in zip(boxes, seen, strict=True):
-        for (low, high), box in zip(made, found, strict=True):
-            grid = np.stack(np.meshgrid(*np.linspace(low, high, 9).T), axis=-1).reshape(-1, 3)
-            xyz, w = projected(matrix, grid)
-            inside = (w > 0) & (np.abs(xyz[:, :2]) <= w[:, None]).all(axis=1)
+    for view, answers in zip(views, seen, strict=True):
+        for each, box in zip(view["boxes"], answers, strict=True):
+            sides = np.linspace(each["low"], each["high"], 9).T
+            grid = np.stack(np.meshgrid(*sides, [1]), axis=-1).reshape(-1, 4)
+            clip = grid @ np.reshape(view["matrix"], (4, 4))
+            inside = (clip[:, 3] > 0) & (np.abs(clip[:, :2]) <= clip[:, 3:]).all(axis=1)
             assert not (box["outside"] and inside.any())
             hidden += box["outside"]
-            assert 0 < box["area"] <= width * height
+            assert 0 < box["area"] <= size[0] * size[1]
     assert 180 < hidden < 350  # of 360 boxes: cameras see less than a half of the space
 
-    cube = {"low": [-0.5, -0.5, 9.5], "high": [0.5, 0.5, 10.5]}
-    job = {
-        "matrix": np.eye(4).ravel().tolist(),
-        "eye": [0, 0, 0],
-        "focal": focal,
-        "pixels": width * height,
-        "boxes": [cube],
-    }
-    (((found,),)) = json.loads(run_node("choose_levels.mjs", json.dumps({"views": [job]})))["seen"]
     turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2000)]
-    shadows = [
-        np.abs(turn).sum(axis=1)[2] for turn in turns
-    ]  # area of a unit cube's shadow: sum of |normal components|
+    shadows = [np.abs(turn).sum(axis=1)[2] for turn in turns]  # of a unit cube: sum of |normal components|
     assert abs(found["area"] / (focal / 10) ** 2 - np.mean(shadows)) < 0.02

@@ -3,7 +3,6 @@
 import json
 
 import pytest
-from helpers.viewers import NO_GPU, chromium
 from helpers.web_scenes import (
     IMAGES,
     assert_progress,
@@ -65,23 +64,10 @@ IN_WORKER = """(job) => new Promise((resolve, reject) => {
 })"""
 
 
-@pytest.fixture(scope="module")
-def site():
-    site = Site()
-    site.files["/page.html"] = PAGE
-    yield site
-    site.close()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium(NO_GPU) as browser:
-        yield browser
-
-
 @pytest.fixture
 def do(browser, site):
     """Return a function that performs a job in a page or a worker."""
+    site.files["/page.html"] = PAGE
     context = browser.new_context()
     context.add_init_script(SPY)
     page = context.new_page()

@@ -9,12 +9,11 @@ import logging
 
 import numpy as np
 import pytest
-from helpers.viewers import chromium, opened, psnr, scattered, seen_from
+from helpers.viewers import opened, psnr, scattered, seen_from, skewed
 
 import kissgs
 from kissgs.io.ply import write_ply
 from kissgs.pipeline.scene_files import write_scene
-from kissgs.rendering.camera import Camera
 
 # To kissgs.render, dB. Spark rounds colours and sizes, and reaches 46. PlayCanvas draws exp(-x) less a constant, so
 # that every Gaussian ends at 2.8 standard deviations, and reaches 37, from a .ply too. One SH band of wrong sign, or
@@ -24,24 +23,10 @@ TO_ITS_PLY = 46  # the same values from a .ply: other roundings within the viewe
 log = logging.getLogger(__name__)
 
 
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as browser:
-        yield browser
-
-
 @pytest.fixture(scope="module", params=["spark", "playcanvas"])
 def viewer(request, browser):
     with opened(request.param, browser) as (viewer, _):
         yield viewer
-
-
-def skewed(camera):
-    """Return the camera with another principal point and pixels that are not square."""
-    K = camera.K.copy()
-    K[0, 0] *= 1.25
-    K[:2, 2] += (0.07 * camera.width, -0.05 * camera.height)
-    return Camera(camera.viewmat, K, camera.width, camera.height)
 
 
 CAMERAS = [seen_from((1.2, -1.2, -4.2), (300, 200)), skewed(seen_from((-3.5, -2.6, 2.0), (200, 180)))]

@@ -5,6 +5,8 @@ import itertools
 import json
 
 import numpy as np
+import pytest
+from helpers.viewers import page_camera
 from helpers.web_tools import run_node
 
 
@@ -91,6 +93,7 @@ def test_damaged_manifests():
         assert tree["error"].startswith("The list of this scene's files is damaged: ")
 
 
+@pytest.mark.quick(0)
 def test_a_manifest_of_very_many_leaves_and_files():
     """The whole is one flat list of leaves, each with its own file."""
     count = 130_000
@@ -213,19 +216,11 @@ def test_workers_keep_nothing_of_their_tasks():
     assert broken == {"ends": ["a:", "b:", "c:"], "most": 3, "now": 0}
 
 
-def camera(eye, width=200, height=100, focal=100.0):
+def camera(eye):
     """Return a camera that looks along z, with y up, in the form of the page."""
-    projection = np.array(
-        [[2 * focal / width, 0, 0, 0], [0, 2 * focal / height, 0, 0], [0, 0, -1, -0.02], [0, 0, -1, 0]]
-    )
     view = np.diag([1.0, 1, -1, 1])
     view[:3, 3] = -view[:3, :3] @ eye
-    return {
-        "matrix": (projection @ view).T.ravel().tolist(),
-        "eye": list(eye),
-        "focal": focal,
-        "pixels": width * height,
-    }
+    return page_camera(view)
 
 
 def test_every_leaf_is_drawn_once_in_every_state():

@@ -2,14 +2,15 @@
 
 import json
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.streamed_scenes import FAST, small_sizes
-from helpers.viewers import chromium, image_of, opened, pinhole, psnr, scattered, seen_from
+from helpers.viewers import image_of, opened, pinhole, psnr, scattered, seen_from
 
 import kissgs
-from kissgs.core.splats import ATTRIBUTES, Splats
+from kissgs.core.splats import concatenate
 from kissgs.rendering.camera import look_at
 from kissgs.streaming.compress import compress_streamed
 
@@ -19,8 +20,8 @@ log = logging.getLogger(__name__)
 
 
 @pytest.fixture(scope="module")
-def viewer():
-    with chromium() as browser, opened("streaming", browser) as (viewer, site):
+def viewer(browser):
+    with opened("streaming", browser) as (viewer, site):
         yield viewer.page, site
 
 
@@ -46,14 +47,10 @@ def rendered(splats, camera=CAMERA):
     return np.clip(kissgs.render(splats, camera)[0], 0, 1)
 
 
-def joined(parts):
-    return Splats(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in ATTRIBUTES})
-
-
 def rows_of(folder, ranges):
     """Return the Gaussians of rows of files."""
     files = {name: kissgs.load(folder / name) for name, _ in ranges}
-    return joined([files[name].select(slice(at, at + n)) for name, own in ranges for at, n in own])
+    return concatenate([files[name].select(slice(at, at + n)) for name, own in ranges for at, n in own])
 
 
 def leaves_of(folder, manifest="lod-meta.json"):
@@ -152,7 +149,7 @@ def test_sogxt_containers_and_an_environment(viewer, tmp_path):
     left = scene.means[:, 0] < 0
     half = np.arange(len(scene)) % 2 == 0
     sky = scattered(150, 0)
-    sky = Splats(**{**{name: getattr(sky, name) for name in ATTRIBUTES}, "means": 3 * sky.means})
+    sky = replace(sky, means=3 * sky.means)
     parts = {f"{level}_{side}.zip": scene.select(np.flatnonzero((left == (side == 0)) & (half | (level == 0))))
              for level in (0, 1) for side in (0, 1)}  # fmt: skip
     parts["sky.zip"] = sky
@@ -177,7 +174,7 @@ def test_sogxt_containers_and_an_environment(viewer, tmp_path):
     first = draw(viewer, CAMERA, url=url, budget=MANY, coarse=True)
     last = draw(viewer, CAMERA)
     for found, level in ((first, 1), (last, 0)):
-        wanted = joined([padded(stored[f"{level}_{side}.zip"]) for side in (0, 1)] + [padded(stored["sky.zip"])])
+        wanted = concatenate([padded(stored[f"{level}_{side}.zip"]) for side in (0, 1)] + [padded(stored["sky.zip"])])
         assert psnr(found["image"], rendered(wanted)) > 38
         assert sorted(name for name, _ in found["ranges"]) == sorted([f"{level}_0.zip", f"{level}_1.zip", "sky.zip"])
     assert psnr(first["image"], last["image"]) < 30
@@ -185,6 +182,4 @@ def test_sogxt_containers_and_an_environment(viewer, tmp_path):
 
 def padded(splats):
     """Return the scene with zeros for the spherical harmonics up to degree 1."""
-    values = {name: getattr(splats, name) for name in ATTRIBUTES}
-    values["shN"] = np.pad(values["shN"], ((0, 0), (0, 3 - values["shN"].shape[1]), (0, 0)))
-    return Splats(**values)
+    return replace(splats, shN=np.pad(splats.shN, ((0, 0), (0, 3 - splats.shN.shape[1]), (0, 0))))

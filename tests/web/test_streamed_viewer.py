@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 from helpers.streamed_scenes import small_sizes
-from helpers.viewers import chromium, opened, psnr, scattered, seen_from
+from helpers.viewers import opened, psnr, scattered, seen_from
 
 import kissgs
 from kissgs import Settings
@@ -19,9 +19,9 @@ log = logging.getLogger(__name__)
 
 
 @pytest.fixture(scope="module")
-def playcanvas():
-    with chromium() as browser, opened("playcanvas", browser) as (viewer, site):
-        yield viewer, site
+def playcanvas(browser):
+    with opened("playcanvas", browser) as opened_viewer:
+        yield opened_viewer
 
 
 def streamed(scene, folder, site):

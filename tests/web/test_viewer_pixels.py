@@ -9,16 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.viewers import chromium, pinhole, psnr
-from helpers.web_tools import DECODER, Site
+from helpers.viewers import pinhole, psnr, seen_from, skewed
+from helpers.web_tools import DECODER
 
 import kissgs
-from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
-from kissgs.rendering.camera import Camera, look_at
+from kissgs.core.splats import SH_REST_COUNTS
 
 pytestmark = pytest.mark.skipif(not (DECODER / "vendor").exists(), reason="scripts/vendor has not run")
 
-UP = np.array([0, -1.0, 0])
 log = logging.getLogger(__name__)
 
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
@@ -71,18 +69,15 @@ window.draw = async ({ scene, cameras, background = "#000000", file = null }) =>
 
 
 @pytest.fixture(scope="module")
-def page():
+def page(browser, site):
     errors = []
-    site = Site()
-    site.files |= {"/": PAGE.encode(), "/page.js": PROGRAM.encode()}
-    site.headers["/"] = {"Content-Type": "text/html"}
-    with chromium() as browser:
-        page = browser.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.goto(f"{site.url}/")
-        yield page
-    site.close()
+    site.files |= {"/page.html": PAGE.encode(), "/page.js": PROGRAM.encode()}
+    page = browser.new_page()
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.goto(f"{site.url}/page.html")
+    yield page
+    page.close()
     assert errors == []
 
 
@@ -123,20 +118,8 @@ def expected(splats, camera, background=(0, 0, 0)):
     return np.clip(kissgs.render(splats, camera, background=background)[0], 0, 1)
 
 
-def seen_from(position, target=(0, -0.8, 0), size=(300, 200), fov=0.9):
-    return look_at(np.array(position, float), np.array(target, float), UP, fov=fov, width=size[0], height=size[1])
-
-
-def skewed(camera):
-    """Return the camera with another principal point and pixels that are not square."""
-    K = camera.K.copy()
-    K[0, 0] *= 1.25
-    K[:2, 2] += (0.17 * camera.width, -0.12 * camera.height)
-    return Camera(camera.viewmat, K, camera.width, camera.height)
-
-
-FRONT = seen_from((1.2, -2.2, -5.2))
-SIDE = skewed(seen_from((-4.5, -2.6, 2.0)))
+FRONT = seen_from((1.2, -2.2, -5.2), target=(0, -0.8, 0))
+SIDE = skewed(seen_from((-4.5, -2.6, 2.0), target=(0, -0.8, 0)), 0.17, 0.12)
 
 
 @pytest.mark.parametrize("degree", [3, 1])
@@ -155,8 +138,7 @@ def test_images_agree_with_the_rasteriser(page, degree):
 
 def test_a_white_background(page):
     scene = kissgs.sample_scene(3000, sh_degree=1)
-    near = np.linalg.norm(scene.means, axis=1) < 2  # no sky
-    splats = Splats(**{name: getattr(scene, name)[near] for name in ATTRIBUTES})
+    splats = scene.select(np.linalg.norm(scene.means, axis=1) < 2)  # no sky
     (drawn,) = draw(page, splats, [FRONT], background="#ffffff")
     log.info("on white: %.1f dB", psnr(drawn, expected(splats, FRONT, background=(1, 1, 1))))
     assert psnr(drawn, expected(splats, FRONT, background=(1, 1, 1))) > 40
@@ -167,7 +149,7 @@ def test_far_from_the_origin(page):
     """Spark stores positions as half floats."""
     splats = kissgs.sample_scene(5000, sh_degree=1)
     far = replace(splats, means=splats.means + np.float32(1000))
-    camera = seen_from(np.array((1.2, -2.2, -5.2)) + 1000, np.array((0, -0.8, 0)) + 1000)
+    camera = seen_from((1001.2, 997.8, 994.8), target=(1000, 999.2, 1000))
     (drawn,) = draw(page, far, [camera])
     reached = psnr(drawn, expected(far, camera))
     log.info("far from the origin: %.1f dB", reached)
@@ -215,6 +197,6 @@ def test_an_antialiased_scene_is_drawn_with_compensated_opacities(page, ending, 
 def test_scenes_of_no_and_one_gaussian(page, count, degree):
     splats = kissgs.sample_scene(count, sh_degree=degree)
     middle = splats.means.mean(axis=0) if count else np.zeros(3)
-    camera = seen_from(middle + np.array([0, 0, -4.0]), middle, (40, 30))
+    camera = seen_from(middle - [0, 0, 4], (40, 30), middle)
     (drawn,) = draw(page, splats, [camera], background="#204060")
     assert np.abs(drawn - expected(splats, camera, (0x20 / 255, 0x40 / 255, 0x60 / 255))).max() < 3 / 255

@@ -26,24 +26,22 @@ def argb(count, seed=0):
     return np.random.default_rng(seed).integers(0, 1 << 32, count).tolist()
 
 
-ACCEPTED = []
-REFUSED = []
+ACCEPTED, REFUSED = [], []
 
 
-def accepted(make):
-    """Register streams that both decoders read to the same pixels."""
-    ACCEPTED.append(make)
-    return make
-
-
-def refused(why):
-    """Register streams that both decoders refuse, this one with these words."""
+def accepted(cases=None, into=ACCEPTED, why=""):
+    """Register streams that both decoders read to the same pixels: all of a list, or one for each case."""
 
     def register(make):
-        REFUSED.append((make, why))
+        into.append((make.__name__, lambda: make() if cases is None else map(make, cases), why))
         return make
 
     return register
+
+
+def refused(why, cases=None):
+    """Register streams that both decoders refuse, this one with these words."""
+    return accepted(cases, REFUSED, why)
 
 
 def assert_like_pillow(name, data, got, channels=4):
@@ -74,12 +72,12 @@ def with_tiles(kind, bits, width, height, pixel):
     return writer
 
 
-@accepted
+@accepted()
 def plain_noise():
     return [plain(1, 1), plain(5, 3), plain(33, 17)]
 
 
-@accepted
+@accepted()
 def every_predictor_of_noise():
     """Modes 14 and 15 mean black; other bits of the tiles are ignored; narrow images have no pixel to the right."""
     writers = []
@@ -91,7 +89,7 @@ def every_predictor_of_noise():
     return writers
 
 
-@accepted
+@accepted()
 def every_size_of_tiles():
     writers = []
     for bits in range(2, 10):
@@ -104,13 +102,14 @@ def every_size_of_tiles():
     return writers
 
 
-@accepted
+@accepted()
 def every_factor_of_cross_colour():
     """Factors are signed bytes from -128 to 127, two tiles of each."""
     return [with_tiles(CROSS_COLOUR, 2, 64, 64, lambda i, at=at: (i % 256) << at) for at in (0, 8, 16)]
 
 
-def made_transforms_in_any_order(order):
+@accepted([(2, 0, 1), (1, 2, 0), (0, 1, 2), (0, 2), (1, 0), (2, 1)])
+def transforms_in_any_order(order):
     writer = Writer(30, 20)
     for kind in order:
         writer.transform(kind, None if kind == SUBTRACT_GREEN else 3)
@@ -121,12 +120,14 @@ def made_transforms_in_any_order(order):
     return writer
 
 
-@accepted
-def transforms_in_any_order():
-    return list(map(made_transforms_in_any_order, [(2, 0, 1), (1, 2, 0), (0, 1, 2), (0, 2), (1, 0), (2, 1)]))
+SIZES = (1, 2, 3, 4, 5, 15, 16, 17, 200, 256)
+OTHERS = ((), (SUBTRACT_GREEN,), (PREDICTOR,), (CROSS_COLOUR, PREDICTOR))
 
 
-def made_palette(size, before, others):
+@accepted([*itertools.product(SIZES, (True, False), OTHERS)])
+def palettes_with_indices_beyond_their_end(case):
+    """Transforms after a palette apply to packed pixels."""
+    size, before, others = case
     width, height = 29, 11
     writer = Writer(width, height)
 
@@ -150,17 +151,7 @@ def made_palette(size, before, others):
     return writer
 
 
-@accepted
-def palettes_with_indices_beyond_their_end():
-    """Transforms after a palette apply to packed pixels."""
-    sizes, others = (
-        (1, 2, 3, 4, 5, 15, 16, 17, 200, 256),
-        ((), (SUBTRACT_GREEN,), (PREDICTOR,), (CROSS_COLOUR, PREDICTOR)),
-    )
-    return [made_palette(*case) for case in itertools.product(sizes, (True, False), others)]
-
-
-@accepted
+@accepted()
 def codes_of_one_and_two_symbols():
     """Codes are simple or not, of one symbol of any length, of two equal symbols, or of a one-bit first symbol."""
 
@@ -168,13 +159,13 @@ def codes_of_one_and_two_symbols():
         writer = Writer(16, 16)
         writer.put(0, 3)
         codes = [write(writer), *(writer.simple(symbol) for symbol in (7, 255, 128, 0))]
-        for value in np.random.default_rng(1).choice(list(codes[0].values()), 256):
+        for value in np.random.default_rng(1).choice(list(codes[0]), 256):
             writer.symbol(codes[0], int(value))
         return writer
 
     def one_bit(writer):
         writer.put(0b0001, 4)  # read upwards: simple, one symbol, of one bit, 0
-        return {(1, 0): 0}
+        return {0: (1, 0)}
 
     def only(length, symbol):
         return lambda writer: writer.code([0] * symbol + [length], 280)
@@ -188,7 +179,9 @@ def codes_of_one_and_two_symbols():
     ]
 
 
-def made_codes_up_to_15_bits(longest):
+@accepted(range(1, 16))
+def codes_up_to_15_bits(longest):
+    """One symbol of each length gives the longest possible codes, with one or two tables."""
     lengths = [*range(1, longest + 1), longest]
     writer = Writer(32, 32)
     writer.put(0, 3)
@@ -201,13 +194,7 @@ def made_codes_up_to_15_bits(longest):
     return writer
 
 
-@accepted
-def codes_up_to_15_bits():
-    """One symbol of each length gives the longest possible codes, with one or two tables."""
-    return list(map(made_codes_up_to_15_bits, range(1, 16)))
-
-
-@accepted
+@accepted()
 def code_lengths_in_all_encodings():
     """Repeats 16, 17 and 18, also at the beginning (16 repeats 8 there), and a number of lengths."""
     writer = Writer(16, 16)
@@ -242,13 +229,20 @@ def code_lengths_in_all_encodings():
     return [writer]
 
 
-def made_colour_caches(bits):
-    writer = Writer(40, 30)
+def with_cache(width, height, bits):
+    """Return an image with a colour cache and its codes, for pixels to follow."""
+    writer = Writer(width, height)
     writer.put(0, 1)
     writer.put(1, 1)
     writer.put(bits, 4)
     writer.put(0, 1)
-    codes = writer.literal_codes(cache=bits)
+    return writer, writer.literal_codes(cache=bits)
+
+
+@accepted(range(1, 12))
+def colour_caches(bits):
+    """Caches of all sizes, with pixels from filled and from empty slots, which are transparent black."""
+    writer, codes = with_cache(40, 30, bits)
     rng = np.random.default_rng(bits)
     count = 0
     while count < 1200:
@@ -265,30 +259,21 @@ def made_colour_caches(bits):
     return writer
 
 
-@accepted
-def colour_caches():
-    """Caches of all sizes, with pixels from filled and from empty slots, which are transparent black."""
-    return list(map(made_colour_caches, range(1, 12)))
-
-
-@accepted
+@accepted()
 def a_colour_from_an_empty_slot_is_put_into_the_cache():
     """The colour of an empty slot is 0, which then replaces the colour in slot 0."""
     bits = 1
     kept = next(value for value in range(0xFF000001, 0xFFFFFFFF) if (0x1E35A7BD * value & 0xFFFFFFFF) >> 31 == 0)
-    writer = Writer(3, 1)
-    writer.put(0, 1)
-    writer.put(1, 1)
-    writer.put(bits, 4)
-    writer.put(0, 1)
-    codes = writer.literal_codes(cache=bits)
+    writer, codes = with_cache(3, 1, bits)
     writer.pixel(codes, kept)
     writer.symbol(codes[0], 281)
     writer.symbol(codes[0], 280)
     return [writer]
 
 
-def made_every_distance_and_length(width):
+@accepted([1, 2, 5, 9, 40])
+def every_distance_and_length(width):
+    """Includes the 120 near distances; those that are not positive mean the previous pixel."""
     height = 400 // width + 30
     near = [*range(1, 121), 121, 125, 200, 300]
     writer = Writer(width, height)
@@ -327,13 +312,9 @@ def made_every_distance_and_length(width):
     return writer
 
 
-@accepted
-def every_distance_and_length():
-    """Includes the 120 near distances; those that are not positive mean the previous pixel."""
-    return list(map(made_every_distance_and_length, [1, 2, 5, 9, 40]))
-
-
-def made_groups_of_codes(bits):
+@accepted(range(2, 10))
+def groups_of_codes(bits):
+    """Each tile has a group, whose number takes both bytes; some groups are never used."""
     width, height = (70, 9) if bits < 7 else (2 * (1 << bits) + 3, 2)
     writer = Writer(width, height)
     writer.put(0, 2)
@@ -350,13 +331,7 @@ def made_groups_of_codes(bits):
     return writer
 
 
-@accepted
-def groups_of_codes():
-    """Each tile has a group, whose number takes both bytes; some groups are never used."""
-    return list(map(made_groups_of_codes, range(2, 10)))
-
-
-@accepted
+@accepted()
 def groups_of_codes_that_are_not_used():
     """All tiles use group 300, so that 301 groups are written and one is used."""
     writer = Writer(9, 9)
@@ -386,7 +361,8 @@ def test_alpha_does_not_depend_on_the_hint(hint, tmp_path):
 # --- Files that both decoders refuse ---------------------------------------------------------------------
 
 
-def made_a_transform_twice(kind):
+@refused("a transform that occurs twice", range(4))
+def a_transform_twice(kind):
     writer = Writer(4, 4)
     for _ in range(2):
         writer.transform(kind, None if kind in (SUBTRACT_GREEN, INDEXING) else 2)
@@ -399,38 +375,20 @@ def made_a_transform_twice(kind):
     return writer
 
 
-@refused("a transform that occurs twice")
-def a_transform_twice():
-    return list(map(made_a_transform_twice, range(4)))
-
-
-def made_other_versions(version):
+@refused("version", range(1, 8))
+def other_versions(version):
     writer = Writer(4, 4, version=version)
     writer.put(0, 1)
     writer.image(argb(16), main=True)
     return writer
 
 
-@refused("version")
-def other_versions():
-    return list(map(made_other_versions, range(1, 8)))
-
-
-def made_caches_of_invalid_size(bits):
-    writer = Writer(4, 4)
-    writer.put(0, 1)
-    writer.put(1, 1)
-    writer.put(bits, 4)
-    writer.put(0, 1)
-    codes = writer.literal_codes(cache=bits)
+@refused("cache", [0, 12, 13, 14, 15])
+def caches_of_invalid_size(bits):
+    writer, codes = with_cache(4, 4, bits)
     for value in argb(16):
         writer.pixel(codes, value)
     return writer
-
-
-@refused("cache")
-def caches_of_invalid_size():
-    return list(map(made_caches_of_invalid_size, [0, 12, 13, 14, 15]))
 
 
 def made_code(lengths, which):
@@ -442,7 +400,7 @@ def made_code(lengths, which):
     return writer
 
 
-@accepted
+@accepted()
 def codes_of_one_long_symbol():
     return [made_code([2], which) for which in range(5)]
 
@@ -496,7 +454,7 @@ def a_symbol_outside_its_alphabet():
     return [writer]
 
 
-@accepted
+@accepted()
 def one_of_two_symbols_outside_its_alphabet():
     writer = Writer(2, 2)
     writer.put(0, 3)
@@ -506,14 +464,14 @@ def one_of_two_symbols_outside_its_alphabet():
 
 
 def test_streams_that_both_decoders_read(tmp_path):
-    cases = [(make.__name__, writer.file()) for make in ACCEPTED for writer in make()]
+    cases = [(name, writer.file()) for name, make, _ in ACCEPTED for writer in make()]
     for (name, data), got in zip(cases, decode_all(tmp_path, [data for _, data in cases], pixels=True), strict=True):
         assert pillow(data) is not None, name
         assert_like_pillow(name, data, got)
 
 
 def test_streams_that_both_decoders_refuse(tmp_path):
-    cases = [(make.__name__, why, writer.file()) for make, why in REFUSED for writer in make()]
+    cases = [(name, why, writer.file()) for name, make, why in REFUSED for writer in make()]
     for (name, why, data), got in zip(cases, decode_all(tmp_path, [data for *_, data in cases]), strict=True):
         assert pillow(data) is None, name
         assert got.get("name") == "WebPError", (name, got)

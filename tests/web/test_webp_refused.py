@@ -3,15 +3,13 @@
 import base64
 import io
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.reference_vp8l import Writer, chunk, riff, stream_of, wrapped
+from helpers.web_scenes import IMAGES, container
 from helpers.web_tools import decode_all, pillow, sha_of, webp
 from PIL import Image
-
-import kissgs
 
 RNG = np.random.default_rng(0)
 NOISE = webp(RNG.integers(0, 256, (9, 11, 4)).astype(np.uint8))
@@ -117,20 +115,8 @@ LIMIT = 1 << 20
 
 def planes():
     """Return small images of containers of several presets, and others."""
-    rng = np.random.default_rng(5)
     found = [SMALL, NOISE, saved(lossless=True, exif=b"Exif\0\0abc")]
-    scene = kissgs.Splats(
-        means=rng.normal(size=(150, 3)).astype(np.float32),
-        quats=rng.normal(size=(150, 4)).astype(np.float32),
-        scales=rng.normal(-4, 1, (150, 3)).astype(np.float32),
-        opacities=rng.normal(size=150).astype(np.float32),
-        sh0=rng.normal(size=(150, 3)).astype(np.float32),
-        shN=(rng.normal(size=(150, 15, 3)) * 0.1).astype(np.float32),
-    )
-    for preset in ("fast", "paper"):
-        files = kissgs.compress(scene, settings=kissgs.Settings(preset=preset)).files
-        found += [data for name, data in files.items() if Path(name).suffix == ".webp"]
-    return found
+    return found + [container(preset, 3, 150)[name] for preset in ("fast", "paper") for name in IMAGES]
 
 
 def changed(data, rng):
@@ -175,7 +161,7 @@ def corpus():
 
 
 @pytest.mark.parametrize("part", range(PARTS))
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_changed_bytes(part, corpus, tmp_path):
     """Any change gives an error of one sentence or an image, the same as libwebp's if that decodes the file."""
     rng = np.random.default_rng(part)
