@@ -273,7 +273,7 @@ def test_a_target_size_is_met_if_fine_tuned_containers_are_too_large(monkeypatch
     def sizes(files, *, packed):
         return 900 + 900 * (b"finetune" in files[YAML_NAME]), {}
 
-    monkeypatch.setattr("kissgs.pipeline.rate_control.stored_sizes", sizes)
+    monkeypatch.setattr("kissgs.pipeline.search.stored_sizes", sizes)
     common = {"target_size": 1000, "sensitivity_views": 4, "sensitivity_view_size": 60}
     gentle = Settings.from_preset("balanced", finetune={**SHORT, **GENTLE}, **common)
     found = kissgs.compress(cloud(60), settings=gentle)
