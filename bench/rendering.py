@@ -98,7 +98,7 @@ def one_view(splats: Splats, model: GaussianModel, camera: Camera) -> tuple[int,
     times.append(training_steps(model, camera))
     with Workers(0) as pool:
         frame = draw(splats, camera, np.zeros(3, np.float32), pool)
-    return frame.footprints.count, dict(zip(NAMES, times, strict=True))
+    return len(frame.rows()), dict(zip(NAMES, times, strict=True))
 
 
 def training_steps(model: GaussianModel, camera: Camera) -> list[float]:
@@ -109,7 +109,7 @@ def training_steps(model: GaussianModel, camera: Camera) -> list[float]:
         "measure",
         Pace(REPEATS + 1),
         lambda done: NO_RATES,
-        ssim_weight=settings.used_ssim_weight,
+        ssim_weight=settings.ssim_weight,
         mse_weight=settings.mse_weight,
         seed=(0,),
     )

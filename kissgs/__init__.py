@@ -35,11 +35,12 @@ if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
     from kissgs.io.ply import PlyInfo, read_ply_info
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.pipeline.decompress import decompress
     from kissgs.pipeline.inspect import SceneInfo, read_scene_info
     from kissgs.pipeline.pipeline import Compressed, compact, compress
     from kissgs.pipeline.report import Report
-    from kissgs.pipeline.scene_files import ReadOptions, load, recognise, save
+    from kissgs.pipeline.scene_files import load, recognise, save
     from kissgs.rendering.camera import Camera
     from kissgs.rendering.rasterizer import render
     from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
@@ -69,7 +70,7 @@ _HOMES = {
     "PlyInfo": "io.ply",
     "Preset": "settings",
     "Progress": "core.progress",
-    "ReadOptions": "pipeline.scene_files",
+    "ReadOptions": "io.scene_format",
     "Remote": "client",
     "RemoteError": "core.errors",
     "RunnerError": "core.errors",

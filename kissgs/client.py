@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 from kissgs.core.errors import Cancelled, InvalidSceneError, KissgsError, RemoteError, UnsupportedError
 from kissgs.core.progress import Progress, silent
-from kissgs.io.containers import ContainerName, named_container
+from kissgs.formats import ContainerName, named_container
 from kissgs.io.files import atomic_file, reason_of, refuse_existing
 from kissgs.settings import Settings
 
@@ -369,7 +369,7 @@ def _checked(response: httpx.Response) -> httpx.Response:
         return response
     try:
         problem = response.json()
-        hint = "; set KISSGS_KEY or give --key" if problem["code"] == "unauthorized" else ""
+        hint = "; set KISSGS_KEY (in Python key)" if problem["code"] == "unauthorized" else ""
         error = _error({"code": problem["code"], "detail": problem["detail"] + hint})
     except (ValueError, KeyError, TypeError):
         error = RemoteError(

@@ -35,7 +35,6 @@ CHECKED = [
     "planning/rd_criterion",
     "planning/rd_fields",
     "planning/rdo_quantize",
-    "planning/rdo_tables",
     "planning/rotation_forms",
     "planning/sh_codebook",
     "planning/smallest_three",

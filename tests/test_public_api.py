@@ -139,9 +139,9 @@ print([name for name in {(*HEAVY, *ENCODER, *others)} if name in sys.modules])
 
 @pytest.mark.parametrize(("module", "seconds"), [("kissgs", 0.1), ("kissgs.pipeline.pipeline", 0.5)])
 def test_importing_is_quick(module, seconds):
-    """Processor time, the best of three, so that a busy machine does not matter."""
+    """Processor time, the best of up to three, so that a busy machine does not matter."""
     program = f"import time; start = time.process_time(); import {module}; print(time.process_time() - start)"
-    assert min(float(fresh(program)) for _ in range(3)) < seconds
+    assert any(float(fresh(program)) < seconds for _ in range(3))
 
 
 def test_errors_form_one_tree_with_codes_of_their_own():

@@ -118,14 +118,20 @@ export function expandSH({ count, degree, labels, centroids }) {
   return shN;
 }
 
+/** @type {(value: any, most: number) => boolean} */
+const isDeeper = (value, most) =>
+  Object(value) === value && (most < 0 || Object.values(value).some((each) => isDeeper(each, most - 1)));
+
 /**
- * Parse the metadata, an object.
+ * Parse the metadata, an object, nested at most 200 deep.
  * @param {Uint8Array} json
  * @returns {any}
  */
 export function parseMeta(json) {
   try {
-    return JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
+    const meta = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
+    if (isDeeper(meta, 200)) throw new Error("too deep");
+    return meta;
   } catch (error) {
     throw new Error(`${META} is not readable JSON`, { cause: error });
   }

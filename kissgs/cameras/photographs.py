@@ -77,21 +77,13 @@ class PhotoHeader:
 
 
 def read_photo_header(path: Path) -> PhotoHeader:
-    """Read the header of a photograph, without its pixels.
-
-    Raises:
-        InvalidViewsError: the file cannot be read, has another format, or has more than :data:`MAX_PIXELS`.
-    """
+    """Read the header of a photograph, without its pixels."""
     with _opened(path) as image:
         return PhotoHeader(image.width, image.height, _is_transparent(image))
 
 
 def orientation(path: Path) -> int:
-    """Return the photograph's EXIF orientation, which is ignored, 1 to 8; 1 is upright.
-
-    Raises:
-        InvalidViewsError: as for :func:`read_photo_header`; a PNG file is read whole.
-    """
+    """Return the photograph's EXIF orientation, which is ignored, 1 to 8; 1 is upright."""
     with _opened(path) as image:
         found = image.getexif().get(Base.Orientation)
         return found if isinstance(found, int) and 1 <= found <= 8 else 1
@@ -104,10 +96,6 @@ def read_photo(
 
     Returns:
         uint8 array ``(height, width, 3)``.
-
-    Raises:
-        InvalidViewsError: the file cannot be read, has another format, is damaged or truncated, or has too many pixels.
-        UnsupportedError: it has 32 bits per channel.
     """
     with _opened(path) as image:
         if image.mode in ("I", "F"):
@@ -271,9 +259,6 @@ def full_window(lens: Lens) -> Window:
 
     The window is the photograph's rectangle shrunk towards the principal point, so its aspect ratio stays, and barrel
     distortion loses nothing.
-
-    Raises:
-        InvalidViewsError: the principal point is outside the photograph, or less than :data:`MIN_AREA` would remain.
     """
     if not (0 < lens.cx < lens.width and 0 < lens.cy < lens.height):
         raise InvalidViewsError(

@@ -30,50 +30,32 @@ HELD_OUT = " · held out"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedImages:
-    """Result of a render job.
-
-    Attributes:
-        images: uint8 ``(height, width, 3)`` each: one image or contact sheet, or the frames of an animation.
-        views: the views that were rendered, in the world's coordinates; for a contact sheet, those of all its cells.
-        description: description of the views, for people.
-    """
+    """Result of a render job."""
 
     images: Sequence[UInt8[np.ndarray, "H W 3"]]
+    """One image or contact sheet, or the frames of an animation."""
     views: Sequence[View]
+    """The views that were rendered, in the world's coordinates; for a contact sheet, those of all its cells."""
     description: str
+    """Description of the views, for people."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RenderJob:
-    """Renderer of a scene with the choices of ``kissgs render``.
-
-    Attributes:
-        splats: scene to render, without non-finite values (:func:`kissgs.clean`).
-        size: (width, height) of each image, pixels; None for the camera's size, else for the default.
-        background: RGB, 0 to 1; None for that of the capture, else black.
-        device: as for :func:`kissgs.render`.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the stages ``"kernels"``, ``"cameras"`` and ``"render"``.
-    """
+    """Renderer of a scene with the choices of ``kissgs render``."""
 
     splats: Splats
+    """Without non-finite values (:func:`kissgs.clean`)."""
     size: tuple[int, int] | None = None
+    """(width, height) of each image, pixels; None for the camera's size, else for the default."""
     background: Colour | None = None
+    """RGB, 0 to 1; None for that of the capture, else black."""
     device: Device = "cpu"
     threads: int = 0
     progress: Progress = silent
 
     def single(self, capture: Views | None, which: str | None) -> RenderedImages:
-        """Render a single image, by default at the camera's size.
-
-        Args:
-            capture: views that ``which`` selects from, in the scene's coordinates; None for virtual views.
-            which: number or name of a view, or a camera file; None for the first view of the capture, or the best
-                virtual view.
-
-        Raises:
-            InvalidViewsError: no view or camera file matches ``which``.
-        """
+        """Render a single image, by default at the camera's size."""
         load_kernels(self.progress)
         if which is not None and is_camera_file(which):
             view, source = view_of_file(which).relative_to(self.splats.origin), "camera file"

@@ -29,19 +29,15 @@ class UndistortionSpec:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """The pixels of a whole image that a view has.
-
-    Attributes:
-        width: of the whole image, the photograph after undistortion, pixels.
-        height: of the whole image, pixels.
-        stride: distance of neighbouring pixels of the view in the whole image, in columns and in rows.
-        first: column and row of the view's first pixel.
-    """
+    """The pixels of a whole image that a view has."""
 
     width: int
+    """Width of the whole image, the photograph after undistortion, pixels."""
     height: int
     stride: int
+    """Distance of neighbouring pixels of the view in the whole image, in columns and in rows."""
     first: tuple[int, int]
+    """Column and row of the view's first pixel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,15 +109,12 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
-    """A change of world coordinates that keeps shapes: a rotation, a translation and a scale.
-
-    Attributes:
-        source: the file or field that has it, for messages.
-        matrix: ``(4, 4)`` float64, from the old coordinates to the new ones.
-    """
+    """A change of world coordinates that keeps shapes: a rotation, a translation and a scale."""
 
     source: str
+    """The file or field that has it, for messages."""
     matrix: Float64[np.ndarray, "4 4"]
+    """Transform from the old coordinates to the new ones."""
 
     def moved(self, view: View) -> View:
         """Return the view in the new coordinates; lengths along its camera's axes change by the scale."""

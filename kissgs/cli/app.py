@@ -21,7 +21,7 @@ from kissgs.cli.decompress import decompress
 from kissgs.cli.evaluate import evaluate
 from kissgs.cli.files import discard_stdout, write_stdout
 from kissgs.cli.info import info
-from kissgs.cli.options import with_default_values
+from kissgs.cli.options import SCENE_OPTIONS, SEE_SCENE_OPTIONS, with_default_values
 from kissgs.cli.remote import app as remote
 from kissgs.cli.render import render
 from kissgs.cli.sample import sample
@@ -34,6 +34,7 @@ app = typer.Typer(
     name="kissgs",
     help="Compress 3D Gaussian Splatting scenes (.ply, .sog, .spz and others) into SOG-XT containers, which any "
     "browser can decode.",
+    epilog=SCENE_OPTIONS,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -63,7 +64,9 @@ def _run() -> None:
         _fail(UnsupportedError(f"cannot use {error.filename!s:.100}: {(error.strerror or str(error)).lower()}"))
 
 
-for command in (compress, decompress, convert, compact, render, view, evaluate, info, sample, bench, warmup):
+for command in (compress, decompress, convert, compact, render, view, evaluate, info):
+    app.command(epilog=SEE_SCENE_OPTIONS)(command)
+for command in (sample, bench, warmup):
     app.command()(command)
 app.add_typer(remote)
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from kissgs.cameras.views import Views
     from kissgs.evaluation.results import Evaluation
-    from kissgs.io.containers import ContainerName
+    from kissgs.formats import ContainerName
     from kissgs.pipeline.report import Report
     from kissgs.settings import Settings
 
@@ -147,11 +147,7 @@ def _plot_beside(output: Path, force: bool) -> Path | None:
 def measured(
     scene: Path, settings: Settings, *, container: ContainerName = "sogxt", views: Views | None = None
 ) -> Measurement:
-    """Compress, decompress and evaluate a scene in a separate process; ``views`` serve the encoder and the evaluation.
-
-    Raises:
-        KissgsError: the scene or the capture cannot be used, or the process was killed.
-    """
+    """Compress, decompress and evaluate a scene in a process of its own, with ``views`` for both."""
     return isolated(partial(_measure, scene, settings, container, views), str(scene))
 
 
@@ -178,11 +174,7 @@ def _measure(scene: Path, settings: Settings, container: ContainerName, views: V
 
 
 def isolated(work: Callable[[], Result], what: str) -> Result:
-    """Call ``work`` in a separate process, so that its times and memory are its own; ``what`` is for error messages.
-
-    Raises:
-        UnsupportedError: the process was killed, most likely for lack of memory.
-    """
+    """Call ``work`` in a separate process, so that its times and memory are its own; ``what`` is for error messages."""
     ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process, which ends the other
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=ignore) as pool:
         try:

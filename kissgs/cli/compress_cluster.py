@@ -22,7 +22,7 @@ from kissgs.cli.files import show, sibling
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.io.files import move_into_place, open_scene_file, reason_of
-from kissgs.runners import INTERNAL, Outcome, Resources, RunHandle, Runner, WorkItem, error_of, open_runner
+from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of
 from kissgs.sogxt.container import check_destination
 
 if TYPE_CHECKING:
@@ -32,20 +32,12 @@ if TYPE_CHECKING:
 def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
     """Compress a scene into a new folder within the work folder, from where whoever submitted it moves the result.
 
-    Args:
-        arguments: "scene" and its size "bytes", the work folder "work", the path "target" for which the output is
-            made, and arguments of :func:`kissgs.compress`; "width" and "color" of the terminal.
-        progress: receives the stages.
-
     Returns:
         "written", the path of the output; "report" for JSON; "table", the report as text for the terminal.
-
-    Raises:
-        KissgsError: as :func:`kissgs.compress`, or the files are not on storage that this machine shares.
     """
     from kissgs.cli.options import open_views
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.pipeline.pipeline import compress
-    from kissgs.pipeline.scene_files import ReadOptions
     from kissgs.settings import Settings
 
     scene, work = Path(arguments["scene"]), Path(arguments["work"])
@@ -129,10 +121,6 @@ class ClusterCompression:
     All scenes are submitted at once, and their results are awaited in order. An item writes below a work folder beside
     its output, and the result is moved from there when its outcome has arrived: a node may be lost at any moment, and
     nothing is written twice or in part.
-
-    Attributes:
-        address: address of the cluster.
-        options: the command's options.
     """
 
     address: str
@@ -143,19 +131,12 @@ class ClusterCompression:
 
     @contextlib.contextmanager
     def submitted(self, inputs: list[tuple[str, Path]]) -> Iterator[None]:
-        """Connect to the cluster and submit all scenes, given each with the path of its output.
-
-        The end of the context cancels what has not ended.
-
-        Raises:
-            UnsupportedError: an input or output has no path, or no node has the resources.
-            RunnerError: the cluster cannot be reached.
-        """
+        """Connect to the cluster and submit all scenes; the end of the context cancels what has not ended."""
         if any("-" in (name, str(target)) for name, target in inputs):
             raise UnsupportedError("--ray needs files that all machines see, not standard input or output")
         with progress_bar(self.options.quiet) as bar:
             bar("cluster", 0.0)
-            runner = open_runner("ray", self.address)
+            runner = RayRunner(self.address)
         try:
             requested = self._request(runner, len(inputs))
             for name, target in inputs:
@@ -172,11 +153,7 @@ class ClusterCompression:
                     shutil.rmtree(work, ignore_errors=True)
 
     def result(self, name: str, target: Path) -> dict[str, Any]:
-        """Wait for the result of one scene, move it to its place, show its table and return its report.
-
-        Raises:
-            KissgsError: the scene could not be compressed.
-        """
+        """Wait for the result of one scene, move it to its place, show its table and return its report."""
         handle = self._handles[target]
         if isinstance(handle, KissgsError):
             raise handle
@@ -195,12 +172,9 @@ class ClusterCompression:
         return report
 
     def _request(self, runner: Runner, count: int) -> Resources:
-        """Return the processors and GPUs that each of ``count`` scenes requests.
-
-        Without ``--threads``, all processors of the cluster are shared among the scenes.
-        """
-        stats = runner.stats()
-        share = min(stats.smallest_cpus, stats.cpus // count)
+        """Return the processors and GPUs of each of ``count`` scenes, which share all without ``--threads``."""
+        processors = [node.cpus for node in runner.nodes]
+        share = min(*processors, sum(processors) // count) if processors else 0
         cpus = self.options.threads or max(1, int(share))
         requested = Resources(cpus, gpus=1 if self.options.device == "cuda" else 0)
         if refusal := runner.refusal(requested):
@@ -247,12 +221,8 @@ class ClusterCompression:
         return runner.submit(WorkItem("kissgs.cli.compress_cluster:compress_scene", arguments, resources), progress)
 
     def _with_memory(self, runner: Runner, requested: Resources, memory: int) -> Resources:
-        """Return a request with memory, at most that of the largest node that has the rest of it.
-
-        Raises:
-            UnsupportedError: no node has the resources any more.
-        """
-        nodes = [node.total.memory for node in runner.stats().nodes if requested.fits(node.total)]
+        """Return a request with memory, at most that of the largest node that has the rest of it."""
+        nodes = [node.memory for node in runner.nodes if requested.fits(node)]
         resources = Resources(requested.cpus, min(memory, max(nodes, default=0)), requested.gpus)
         if refusal := runner.refusal(resources):
             raise UnsupportedError(refusal)

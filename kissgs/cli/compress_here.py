@@ -20,17 +20,7 @@ if TYPE_CHECKING:
 
 
 def compress_here(options: CompressOptions, capture: Views | None, scene: str, target: Path) -> dict[str, Any]:
-    """Compress a scene, show a table of the result and return its report.
-
-    Args:
-        options: the command's options.
-        capture: the views at ``options.views``.
-        scene: path of the scene, or "-" for standard input.
-        target: path of the output, or "-" for standard output.
-
-    Raises:
-        KissgsError: as :func:`kissgs.compress`, or standard output cannot be written.
-    """
+    """Compress a scene, show a table of the result and return its report; ``capture`` are the ``options.views``."""
     piped = str(target) == "-"
     searches = decided(options.settings, capture).searches
     with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:

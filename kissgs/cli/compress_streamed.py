@@ -21,14 +21,7 @@ if TYPE_CHECKING:
 
 
 def refuse_options(manifest: Path, options: CompressOptions, *, container: str | None, unpacked: bool) -> None:
-    """Raise UnsupportedError for options that levels of detail do not have.
-
-    Args:
-        manifest: path of the manifest to write.
-        options: the command's options.
-        container: value of ``--container``; None if not given.
-        unpacked: whether ``--unpacked`` was given.
-    """
+    """Raise UnsupportedError for options that levels of detail do not have."""
     unused = {
         "--views": options.views,
         "--evaluate": options.evaluate,
@@ -41,18 +34,7 @@ def refuse_options(manifest: Path, options: CompressOptions, *, container: str |
 
 
 def compress_streamed(options: CompressOptions, ray: str | None, scene: str, target: Path) -> dict[str, Any]:
-    """Compress a scene into a streamed scene, show a table of the result and return its report.
-
-    Args:
-        options: the command's options.
-        ray: address of a Ray cluster that does the work; None for this machine.
-        scene: path of the scene.
-        target: path of the manifest.
-
-    Raises:
-        UnsupportedError: the scene is standard input.
-        KissgsError: as :func:`kissgs.compress_streamed`, or the cluster cannot be reached.
-    """
+    """Compress a scene into a streamed scene, show a table and return its report; ``ray`` is an address or None."""
     if scene == "-":
         raise UnsupportedError("levels of detail need a file: it is read more than once")
     with _stages(options.quiet) as progress, contextlib.ExitStack() as ending:
@@ -66,10 +48,10 @@ def compress_streamed(options: CompressOptions, ray: str | None, scene: str, tar
 
         runner = None
         if ray is not None:
-            from kissgs.runners import open_runner
+            from kissgs.runners import RayRunner
 
             progress("cluster", 0.0)
-            runner = open_runner("ray", ray)
+            runner = RayRunner(ray)
             ending.callback(runner.close)
         report = run(
             scene,

@@ -4,54 +4,44 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from kissgs.cli.console import progress_bar
 from kissgs.cli.files import for_each_input, say_notes, show, source, stdout
 from kissgs.cli.options import (
-    AntialiasedOption,
     ForceOption,
     JsonOption,
-    LevelOption,
-    MaxGaussiansOption,
     OriginOption,
-    QuietOption,
-    RawAxesOption,
-    ThreadsOption,
-    reading_options,
+    SceneOptions,
+    reads_scenes,
 )
 from kissgs.core.errors import InvalidSceneError, OutputError
-
-if TYPE_CHECKING:
-    from kissgs.pipeline.scene_files import OutputFormat
+from kissgs.formats import ENDINGS, OUTPUT_FORMATS, SCENE_ENDINGS, WRITTEN, alternatives, output_format
 
 
+@reads_scenes
 def convert(
     files: Annotated[
         list[str],
         typer.Argument(
             metavar="IN… OUT",
-            help="Scenes ('-' reads standard input), then the output: NAME.ply, .compressed.ply, .spz, .splat, .glb "
-            "or .spz.glb; with --to also a folder, or '-' for standard output.",
+            help=f"Scenes ('-' reads standard input), then the output: NAME{alternatives(WRITTEN)}; with --to also a "
+            "folder, or '-' for standard output.",
         ),
     ],
     to: Annotated[
         str | None,
-        typer.Option("--to", help="Format where OUT has no ending: ply, compressed.ply, spz, splat, glb or spz.glb."),
+        typer.Option("--to", help=f"Format where OUT has no ending: {alternatives(OUTPUT_FORMATS)}."),
     ] = None,
-    max_gaussians: MaxGaussiansOption = None,
-    level: LevelOption = 0,
-    raw_axes: RawAxesOption = False,
     origin: OriginOption = None,
-    antialiased: AntialiasedOption = None,
-    threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
+    *,
+    common: SceneOptions,
 ) -> None:
-    """Convert scenes into .ply, .compressed.ply, .spz, .splat, .glb or .spz.glb; the ending of OUT decides."""
+    """Convert scenes into other formats; the ending of OUT decides."""
     from kissgs.core.origin import in_world
     from kissgs.core.splats import clean
     from kissgs.io.files import atomic_file, refuse_existing
@@ -61,23 +51,23 @@ def convert(
     if not inputs:
         raise OutputError("convert needs an input and an output: kissgs convert IN OUT")
     kind = _output_format(output, to)
-    reading = reading_options(max_gaussians, level, raw_axes, origin, antialiased)
+    reading, quiet = common.reading(origin), common.quiet or as_json
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
         if not piped:
             refuse_existing(target, overwrite=force)
-        with progress_bar(quiet or as_json) as progress:
-            splats, cleaned = clean(read_scene(source(scene), reading, threads=threads, progress=progress))
+        with progress_bar(quiet) as progress:
+            splats, cleaned = clean(read_scene(source(scene), reading, threads=common.threads, progress=progress))
             splats = splats if origin else in_world(splats)
             with stdout() if piped else atomic_file(target, overwrite=force) as file:
                 stream = sys.stdout.buffer if file is None else file
-                losses = write_scene(stream, splats, kind, raw_axes=raw_axes, progress=progress)
+                losses = write_scene(stream, splats, kind, raw_axes=common.raw_axes, progress=progress)
         notes = [*splats.notes, *cleaned.notes, *losses]
-        say_notes(str(target), notes, quiet or as_json)
+        say_notes(str(target), notes, quiet)
         if piped:
             return {}
-        if not (quiet or as_json):
+        if not quiet:
             show(f"{target}  {len(splats):,} Gaussians, {target.stat().st_size:,} bytes")
         degree = 0 if kind == "splat" else splats.sh_degree
         size = target.stat().st_size
@@ -86,11 +76,8 @@ def convert(
     for_each_input(inputs, output, f".{kind}", as_json, work, unreadable=InvalidSceneError)
 
 
-def _output_format(output: str, to: str | None) -> OutputFormat:
+def _output_format(output: str, to: str | None) -> str:
     """Return the format of the outputs: ``--to``, or what the ending of the output stands for."""
-    from kissgs.io.containers import ENDINGS, SCENE_ENDINGS
-    from kissgs.pipeline.scene_files import OUTPUT_FORMATS, output_format
-
     if to is None:
         if output == "-":
             raise OutputError(f"standard output has no ending; give --to: {', '.join(OUTPUT_FORMATS)}")

@@ -11,19 +11,16 @@ import typer
 from kissgs.cli.console import progress_bar
 from kissgs.cli.files import for_each_input, say_notes, show, source, stdout
 from kissgs.cli.options import (
-    AntialiasedOption,
     ForceOption,
     JsonOption,
-    LevelOption,
-    MaxGaussiansOption,
-    QuietOption,
-    RawAxesOption,
+    SceneOptions,
     ScenesArgument,
-    ThreadsOption,
+    reads_scenes,
 )
 from kissgs.core.errors import InvalidContainerError
 
 
+@reads_scenes
 def decompress(
     containers: ScenesArgument,
     output: Annotated[
@@ -35,40 +32,38 @@ def decompress(
             help="Output NAME.ply, a folder, or '-' for standard output. Default: next to the container.",
         ),
     ] = None,
-    max_gaussians: MaxGaussiansOption = None,
-    level: LevelOption = 0,
-    raw_axes: RawAxesOption = False,
-    antialiased: AntialiasedOption = None,
-    threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
+    *,
+    common: SceneOptions,
 ) -> None:
-    """Decode containers, and .sog, .spz, .splat, .ksplat, .glb and .gltf scenes, into .ply files."""
+    """Decode containers and scenes of other formats into .ply files."""
     from kissgs.pipeline.decompress import decompress as run
+
+    quiet = common.quiet or as_json
 
     def work(container: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
-        with progress_bar(quiet or as_json) as progress:
+        with progress_bar(quiet) as progress:
             splats = run(
                 source(container),
                 None if piped else target,
-                max_gaussians=max_gaussians,
-                level=level,
-                raw_axes=raw_axes,
-                antialiased=antialiased,
+                max_gaussians=common.max_gaussians,
+                level=common.level or 0,
+                raw_axes=common.raw_axes,
+                antialiased=common.antialiased,
                 overwrite=force,
-                threads=threads,
+                threads=common.threads,
                 progress=progress,
             )
-        say_notes(str(target), splats.notes, quiet or as_json)
+        say_notes(str(target), splats.notes, quiet)
         if piped:
             from kissgs.io.ply import write_ply
 
             with stdout():
                 write_ply(sys.stdout.buffer, splats)
             return {}
-        if not (quiet or as_json):
+        if not quiet:
             from kissgs.cli.tables import gaussians
 
             show(f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}")

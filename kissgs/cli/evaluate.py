@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
-from functools import partial
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -12,25 +11,21 @@ import typer
 
 from kissgs.cli.files import print_json, say_notes, show
 from kissgs.cli.options import (
-    AntialiasedOption,
     ForceOption,
     ImagesOption,
-    LevelOption,
-    MaxGaussiansOption,
-    QuietOption,
-    RawAxesOption,
     RenderDeviceOption,
-    RenderThreadsOption,
-    ResolutionOption,
     ScaleOption,
+    SceneOptions,
     SplitOption,
     ViewsOption,
     choice,
     device_of,
     open_views,
+    reads_scenes,
 )
 
 
+@reads_scenes
 def evaluate(
     reference: Annotated[
         Path, typer.Argument(metavar="REFERENCE", help="Original scene, of any format that kissgs reads.")
@@ -41,7 +36,6 @@ def evaluate(
     views: ViewsOption = None,
     scale: ScaleOption = None,
     images: ImagesOption = None,
-    resolution: ResolutionOption = None,
     split: SplitOption = "test",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual cameras.")] = 0,
     distance: Annotated[
@@ -56,15 +50,11 @@ def evaluate(
         Path | None,
         typer.Option(metavar="FILE", help="Write an HTML report with renderings of both scenes and error maps."),
     ] = None,
-    max_gaussians: MaxGaussiansOption = None,
-    level: LevelOption = 0,
-    raw_axes: RawAxesOption = False,
-    antialiased: AntialiasedOption = None,
     device: RenderDeviceOption = "cpu",
-    threads: RenderThreadsOption = 0,
     force: ForceOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON report.")] = False,
-    quiet: QuietOption = False,
+    *,
+    common: SceneOptions,
 ) -> None:
     """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""
     from kissgs.cli.console import progress_bar
@@ -75,17 +65,20 @@ def evaluate(
     from kissgs.io.files import atomic_file, refuse_existing
     from kissgs.pipeline.scene_files import load, stored_bytes
 
+    quiet, threads = common.quiet or as_json, common.threads
     used_split = cast(Split, choice("--split", split, Split))
     render_device = device_of(device)
     if html is not None:
         refuse_existing(html, overwrite=force)
-    capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    with progress_bar(quiet or as_json) as progress:
-        loaded = partial(
-            load, threads=threads, max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased
-        )
+    capture = open_views(views, scale=scale, images=images)
+    with progress_bar(quiet) as progress:
+        reading = asdict(common.reading())
         sides = [
-            ReportScene(name=path.name, splats=loaded(path, progress=progress), bytes=stored_bytes(path))
+            ReportScene(
+                name=path.name,
+                splats=load(path, threads=threads, progress=progress, **reading),
+                bytes=stored_bytes(path),
+            )
             for path in (reference, candidate)
         ]
         sides[1] = replace(sides[1], splats=with_origin(sides[1].splats, sides[0].splats.origin))
@@ -107,8 +100,8 @@ def evaluate(
             with atomic_file(html, overwrite=force) as file:
                 file.write(page.encode(errors="replace"))  # file names may be invalid UTF-8
     for side in sides:
-        say_notes(side.name, side.splats.notes, quiet)
-    if scenes[0].antialiased != scenes[1].antialiased and not quiet:
+        say_notes(side.name, side.splats.notes, common.quiet)
+    if scenes[0].antialiased != scenes[1].antialiased and not common.quiet:
         marked, other = sides if scenes[0].antialiased else sides[::-1]
         sys.stderr.write(
             f"kissgs: {marked.name} is marked as trained with antialiasing, and {other.name} is not; each is drawn so "

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from kissgs.core.errors import InvalidSceneError, KissgsError, OutputError, UnsupportedError
+from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, SCENE_ENDINGS, named_manifest, names_folder
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-_DOUBLE_ENDINGS = (".compressed.ply", ".spz.glb")
 _SLASHES = tuple({"/", os.sep})
 
 
@@ -38,17 +38,8 @@ def for_each_input(
     """Call ``work`` for every input. If one of several fails, the others are still processed; the exit code is then 2.
 
     A folder that is made for the outputs stays if all inputs fail: another command may be about to write into it.
-
-    Args:
-        names: inputs as given: paths, patterns or "-".
-        output: value of ``--output``, as text if a slash at its end counts; None if not given.
-        suffix: file ending of the outputs.
-        as_json: whether to print reports as JSON.
-        work: processes one input, given the path of its output, and returns the report.
-        writes: whether the command writes outputs.
-        unreadable: error class for an input that cannot be read.
-        during: receives all inputs and outputs; its context is entered before the first call of ``work``, and left
-            after the last one.
+    ``work`` gets an input and the path of its output, and returns the report; the context of ``during``, which gets all
+    of them, encloses its calls. A slash at the end of ``output`` names a folder.
     """
     inputs = expand(names)
     if writes and output is None:
@@ -118,8 +109,6 @@ def _entry(name: str, target: Path, writes: bool, report: dict[str, Any]) -> dic
 
 def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folder: bool) -> list[Path]:
     """Return the output path of each input: next to it, in the folder ``output``, or the file ``output``."""
-    from kissgs.io.containers import FOLDER_ENDING, named_manifest, names_folder
-
     if "-" in inputs and (len(inputs) > 1 or output is None):
         raise OutputError("standard input has no name and must be the only input; give the output with -o")
     if output is not None and not is_named_folder and (str(output) == "-" or _ends_with(output, suffix)):
@@ -145,8 +134,6 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
 
 def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:
     """Raise OutputError for ``SCENE.ply NEW.zip``, as other tools name their output; -o names it here."""
-    from kissgs.io.containers import ENDINGS
-
     if len(inputs) != 2 or not os.path.lexists(inputs[0]) or os.path.lexists(inputs[1]):
         return
     read, written = (Path(name).suffix.lower() for name in inputs)
@@ -156,8 +143,6 @@ def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:
 
 def _refuse_file_name(folder: Path, suffix: str) -> None:
     """Raise OutputError if the name of a folder to be made is that of a scene's file, which somebody expects there."""
-    from kissgs.io.containers import ENDINGS, SCENE_ENDINGS
-
     ending = folder.suffix.lower()
     if not ending:
         file = f", or in {suffix}" if suffix else ""
@@ -198,7 +183,7 @@ def _stem(name: str) -> str:
     path = Path(name).absolute()
     if is_folder(path):
         return path.name
-    ending = next((ending for ending in _DOUBLE_ENDINGS if path.name.lower().endswith(ending)), path.suffix)
+    ending = next((ending for ending in DOUBLE_ENDINGS if path.name.lower().endswith(ending)), path.suffix)
     return path.name[: len(path.name) - len(ending)]
 
 

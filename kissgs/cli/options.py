@@ -2,23 +2,89 @@
 
 from __future__ import annotations
 
+import functools
 import glob
+import inspect
 import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args, get_type_hints
 
 import typer
 
 from kissgs.core.errors import UnsupportedError
-from kissgs.io.containers import ENDINGS, SCENE_ENDINGS
+from kissgs.formats import ENDINGS, SCENE_ENDINGS
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
-    from kissgs.io.containers import ContainerName
-    from kissgs.pipeline.scene_files import ReadOptions
+    from kissgs.formats import ContainerName
+    from kissgs.io.scene_format import ReadOptions
     from kissgs.settings import Settings
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Options of every command that reads scenes: :func:`reads_scenes` adds them, ``kissgs --help`` explains them."""
+
+    level: Annotated[int | None, typer.Option(min=0, hidden=True)] = None
+    max_gaussians: Annotated[int | None, typer.Option(min=0, hidden=True)] = None
+    raw_axes: Annotated[bool, typer.Option("--raw-axes", hidden=True)] = False
+    antialiased: Annotated[bool | None, typer.Option("--antialiased/--classic", hidden=True)] = None
+    threads: Annotated[int, typer.Option(min=0, hidden=True)] = 0
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", hidden=True)] = False
+
+    def reading(self, origin: str | None = None) -> ReadOptions:
+        """Return the options of reading scenes; ``origin`` is the value of ``--origin``."""
+        from kissgs.io.scene_format import ReadOptions
+
+        return ReadOptions(
+            max_gaussians=self.max_gaussians,
+            level=self.level or 0,
+            raw_axes=self.raw_axes,
+            origin=origin_of(origin),
+            antialiased=self.antialiased,
+        )
+
+
+def reads_scenes(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of :class:`SceneOptions`, which it takes as its argument ``common``."""
+    shared = inspect.signature(SceneOptions).parameters
+    hints = get_type_hints(command, include_extras=True) | get_type_hints(SceneOptions, include_extras=True)
+
+    @functools.wraps(command)
+    def with_options(**given: Any) -> None:  # noqa: ANN401
+        command(common=SceneOptions(**{name: given.pop(name) for name in shared}), **given)
+
+    own = {name: found for name, found in inspect.signature(command).parameters.items() if name != "common"}
+    parameters = [found.replace(annotation=hints[name]) for name, found in {**own, **shared}.items()]
+    with_options.__annotations__ = {name: hints[name] for name in (*own, *shared)}
+    vars(with_options)["__signature__"] = inspect.Signature(parameters)
+    return with_options
+
+
+SCENE_OPTIONS = """Every command that reads scenes also takes:
+
+[cyan]--level[/] N  Level of detail of a streamed scene; 0, the default, is the finest.
+
+[cyan]--max-gaussians[/] N  Refuse files with more Gaussians. Default: 20 million in compressed formats, whose
+files can declare far more than they hold.
+
+[cyan]--raw-axes[/]  Take the axes of .spz as those of a .ply, as splat-transform writes and reads them.
+Default: y up.
+
+[cyan]--antialiased/--classic[/]  Take the scene as trained with antialiasing, or as a classic one. Default: as the
+file is marked.
+
+[cyan]--threads[/] N  Number of threads; 0, the default, for one per processor. The output does not depend on it.
+
+[cyan]--quiet[/], [cyan]-q[/]  Print only errors.
+"""
+
+SEE_SCENE_OPTIONS = (
+    "Also: --level, --max-gaussians, --raw-axes, --antialiased/--classic, --threads, --quiet; see 'kissgs --help'."
+)
 
 ScenesArgument = Annotated[
     list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
@@ -37,33 +103,14 @@ PresetOption = Annotated[
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--set",
-        metavar="NAME=VALUE",
-        help="Change a setting of the preset; repeatable. List: docs/reference/settings.md.",
+        "--set", metavar="NAME=VALUE", help="Change another setting; repeatable. List: docs/reference/settings.md."
     ),
 ]
+ResearchOption = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", hidden=True)]
 SeedOption = Annotated[int | None, typer.Option(help="Seed of all random choices; same seed, same result. Default: 0.")]
 ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print a JSON report: an object for one file, a list for several.")
-]
-MaxGaussiansOption = Annotated[
-    int | None,
-    typer.Option(
-        min=0,
-        help="Refuse files with more Gaussians. Default: 20 million in compressed formats, whose files can declare far "
-        "more than they hold.",
-    ),
-]
-LevelOption = Annotated[
-    int, typer.Option(min=0, help="Level of detail of a streamed scene; 0 is the finest.", show_default=True)
-]
-RawAxesOption = Annotated[
-    bool,
-    typer.Option(
-        "--raw-axes",
-        help="Take the axes of .spz as those of a .ply, as splat-transform writes and reads them. Default: y up.",
-    ),
 ]
 OriginOption = Annotated[
     str | None,
@@ -73,24 +120,13 @@ OriginOption = Annotated[
         "scenes far from the origin. Default: as in the file.",
     ),
 ]
-AntialiasedOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--antialiased/--classic",
-        help="Take the scene as trained with antialiasing, or as a classic one. Default: as the file is marked.",
-    ),
-]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
-ThreadsOption = Annotated[
-    int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The output does not depend on it.")
-]
 ViewsOption = Annotated[
     Path | None,
     typer.Option(
         "--views",
         metavar="DATA",
-        help="Capture with cameras and optionally photographs: a folder with a COLMAP model or a transforms.json. "
-        "Default: virtual cameras.",
+        help="Capture to work and evaluate with, cameras and optionally photographs: a folder with a COLMAP model or a "
+        "transforms.json. Default: virtual cameras.",
     ),
 ]
 ForceViewsOption = Annotated[
@@ -103,16 +139,10 @@ ScaleOption = Annotated[
 ImagesOption = Annotated[
     Path | None, typer.Option(help="Folder of the photographs of --views, if it is not the capture's own.")
 ]
-ResolutionOption = Annotated[
-    int | None, typer.Option(min=1, help="Limit of the longer side of the photographs, pixels. Default: 1600.")
-]
 SplitOption = Annotated[
     str, typer.Option(help="Views of --views to use: test (held-out), train or all.", show_default=True)
 ]
 RenderDeviceOption = Annotated[str, typer.Option(help="Device of the rasteriser: cpu or cuda.")]
-RenderThreadsOption = Annotated[
-    int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The images do not depend on it.")
-]
 PsnrOption = Annotated[
     float | None,
     typer.Option(metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."),
@@ -141,6 +171,33 @@ TimeOption = Annotated[
         "first, it bounds the search. --evaluate takes longer.",
     ),
 ]
+CompactOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="BUDGET",
+        help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
+        "PSNR drop (0.2dB); 100% keeps all; auto searches the number that serves a goal best, which is the default "
+        "with held-out photographs, and without --views where it is fine-tuned.",
+    ),
+]
+FinetuneOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[STEPS]",
+        help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
+        "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset; 0: never. "
+        "Default with a goal, if photographs are held out or there is no --views.",
+    ),
+]
+EvaluateOption = Annotated[
+    bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
+]
+CheckpointOption = Annotated[
+    bool, typer.Option("--checkpoint", help="Save the state of training next to the scene, and resume from it.")
+]
+DeviceOption = Annotated[
+    str, typer.Option(help="Device of training: cpu (reproducible) or cuda (results vary slightly).")
+]
 RayOption = Annotated[
     str | None,
     typer.Option(
@@ -158,22 +215,7 @@ RayOption = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class CompressOptions:
-    """Options that apply to each scene of one ``kissgs compress``.
-
-    Attributes:
-        settings: the preset with all changes, budgets and goals.
-        reading: how scene files are read.
-        container: container to write.
-        cache: whether the sensitivity is kept next to the scene.
-        evaluate: whether the result is decoded and evaluated.
-        views: path of the capture; None for virtual cameras.
-        force_views: whether a capture whose photographs do not show the scene is accepted.
-        checkpoint: whether the state of training is kept next to the scene.
-        force: whether existing output files are overwritten.
-        threads: number of threads; 0 for one per processor.
-        device: device of training.
-        quiet: whether neither progress nor tables are printed.
-    """
+    """Options that apply to each scene of one ``kissgs compress``, checked."""
 
     settings: Settings
     reading: ReadOptions
@@ -205,19 +247,10 @@ def chosen(
     time: str | None = None,
     **options: float | str | None,
 ) -> Settings:
-    """Return the settings of a preset with ``NAME=VALUE`` changes, which ``options`` override.
+    """Return the settings of a preset with ``NAME=VALUE`` or ``GROUP.NAME=VALUE`` changes, which ``options`` override.
 
-    Args:
-        preset: name of the preset.
-        changes: changes of settings of ``group``, or of another group as ``GROUP.NAME=VALUE``.
-        group: "encode", "compact" or "finetune".
-        budget: settings of the group "compact".
-        finetune: a number of steps, 0 for no fine-tuning, or "auto" for that of the preset; None if not given.
-        time: time limit with a unit; None for no limit.
-        options: settings of ``group``; None if not given.
-
-    Raises:
-        UnsupportedError: there is no such preset or setting, or a value is invalid.
+    Changes may be values that belong to the preset. ``group`` is that of changes without one; ``options`` are settings
+    of encode.
     """
     from kissgs.settings import Settings
 
@@ -225,7 +258,7 @@ def chosen(
     for change in changes or []:
         name, equals, value = change.partition("=")
         if not equals:
-            raise UnsupportedError(f"--set {change!r}: write NAME=VALUE, for example --set means_bits=16")
+            raise UnsupportedError(f"--set {change!r}: write NAME=VALUE, for example --set max_encodes=5")
         of, dot, inner = name.strip().partition(".")
         if dot and of not in values:
             raise UnsupportedError(
@@ -233,13 +266,11 @@ def chosen(
             )
         values[of if dot else group][inner if dot else of] = None if value.strip() == "auto" else value.strip()
     values["compact"].update(budget or {})
-    values[group].update({name: value for name, value in options.items() if value is not None})
+    values["encode"].update({name: value for name, value in options.items() if value is not None})
     values["finetune"].update(_finetune_values(finetune))
-    if group == "encode" and options.get("seed") is not None:
-        for other in ("compact", "finetune"):
-            values[other].setdefault("seed", options["seed"])
     groups = {"compact": values["compact"], "finetune": values["finetune"]}
-    return Settings.from_preset(preset, time_limit=time, **groups, **values["encode"])
+    made = Settings.research if changes else Settings.from_preset
+    return made(preset, time_limit=time, **groups, **values["encode"])
 
 
 FINETUNE, RAY = "--finetune", "--ray"
@@ -249,14 +280,7 @@ OPTIONAL_VALUES = {FINETUNE: r"[0-9]+|auto", RAY: r"auto|[^\s/]+:[0-9]+|ray://\S
 
 
 def with_default_values(words: list[str]) -> list[str]:
-    """Insert ``auto`` after each ``--finetune`` and ``--ray`` without a value: typer has no optional values.
-
-    Args:
-        words: arguments of ``kissgs``, the name of the command first.
-
-    Raises:
-        UnsupportedError: what follows ``--ray`` of ``kissgs compress`` is neither an address nor a scene.
-    """
+    """Insert ``auto`` after each ``--finetune`` and ``--ray`` without a value: typer has no optional values."""
     result = list[str]()
     for n, word in enumerate(words):
         if word == "--":
@@ -291,11 +315,7 @@ def _finetune_values(steps: str | None) -> Values:
 
 
 def count_of(text: str) -> int:
-    """Parse a number of Gaussians: 200000, 200,000, 200k, 1.5M.
-
-    Raises:
-        UnsupportedError: the text is no such number.
-    """
+    """Parse a number of Gaussians: 200000, 200,000, 200k, 1.5M."""
     word = text.strip().lower()
     if re.fullmatch(r"[0-9]{1,3}(,[0-9]{3})+|[0-9]+", word):
         return int(word.replace(",", ""))
@@ -307,11 +327,7 @@ def count_of(text: str) -> int:
 
 
 def share_of(text: str) -> float:
-    """Parse a share: 0.2 or 20%.
-
-    Raises:
-        UnsupportedError: the text is no such number.
-    """
+    """Parse a share: 0.2 or 20%."""
     word = text.strip()
     try:
         return float(word.removesuffix("%")) * (0.01 if word.endswith("%") else 1.0)
@@ -320,11 +336,7 @@ def share_of(text: str) -> float:
 
 
 def budget_of(text: str) -> Values:
-    """Parse a budget: a count such as 200k, a share such as 20%, a PSNR drop such as 0.2dB, or auto for a goal's best.
-
-    Raises:
-        UnsupportedError: the text is none of these.
-    """
+    """Parse a budget: a count such as 200k, a share such as 20%, a PSNR drop such as 0.2dB, or auto with a goal."""
     word = text.strip().lower().replace(" ", "")
     if word == "auto":
         return {"auto_count": True}
@@ -341,18 +353,16 @@ def budget_of(text: str) -> Values:
         ) from error
 
 
-def open_views(
-    path: Path | None, *, scale: int | None = None, images: Path | None = None, resolution: int | None = None
-) -> Views | None:
+def open_views(path: Path | None, *, scale: int | None = None, images: Path | None = None) -> Views | None:
     """Load the capture at ``path``; return None if there is none, and refuse options of its photographs then."""
     if path is None:
-        for name, value in (("--scale", scale), ("--images", images), ("--resolution", resolution)):
+        for name, value in (("--scale", scale), ("--images", images)):
             if value is not None:
                 raise UnsupportedError(f"{name} only applies to the photographs of a capture; give one with --views")
         return None
     from kissgs.cameras.captures.load import load_views
 
-    return load_views(path, scale=scale, images=images, resolution=resolution)
+    return load_views(path, scale=scale, images=images)
 
 
 def device_of(name: str) -> Literal["cpu", "cuda"]:
@@ -365,29 +375,8 @@ def origin_of(name: str | None) -> Literal["auto"] | None:
     return None if name is None else cast(Literal["auto"], choice("--origin", name, Literal["auto"]))
 
 
-def reading_options(
-    max_gaussians: int | None, level: int, raw_axes: bool, origin: str | None, antialiased: bool | None
-) -> ReadOptions:
-    """Return the options of reading scenes, with the value of ``--origin`` checked."""
-    from kissgs.pipeline.scene_files import ReadOptions
-
-    return ReadOptions(
-        max_gaussians=max_gaussians,
-        level=level,
-        raw_axes=raw_axes,
-        origin=origin_of(origin),
-        antialiased=antialiased,
-    )
-
-
 def refuse_without_training(settings: Settings, *, checkpoint: bool, device: str) -> None:
-    """Raise UnsupportedError if ``--checkpoint`` or ``--device`` is given where nothing could train.
-
-    Args:
-        settings: the settings of the command.
-        checkpoint: whether ``--checkpoint`` was given.
-        device: value of ``--device``.
-    """
+    """Raise UnsupportedError if ``--checkpoint`` or ``--device`` is given where nothing could train."""
     trains = settings.finetune.enabled or (settings.compact.enabled and settings.compact.trains) or settings.aims
     if trains or not (checkpoint or device != "cpu"):
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,12 +11,22 @@ import typer
 
 from kissgs.cli.files import for_each_input, print_json, show
 from kissgs.cli.options import (
+    CompactOption,
     ContainerOption,
+    EvaluateOption,
+    FilesArgument,
+    FinetuneOption,
+    ForceOption,
     MaxPsnrDropOption,
     MaxSsimDropOption,
     OriginOption,
+    PresetOption,
     PsnrOption,
+    SetOption,
     TargetSizeOption,
+    budget_of,
+    chosen,
+    origin_of,
 )
 
 if TYPE_CHECKING:
@@ -24,33 +35,18 @@ if TYPE_CHECKING:
 ServerOption = Annotated[
     str, typer.Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="URL of the service.")
 ]
-KeyOption = Annotated[
-    str | None, typer.Option("--key", envvar="KISSGS_KEY", help="API key, if the service needs one; prefer KISSGS_KEY.")
-]
-CompactOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="BUDGET",
-        help="First reduce the number of Gaussians: 200k, 20% or 0.2dB; 100% keeps all; auto: the best for the goal, "
-        "the default where it is fine-tuned.",
-    ),
-]
-FinetuneOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="[STEPS]",
-        help="Fine-tune the quantised values on renderings of the scene; default with a goal. 0: never.",
-    ),
-]
-
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 
-app = typer.Typer(name="remote", help="Compress with a kissgs service.", no_args_is_help=True)
+app = typer.Typer(
+    name="remote",
+    help="Compress with a kissgs service. If it needs an API key, set the variable KISSGS_KEY.",
+    no_args_is_help=True,
+)
 
 
 @app.command()
 def compress(
-    scenes: Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns.")],
+    scenes: FilesArgument,
     output: Annotated[
         str | None,
         typer.Option(
@@ -59,36 +55,26 @@ def compress(
     ] = None,
     container: ContainerOption = None,
     server: ServerOption = DEFAULT_SERVER,
-    key: KeyOption = None,
-    preset: Annotated[
-        str,
-        typer.Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced, small or paper."),
-    ] = "balanced",
-    changes: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Change a setting of the preset; repeatable."),
-    ] = None,
+    preset: PresetOption = "balanced",
+    changes: SetOption = None,
     psnr: PsnrOption = None,
     target_size: TargetSizeOption = None,
     max_psnr_drop: MaxPsnrDropOption = None,
     max_ssim_drop: MaxSsimDropOption = None,
     compact: CompactOption = None,
     finetune: FinetuneOption = None,
-    evaluate: Annotated[
-        bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
-    ] = False,
+    evaluate: EvaluateOption = False,
     origin: OriginOption = None,
-    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")] = False,
+    force: ForceOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job."""
     from kissgs.cli.console import progress_bar
-    from kissgs.cli.options import budget_of, chosen, origin_of
     from kissgs.cli.tables import status_table
     from kissgs.client import Remote
     from kissgs.core.errors import UnsupportedError
-    from kissgs.io.containers import ending_of, named_container
+    from kissgs.formats import ending_of, named_container
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
@@ -103,7 +89,7 @@ def compress(
         max_psnr_drop=max_psnr_drop,
         max_ssim_drop=max_ssim_drop,
     )
-    with Remote(server, key=key) as remote:
+    with Remote(server, key=os.environ.get("KISSGS_KEY")) as remote:
 
         def work(scene: str, target: Path) -> dict[str, Any]:
             with progress_bar(quiet or as_json) as progress:
@@ -127,15 +113,13 @@ def compress(
 @app.command(name="list")
 def list_jobs(
     server: ServerOption = DEFAULT_SERVER,
-    key: KeyOption = None,
-    limit: Annotated[int, typer.Option(min=1, max=100, help="Largest number of jobs to list.")] = 20,
     as_json: Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")] = False,
 ) -> None:
     """List the latest jobs on a server."""
     from kissgs.client import Remote
 
-    with Remote(server, key=key) as remote:
-        jobs = remote.jobs(limit)
+    with Remote(server, key=os.environ.get("KISSGS_KEY")) as remote:
+        jobs = remote.jobs()
     if as_json:
         print_json(jobs)
         return
@@ -151,20 +135,19 @@ def get(
         Path | None, typer.Option("--output", "-o", help="Output NAME.zip or NAME.sog. Default: the name of the scene.")
     ] = None,
     server: ServerOption = DEFAULT_SERVER,
-    key: KeyOption = None,
-    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite an existing output file.")] = False,
+    force: ForceOption = False,
 ) -> None:
     """Wait for a job to finish, and download its container."""
     from kissgs.cli.console import progress_bar
     from kissgs.cli.tables import status_table
     from kissgs.client import Remote
     from kissgs.core.errors import OutputError
-    from kissgs.io.containers import ENDINGS, ending_of, named_container
+    from kissgs.formats import ENDINGS, ending_of, named_container
     from kissgs.io.files import refuse_existing
 
     if output is not None and output.suffix.lower() not in ENDINGS:
         raise OutputError(f"{output!s:.100} is not the name of a container; end it in {' or '.join(ENDINGS)}")
-    with Remote(server, key=key) as remote, progress_bar(False) as bar:
+    with Remote(server, key=os.environ.get("KISSGS_KEY")) as remote, progress_bar(False) as bar:
         progress = _announcing(bar, server, False)
         known = remote.status(job)
         kind = named_container(known["options"].get("format"), output)  # services of older versions state none
@@ -179,12 +162,11 @@ def get(
 def cancel(
     job: Annotated[str, typer.Argument(help="Id of the job, see 'kissgs remote list'.")],
     server: ServerOption = DEFAULT_SERVER,
-    key: KeyOption = None,
 ) -> None:
     """Cancel a job."""
     from kissgs.client import Remote
 
-    with Remote(server, key=key) as remote:
+    with Remote(server, key=os.environ.get("KISSGS_KEY")) as remote:
         show(f"{job} {remote.cancel(job)['state']}")
 
 

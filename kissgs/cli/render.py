@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,20 +11,15 @@ import typer
 
 from kissgs.cli.files import for_each_input, say_notes, show, write_stdout
 from kissgs.cli.options import (
-    AntialiasedOption,
     ForceOption,
     ImagesOption,
-    LevelOption,
-    MaxGaussiansOption,
-    QuietOption,
-    RawAxesOption,
     RenderDeviceOption,
-    RenderThreadsOption,
-    ResolutionOption,
     ScaleOption,
+    SceneOptions,
     ViewsOption,
     device_of,
     open_views,
+    reads_scenes,
 )
 from kissgs.core.errors import UnsupportedError
 
@@ -82,18 +78,13 @@ FramesOption = Annotated[
     int | None,
     typer.Option(min=3, max=3600, help="Images of an --orbit. Default: 48 in an animation, 24 on a contact sheet."),
 ]
-FpsOption = Annotated[
-    int | None, typer.Option(min=1, max=60, help=f"Images per second of an animation. Default: {FPS}.")
-]
-QualityOption = Annotated[
-    int | None, typer.Option(min=0, max=100, help=f"Quality of .webp, 0 to 100 (lossless). Default: {QUALITY}.")
-]
 SaveCameraOption = Annotated[
     Path | None,
     typer.Option(metavar="FILE.json", help="Write the camera of the image as JSON, for --view and other programs."),
 ]
 
 
+@reads_scenes
 def render(
     file: Annotated[str, typer.Argument(metavar="FILE", help="Scene to render, of any format that kissgs reads.")],
     output: OutputOption = None,
@@ -103,24 +94,17 @@ def render(
     size: SizeOption = None,
     background: BackgroundOption = None,
     frames: FramesOption = None,
-    fps: FpsOption = None,
-    quality: QualityOption = None,
     save_camera: SaveCameraOption = None,
     views: ViewsOption = None,
     scale: ScaleOption = None,
     images: ImagesOption = None,
-    resolution: ResolutionOption = None,
-    max_gaussians: MaxGaussiansOption = None,
-    level: LevelOption = 0,
-    raw_axes: RawAxesOption = False,
-    antialiased: AntialiasedOption = None,
     device: RenderDeviceOption = "cpu",
-    threads: RenderThreadsOption = 0,
     force: ForceOption = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print a JSON report: the output file and the cameras.")
     ] = False,
-    quiet: QuietOption = False,
+    *,
+    common: SceneOptions,
 ) -> None:
     """Render an image of a scene, an orbit around it (animation or contact sheet), or all its views."""
     from kissgs.cameras.captures.camera_json import write_camera
@@ -130,7 +114,7 @@ def render(
     from kissgs.io.files import refuse_existing
     from kissgs.pipeline.scene_files import load
 
-    suffix = _suffix(file, output)
+    suffix, threads, quiet = _suffix(file, output), common.threads, common.quiet or as_json
     animated = orbit and suffix == ".webp"
     _refuse({"--view": view, "--orbit": orbit, "--sheet": sheet}, most=1, why="choose one")
     if view is not None and ".json" in view.lower():
@@ -141,28 +125,16 @@ def render(
         _refuse({"--frames": frames}, why="it only applies to --orbit")
     if orbit or sheet:
         _refuse({"--save-camera": save_camera}, why="it only applies to a single image; --json prints all cameras")
-    if not animated:
-        _refuse({"--fps": fps}, why="it only applies to animations: --orbit -o NAME.webp")
-    if suffix != ".webp":
-        _refuse({"--quality": quality}, why="it only applies to .webp; a .png is lossless")
     image_size, colour, render_device = _size(size), _colour(background), device_of(device)
-    capture = open_views(views, scale=scale, images=images, resolution=resolution)
+    capture = open_views(views, scale=scale, images=images)
 
     def work(name: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
         for path in ([] if piped else [target]) + ([] if save_camera is None else [save_camera]):
             refuse_existing(path, overwrite=force)
-        with progress_bar(quiet or as_json) as progress:
+        with progress_bar(quiet) as progress:
             job = RenderJob(
-                splats=load(
-                    Path(name),
-                    max_gaussians=max_gaussians,
-                    level=level,
-                    raw_axes=raw_axes,
-                    antialiased=antialiased,
-                    threads=threads,
-                    progress=progress,
-                ),
+                splats=load(Path(name), threads=threads, progress=progress, **asdict(common.reading())),
                 size=image_size,
                 background=colour,
                 device=render_device,
@@ -177,14 +149,14 @@ def render(
             else:
                 rendered = job.view_sheet(fitting) if sheet else job.single(fitting, view)
             progress("write", 0.0)
-            data = _encoded(rendered, suffix, FPS if fps is None else fps, QUALITY if quality is None else quality)
+            data = _encoded(rendered, suffix)
             progress("write", 1.0)
-        say_notes(name, job.splats.notes, quiet)
+        say_notes(name, job.splats.notes, common.quiet)
         _deliver(data, target, force=force)
         if save_camera is not None:
             write_camera(save_camera, rendered.views[0].camera, overwrite=force)
         report = _report(rendered, len(data))
-        if not (quiet or as_json or piped):
+        if not (quiet or piped):
             saved = "" if save_camera is None else f"; {save_camera}"
             show(f"{target}  {report['width']}x{report['height']}, {rendered.description}{saved}")
         return report
@@ -206,7 +178,7 @@ def _suffix(file: str, output: str | None) -> str:
     """Return the ending of the output: .png unless ``output`` ends in .webp."""
     if file == "-":
         raise UnsupportedError("kissgs render reads a file, not standard input")
-    from kissgs.io.containers import names_folder
+    from kissgs.formats import names_folder
 
     if output in (None, "-") or names_folder(output):
         return ".png"
@@ -242,10 +214,10 @@ def _colour(text: str | None) -> tuple[float, float, float] | None:
     return red, green, blue
 
 
-def _encoded(rendered: RenderedImages, suffix: str, fps: int, quality: int) -> bytes:
+def _encoded(rendered: RenderedImages, suffix: str) -> bytes:
     from kissgs.rendering.images import animated_webp, png
 
-    return png(rendered.images[0]) if suffix == ".png" else animated_webp(rendered.images, fps=fps, quality=quality)
+    return png(rendered.images[0]) if suffix == ".png" else animated_webp(rendered.images, fps=FPS, quality=QUALITY)
 
 
 def _report(rendered: RenderedImages, size: int) -> dict[str, Any]:

@@ -11,10 +11,11 @@ from rich.text import Text
 
 from kissgs.core.origin import relative_to
 from kissgs.core.splats import CLEANED_TEXTS
+from kissgs.evaluation.capture_fit import USUAL_PSNR
 from kissgs.evaluation.html import ReportScene
 from kissgs.evaluation.metric_text import format_metric
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics
-from kissgs.pipeline.scene_files import CONTAINER_FORMATS, STREAMED_FORMATS
+from kissgs.formats import FORMATS
 
 if TYPE_CHECKING:
     from kissgs.compaction.result import CompactionReport
@@ -230,11 +231,11 @@ def parts_table(parts: Mapping[str, int], count: int, whole: str = "total") -> T
 
 def info_table(info: Info) -> RenderableType:
     """Format the output of ``kissgs info``."""
-    streamed = info.kind in STREAMED_FORMATS
-    head = Text.assemble((info.path, "bold"), f"  {_kind(info)}, {size(info.bytes)}{' in all levels' * streamed}")
+    streamed = FORMATS[info.kind].manifest is not None
+    head = Text.assemble((info.path, "bold"), f"  {info.title}, {size(info.bytes)}{' in all levels' * streamed}")
     body = f"{gaussians(info.count)}, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits per Gaussian"
-    stored = info.kind in CONTAINER_FORMATS
-    of = "value of {} level" if stored else "{} value"  # channels share a step, so few reach the highest
+    # Channels of a container share a step, so few reach the highest level.
+    of = "value of {} level" if FORMATS[info.kind].is_container else "{} value"
     ends = [_right(of.format(end)) for end in ("lowest", "highest")]
     ranges = Table("attribute", *ends, box=None, pad_edge=False)
     for name, (low, high) in info.ranges.items():
@@ -243,54 +244,10 @@ def info_table(info: Info) -> RenderableType:
     if info.parts:
         whole = f"total of level {info.details['level']}" if streamed else "total"
         blocks.insert(2, parts_table(info.parts, info.count, whole))
-    details = info.details
-    if "origin" in details:
-        blocks.append(Text(relative_to(tuple(details["origin"]))))
-    if info.kind == "sogxt":
-        origin = "unknown"
-        if details["version"]:
-            origin = f"kissgs {details['version']} from {details['source_count']:,} Gaussians"
-        grid, codebook = details["grid_side"], details["codebook_side"]
-        blocks.append(Text(f"grid {grid} x {grid}, codebook {codebook} x {codebook}; encoder: {origin}"))
-    if streamed:
-        levels = ", ".join(f"{count:,}" for count in details["levels"])
-        around = details["environment"]
-        beside = f"; in the environment, which belongs to every level: {around:,}" if around else ""
-        blocks.append(Text(f"Gaussians by level, finest first: {levels}{beside}"))
+    if "origin" in info.details:
+        blocks.append(Text(relative_to(tuple(info.details["origin"]))))
+    blocks += [Text(line) for line in info.lines]
     return Group(*blocks, *(Text(note, style="yellow") for note in info.notes), *_changes(info.changed))
-
-
-def _kind(info: Info) -> str:
-    """Name the format, with what its header states."""
-    details = info.details
-    name = {
-        "ply": "3DGS scene",
-        "sogxt": "SOG-XT container",
-        "sog": "SOG container",
-        "streamed-sog": "streamed SOG scene",
-        "streamed-sogxt": "streamed SOG-XT scene",
-        "spz": "SPZ scene",
-        "splat": ".splat scene",
-        "ksplat": ".ksplat scene",
-        "gltf": "glTF scene",
-    }[info.kind]
-    found = []
-    if info.kind == "ply":
-        found = [details["encoding"], "compressed" if details["compressed"] else ""]
-    elif info.kind == "sog":
-        found = [f"version {details['version']}", details["model"] or "", details["generator"] or ""]
-    elif info.kind in STREAMED_FORMATS:
-        found = [f"level {details['level']} of 0 to {len(details['levels']) - 1}"]
-    elif info.kind == "spz":
-        found = [f"version {details['version']}"]
-    elif info.kind == "ksplat":
-        found = [f"compression level {details['compression_level']}"]
-    elif info.kind == "gltf":
-        found = ["GLB" if details["binary"] else "JSON", "compressed as SPZ" if details["spz"] else ""]
-    if details.get("antialiased") and info.kind != "sog":  # whose model says so
-        found.append("antialiased")
-    facts = ", ".join(filter(None, found))
-    return f"{name} ({facts})" if facts else name
 
 
 def _changes(changed: Mapping[str, int]) -> list[Text]:
@@ -312,6 +269,15 @@ def evaluation_table(
     """Format the output of ``kissgs evaluate``; ``asked`` is the value of ``--split``."""
     what = Text(f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}")
     notes = [Text(evaluation.note, "yellow")] if evaluation.note else []
+    own = evaluation.mean.reference
+    if own is not None and own.psnr < USUAL_PSNR:
+        notes.append(
+            Text(
+                f"the photographs differ much from renderings of {reference.name}: PSNR {own.psnr:.1f} dB, where more "
+                f"than {USUAL_PSNR:g} are usual",
+                "yellow",
+            )
+        )
     if evaluation.split == "train" != asked:
         notes.append(Text("no view is held out: the scene may have been trained on these views", "yellow"))
     views = [_views(evaluation), *_other_means(evaluation.mean)]

@@ -16,21 +16,14 @@ import typer
 from kissgs.cli.console import progress_bar
 from kissgs.cli.files import check_input, say_notes, show, source
 from kissgs.cli.interrupts import Interrupted
-from kissgs.cli.options import (
-    AntialiasedOption,
-    ForceOption,
-    MaxGaussiansOption,
-    QuietOption,
-    RawAxesOption,
-    ThreadsOption,
-)
+from kissgs.cli.options import ForceOption, SceneOptions, reads_scenes
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 
 if TYPE_CHECKING:
-    from kissgs.pipeline.scene_files import ReadOptions
     from kissgs.preview.page_scene import PageScene, StreamedFolder
 
 
+@reads_scenes
 def view(
     scene: Annotated[
         str, typer.Argument(metavar="FILE", help="Scene of any format, or a container; '-' reads standard input.")
@@ -51,41 +44,30 @@ def view(
     fetch: Annotated[
         bool, typer.Option("--fetch-viewer", help="Download Spark and three.js first, if they are not installed.")
     ] = False,
-    max_gaussians: MaxGaussiansOption = None,
-    level: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            help="Show this level of detail of a streamed scene alone; 0 is the finest. Default: what the camera sees, "
-            "as it comes near; with -o, the finest level of at most a million Gaussians.",
-        ),
-    ] = None,
-    raw_axes: RawAxesOption = False,
-    antialiased: AntialiasedOption = None,
-    threads: ThreadsOption = 0,
     force: ForceOption = False,
-    quiet: QuietOption = False,
+    *,
+    common: SceneOptions,
 ) -> None:
-    """Show a scene in the browser, from a server on this machine that Ctrl-C ends; -o writes a page instead."""
-    from kissgs.pipeline.scene_files import ReadOptions
+    """Show a scene in the browser, from a server on this machine that Ctrl-C ends; -o writes a page instead.
+
+    Of a streamed scene it shows what the camera sees, as it comes near; with -o, the finest level of at most a million
+    Gaussians; with --level, that level alone.
+    """
     from kissgs.preview.page_scene import fetch_viewer, page_files
 
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level or 0, raw_axes=raw_axes, antialiased=antialiased)
     check_input(scene, InvalidSceneError)
     if fetch:
         fetch_viewer()
     page_files()  # before the work
     if output is None:
-        _serve(scene, reading, level is None, port, browser, threads, quiet)
+        _serve(scene, common, port, browser)
     elif port or not browser:
         raise UnsupportedError("--port and --no-browser are for the server, which -o does not start")
     else:
-        _write(scene, reading, level is None, output, threads, force, quiet)
+        _write(scene, common, output, force)
 
 
-def _write(
-    scene: str, reading: ReadOptions, any_level: bool, output: Path, threads: int, force: bool, quiet: bool
-) -> None:
+def _write(scene: str, common: SceneOptions, output: Path, force: bool) -> None:
     from kissgs.io.files import atomic_file, refuse_existing
     from kissgs.preview.page_scene import fitting_level, is_streamed, page_container
     from kissgs.preview.standalone_page import standalone_page
@@ -93,29 +75,26 @@ def _write(
     if output.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{output!s:.100} is not the name of a page: end it in .html")
     refuse_existing(output, overwrite=force)
-    content, chosen = source(scene), ""
-    if any_level and is_streamed(content):
+    content, chosen, reading = source(scene), "", common.reading()
+    if common.level is None and is_streamed(content):
         level, levels = fitting_level(content, reading.max_gaussians)
         reading = replace(reading, level=level)
         chosen = f", level {level} of 0 to {levels - 1}"
-    with progress_bar(quiet) as progress:
-        container = page_container(content, reading, threads=threads, progress=progress)
-    say_notes(scene, container.notes, quiet)
+    with progress_bar(common.quiet) as progress:
+        container = page_container(content, reading, threads=common.threads, progress=progress)
+    say_notes(scene, container.notes, common.quiet)
     page = standalone_page(container)
     with atomic_file(output, overwrite=force) as file:
         file.write(page)
-    if not quiet:
+    if not common.quiet:
         made = f", compressed by the preset balanced to {len(container.data):,} bytes" if container.converted else ""
         show(f"{output}  {len(page):,} bytes, holds {container.name}{chosen}{made}")
 
 
-def _serve(
-    scene: str, reading: ReadOptions, all_levels: bool, port: int, browser: bool, threads: int, quiet: bool
-) -> None:
+def _serve(scene: str, common: SceneOptions, port: int, browser: bool) -> None:
     from kissgs.preview.server import PageServer
 
-    prepared = _prepare(scene, reading, all_levels, threads, quiet)
-    with PageServer(prepared, port) as server, contextlib.suppress(Interrupted):
+    with PageServer(_prepare(scene, common), port) as server, contextlib.suppress(Interrupted):
         sys.stdout.write(f"{server.url}  (Ctrl-C ends)\n")
         sys.stdout.flush()
         if browser and _has_display():
@@ -123,31 +102,29 @@ def _serve(
         server.serve_forever()
 
 
-def _prepare(
-    scene: str, reading: ReadOptions, all_levels: bool, threads: int, quiet: bool
-) -> PageScene | StreamedFolder:
+def _prepare(scene: str, common: SceneOptions) -> PageScene | StreamedFolder:
     """Return what the server gets: a scene in memory, or the folder of a streamed one."""
     from kissgs.preview.page_scene import is_streamed_folder, page_scene, streamed_folder
 
     content = source(scene)
-    if all_levels and isinstance(content, Path) and is_streamed_folder(content):
-        if reading.max_gaussians is not None:
+    if common.level is None and isinstance(content, Path) and is_streamed_folder(content):
+        if common.max_gaussians is not None:
             raise UnsupportedError(
                 "--max-gaussians does not apply to a streamed scene that the page loads in parts; "
                 "add &gaussians=N to the page's address, or name a --level"
             )
-        if reading.antialiased is not None:
+        if common.antialiased is not None:
             raise UnsupportedError(
                 "--antialiased and --classic do not apply to a streamed scene that the page loads in parts; name a "
                 "--level"
             )
         folder = streamed_folder(content)
-        if not quiet:
+        if not common.quiet:
             _warn(scene, folder)
         return folder
-    with progress_bar(quiet) as progress:
-        prepared = page_scene(content, reading, threads=threads, progress=progress)
-    say_notes(scene, prepared.notes, quiet)
+    with progress_bar(common.quiet) as progress:
+        prepared = page_scene(content, common.reading(), threads=common.threads, progress=progress)
+    say_notes(scene, prepared.notes, common.quiet)
     return prepared
 
 

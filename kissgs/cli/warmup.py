@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from importlib.util import find_spec
 
 from kissgs.cli.console import progress_bar
 from kissgs.core.errors import OutputError
@@ -14,14 +15,16 @@ SAMPLE_COUNT = 20_000
 
 def warmup() -> None:
     """Compile and cache all kernels, and measure the speed of this machine, by which --time chooses what to do."""
-    from kissgs.compaction import covariance_kernels, merging, nearest_kernels  # noqa: F401
+    from kissgs.compaction import covariance_kernels, merging  # noqa: F401
     from kissgs.core import numba_kernels
     from kissgs.finetuning import kernels as finetuning_kernels  # noqa: F401
-    from kissgs.planning import form_kernels, kmeans_kernels, order_kernels, rdo_kernels, table_kernels, tour_kernels  # noqa: F401
+    from kissgs.planning import form_kernels, kmeans_kernels, order_kernels, rdo_kernels, tour_kernels  # noqa: F401
     from kissgs.planning import kernels as planning_kernels  # noqa: F401
     from kissgs.rendering import ssim_kernels  # noqa: F401
     from kissgs.rendering.cpu import backward, coverage, neighbours, sensitivity  # noqa: F401
-    from kissgs.training import optimizer  # noqa: F401
+
+    if find_spec("torch"):  # without it nothing is trained
+        from kissgs.training import optimizer  # noqa: F401
 
     with progress_bar(False) as progress:
         for number, kernel in enumerate(numba_kernels.kernels):

@@ -12,14 +12,9 @@ from kissgs.core.numba_kernels import compiled
 
 @compiled("void(float32[:, ::1], float32[:, ::1], int64, int64, float64[:, ::1])")
 def covariances_of(quats: np.ndarray, scales: np.ndarray, first: int, last: int, out: np.ndarray) -> None:
-    """Compute the covariances of rows ``first`` to ``last`` (exclusive).
+    """Compute the covariances (xx, xy, xz, yy, yz, zz) of rows ``first`` to ``last`` (exclusive).
 
-    Args:
-        quats: ``(N, 4)`` w, x, y, z, unit length.
-        scales: ``(N, 3)`` natural logarithms of standard deviations.
-        first: first row.
-        last: end of the rows, exclusive.
-        out: ``(N, 6)`` xx, xy, xz, yy, yz, zz.
+    Quaternions are w, x, y, z of unit length; scales are natural logarithms of standard deviations.
     """
     turn = np.empty((3, 3))
     for n in range(first, last):
@@ -87,14 +82,7 @@ def decompose(
 ) -> None:
     """Compute rotation and log-scales of covariances by Jacobi's method, ``rows[first:last]``.
 
-    Args:
-        covariances: ``(N, 6)``.
-        rows: indices of rows to compute.
-        first: first of them.
-        last: end, exclusive.
-        quats: out, ``(N, 4)`` w, x, y, z, unit length.
-        scales: out, ``(N, 3)`` natural logarithms of standard deviations, at most 1e-7 of the largest one lost in
-            rounding.
+    Scales of less than 1e-7 of the largest one are lost in rounding.
     """
     matrix, turn = np.empty((3, 3)), np.empty((3, 3))
     for at in range(first, last):

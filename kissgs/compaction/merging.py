@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
-from kissgs.compaction import covariance_kernels, nearest_kernels
+from kissgs.compaction import covariance_kernels
 from kissgs.core.array_types import Bool, Float32, Float64, Int32, Int64
 from kissgs.core.numba_kernels import compiled
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import LOG_SCALE_LIMIT, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, Splats
-from kissgs.rendering.cpu.neighbours import split_into_leaves
+from kissgs.rendering.cpu.neighbours import SEARCH_LEAF, leaves_of, nearest_neighbours, unique_pairs
 from kissgs.rendering.cpu.tiles import each_part, even
 
 # Numba kernels of merging: moments, opacity and error of two Gaussians that become one.
@@ -159,17 +159,7 @@ def opacity_areas(
     last: int,
     weights: np.ndarray,
 ) -> None:
-    """Compute each Gaussian's opacity times its area, the mean over the three axes, into ``weights``, ``(N,)``.
-
-    Args:
-        covariances: ``(N, 6)``.
-        alphas: ``(N,)`` opacities.
-        spacing: ``(N,)`` squared distances to neighbours.
-        blur: variance of the blur in units of ``spacing``.
-        first: first row.
-        last: end of the rows, exclusive.
-        weights: out.
-    """
+    """Compute each Gaussian's opacity times its area, the mean over the three axes, into ``weights``, ``(N,)``."""
     for n in range(first, last):
         area = 0.0
         for axis in range(3):
@@ -196,23 +186,11 @@ def pair_errors(
     last: int,
     added: np.ndarray,
 ) -> None:
-    """Compute the errors that merging each pair would cause, pairs ``first`` to ``last`` (exclusive).
+    """Compute what the error grows by if each pair merges, pairs ``first`` to ``last`` (exclusive), into ``added``.
 
-    Args:
-        means: ``(N, 3)``.
-        covariances: ``(N, 6)``.
-        alphas: ``(N,)`` opacities.
-        colors: ``(N, F)`` SH coefficients. The mean over all directions of a squared colour difference is the sum of
-            squared differences of the coefficients, divided by 4 pi.
-        weights: ``(N,)``, see :func:`opacity_areas`.
-        spacing: ``(N,)`` squared distances to neighbours.
-        errors: ``(N,)`` errors that earlier merges have caused.
-        blur: variance of the blur in units of ``spacing``.
-        contrast: squared contrast to what is behind, a sum over RGB.
-        pairs: ``(P, 2)`` indices.
-        first: first pair.
-        last: end of the pairs, exclusive.
-        added: out, ``(P,)`` what the error grows by. Errors of repeated merges are alike: their amplitudes add.
+    Errors of repeated merges are alike: their amplitudes add. The mean over all directions of a squared colour
+    difference is the sum of squared differences of the SH coefficients, divided by 4 pi. ``blur`` is in units of
+    ``spacing``, the squared distances to neighbours; ``contrast`` is the squared one to what is behind, over RGB.
     """
     mean, covariance = np.empty(3), np.empty(6)
     for at in range(first, last):
@@ -234,14 +212,7 @@ def pair_errors(
 
 @compiled("int64(int64[::1], int32[:, ::1], int64, int64[::1])")
 def choose(order: np.ndarray, pairs: np.ndarray, count: int, chosen: np.ndarray) -> int:
-    """Choose pairs in this order of which no two share a Gaussian, until ``chosen`` is full; return their number.
-
-    Args:
-        order: ``(P,)`` indices of pairs.
-        pairs: ``(P, 2)`` indices of Gaussians.
-        count: number of Gaussians.
-        chosen: out, indices of the pairs.
-    """
+    """Choose pairs in this order of which no two share a Gaussian, until ``chosen`` is full; return their number."""
     used, found = np.zeros(count, np.bool_), 0
     for at in order:
         i, j = pairs[at, 0], pairs[at, 1]
@@ -290,9 +261,6 @@ def merge(
 NEIGHBOURS = 8
 """Number of nearest neighbours that a Gaussian may merge with."""
 
-LEAF = 16
-"""Largest number of Gaussians in a leaf of the search tree."""
-
 SPACING_RANK = 3
 """Neighbour, from 0, whose distance is the spacing of the Gaussians."""
 
@@ -317,16 +285,7 @@ def merge_gaussians(
 
     Merged Gaussians keep mean, covariance and mean colour of the mixture, weighted by opacity times area, and get the
     opacity that is nearest to the alpha of both together. Gaussians that are not merged stay exactly as they are.
-
-    Args:
-        splats: the scene, clean.
-        count: number of Gaussians, at least 1; a scene with no more is returned unchanged.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        progress: receives the stage "merge".
-
-    Returns:
-        The scene, clean; and for each of its Gaussians the index of the one with the largest weight among those it
-        stands for, ``(M,)``, ascending.
+    Returns the scene, and of each of its Gaussians the index of the heaviest among those it stands for, ascending.
     """
     with Workers(threads) as pool:
         clusters = _Clusters(splats, pool)
@@ -355,34 +314,22 @@ class _Clusters:
     """The Gaussians that are left, each of which stands for one or more of the input.
 
     Neighbours have rows near each other, which processors read faster.
-
-    Attributes:
-        source: the input.
-        pool: threads.
-        means: ``(M, 3)``.
-        covariances: ``(M, 6)`` xx, xy, xz, yy, yz, zz.
-        alphas: ``(M,)`` opacities.
-        colors: ``(M, F)`` SH coefficients, those of ``sh0`` first.
-        errors: ``(M,)`` errors that merges have caused, see :func:`kissgs.compaction.merging.pair_errors`.
-        origin: ``(M,)`` index of the member with the largest weight.
-        heaviest: ``(M,)`` its weight.
-        merged: ``(M,)`` whether it stands for several.
     """
 
     source: Splats
     pool: Workers
     means: Float64[np.ndarray, "M 3"] = field(init=False)
-    covariances: Float64[np.ndarray, "M 6"] = field(init=False)
+    covariances: Float64[np.ndarray, "M 6"] = field(init=False)  # xx, xy, xz, yy, yz, zz
     alphas: Float64[np.ndarray, " M"] = field(init=False)
-    colors: Float32[np.ndarray, "M F"] = field(init=False)
-    errors: Float64[np.ndarray, " M"] = field(init=False)
-    origin: Int32[np.ndarray, " M"] = field(init=False)
-    heaviest: Float64[np.ndarray, " M"] = field(init=False)
-    merged: Bool[np.ndarray, " M"] = field(init=False)
+    colors: Float32[np.ndarray, "M F"] = field(init=False)  # SH coefficients, those of sh0 first
+    errors: Float64[np.ndarray, " M"] = field(init=False)  # that merges have caused, see pair_errors
+    origin: Int32[np.ndarray, " M"] = field(init=False)  # the member with the largest weight
+    heaviest: Float64[np.ndarray, " M"] = field(init=False)  # its weight
+    merged: Bool[np.ndarray, " M"] = field(init=False)  # whether it stands for several
 
     def __post_init__(self) -> None:
         splats, count = self.source, len(self.source)
-        self.origin, _, _ = self._leaves(splats.means)
+        self.origin, _ = leaves_of(splats.means, SEARCH_LEAF)
         self.means = splats.means[self.origin].astype(np.float64)
         self.covariances = np.empty((count, 6))
         quats, scales = splats.quats[self.origin], splats.scales[self.origin]
@@ -404,8 +351,9 @@ class _Clusters:
 
     def _merge(self, disappearing: int) -> None:
         """Merge the pairs that add the least error until this many Gaussians disappear, or fewer if pairs run out."""
-        near, spacing = self._neighbours()
         count, weights = len(self.means), np.empty(len(self.means))
+        neighbours = min(NEIGHBOURS, count - 1)
+        near, spacing = nearest_neighbours(self.means, neighbours, min(SPACING_RANK, neighbours - 1), self.pool)
         self._each(count, lambda a, b: opacity_areas(self.covariances, self.alphas, spacing, BLUR, a, b, weights))
         self.heaviest = np.where(self.merged, self.heaviest, weights)
         joined, added = self._cheapest_pairs(near, weights, spacing, disappearing)
@@ -427,7 +375,7 @@ class _Clusters:
     ) -> tuple[Int32[np.ndarray, "P 2"], Float64[np.ndarray, " P"]]:
         """Return at most ``count`` pairs of which no two share a Gaussian, and the error that each adds."""
         pairs = np.empty((near.size, 2), np.int32)
-        pairs = pairs[: nearest_kernels.unique_pairs(near, pairs)]
+        pairs = pairs[: unique_pairs(near, pairs)]
         added = np.empty(len(pairs))
         gaussians = self.means, self.covariances, self.alphas, self.colors, weights, spacing
         self._each(
@@ -456,26 +404,6 @@ class _Clusters:
             some = rows[a : a + BLOCK]
             self.colors[a : a + len(some)] = self.colors[some]
         self.colors = self.colors[: len(rows)]
-
-    def _neighbours(self) -> tuple[Int32[np.ndarray, "M K"], Float64[np.ndarray, " M"]]:
-        """Return the nearest neighbours of each Gaussian, and its squared spacing."""
-        count = len(self.means)
-        order, edges, leaves = self._leaves(self.means)
-        boxes = np.empty((2 << (leaves - 1).bit_length(), 2, 3))
-        nearest_kernels.fill_boxes(self.means, order, edges, leaves, boxes)
-        near, spacing = np.empty((count, min(NEIGHBOURS, count - 1)), np.int32), np.empty(count)
-        rank = min(SPACING_RANK, near.shape[1] - 1)
-        self._each(
-            leaves, lambda a, b: nearest_kernels.nearest(self.means, order, edges, boxes, a, b, rank, near, spacing)
-        )
-        return near, spacing
-
-    @staticmethod
-    def _leaves(means: np.ndarray) -> tuple[Int32[np.ndarray, " M"], Int64[np.ndarray, " edges"], int]:
-        """Return the indices of the Gaussians in the order of a k-d tree, and the edges and number of its leaves."""
-        order, edges = np.arange(len(means), dtype=np.int32), np.empty(4 * len(means) // LEAF + 2, np.int64)
-        leaves = split_into_leaves(np.ascontiguousarray(means.T.astype(np.float32)), LEAF, order, edges)
-        return order, edges, leaves
 
     def _each(self, count: int, kernel: Callable[[int, int], None]) -> None:
         """Call a kernel with the first and last row of each part, in threads."""

@@ -44,13 +44,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True, eq=False)
 class StepLog:
-    """Records each step with its wall time and, if requested, its quality and size.
-
-    Attributes:
-        evaluate: function that returns image metrics and compressed bytes of a scene, see
-            :func:`kissgs.compaction.popspa.evaluate_scene`; None to leave them out. Its time does not count.
-        steps: recorded steps.
-    """
+    """Records each step with its wall time, without that of ``evaluate``, which measures quality and size."""
 
     evaluate: Callable[[Splats], tuple[ImageMetrics, int]] | None
     steps: list[CompactionStep] = field(default_factory=list)
@@ -90,23 +84,9 @@ class StepLog:
 def evaluate_scene(
     scene: Splats, reference: Splats, supervision: SupervisionViews, threads: int = 0, progress: Progress = silent
 ) -> tuple[ImageMetrics, int]:
-    """Return the image metrics of a scene and its compressed size.
+    """Return the mean image metrics of a scene, and its bytes as a zip with the preset ``fast``.
 
-    Args:
-        scene: the scene to evaluate, clean.
-        reference: the original scene; its renderings are compared with if there are no photographs.
-        supervision: its evaluation views are used if they have photographs, else cameras drawn over all of
-            ``reference``.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        progress: receives the stage ``"evaluate"``.
-
-    Returns:
-        Metrics to photographs if there are any, means over the views, and the bytes of a container with the preset
-        ``fast``, as a zip.
-
-    Raises:
-        InvalidViewsError: a photograph cannot be read.
-        UnsupportedError: an image would take too much memory.
+    Evaluation views are used if they have photographs, else cameras drawn over all of ``reference``.
     """
     as_evaluate = as_stage("evaluate", progress)
     views = _views(reference, supervision, threads, as_evaluate)
@@ -137,42 +117,23 @@ def _views(reference: Splats, supervision: SupervisionViews, threads: int, progr
 class Popspa:
     """Compacts one scene by POPSpa.
 
-    Attributes:
-        splats: the scene, clean.
-        settings: settings of pruning and training; their budget is ignored.
-        supervision: views that score, train and evaluate.
-        reference: the original scene, if ``splats`` is already pruned: its renderings are the targets where there are
-            no photographs. By default ``splats``.
-        targets: target images of the training views; by default they are loaded or rendered when needed.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        device: device of the training. ``"cuda"`` needs the extra ``kissgs[cuda]`` and adds in no fixed order, so that
-            results vary slightly. Scores are always computed on the CPU.
-        progress: receives the stages "kernels", "score", "targets", "sparsify", "refine" and "evaluate".
+    On ``device`` "cuda", sums have no fixed order, so that results vary slightly. Scores are computed on the CPU.
     """
 
     splats: Splats
-    settings: CompactSettings
+    settings: CompactSettings  # their budget is ignored
     supervision: SupervisionViews
-    reference: Splats | None = None
-    targets: TrainingTargets | None = None
+    reference: Splats | None = None  # the original scene, if splats is already pruned
+    targets: TrainingTargets | None = None  # by default loaded or rendered when needed
     threads: int = 0
     device: Device = "cpu"
     progress: Progress = silent
 
     def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
-        """Return the scene with exactly ``count`` Gaussians.
+        """Return the scene with exactly ``count`` Gaussians; ``evaluate`` measures every step.
 
-        Args:
-            count: number of Gaussians to keep, from 1 to that of the scene.
-            evaluate: measure PSNR, SSIM, MS-SSIM and compressed bytes after every step.
-            checkpoint: file for the state of the training, saved every half minute. If it exists and belongs to this
-                work, training continues from it, on the CPU with the same result as without an interruption. It stays
-                at the end; delete it once the result is saved.
-
-        Raises:
-            InvalidViewsError: a photograph cannot be read.
-            OutputError: ``checkpoint`` belongs to other work, or cannot be written.
-            UnsupportedError: torch is missing for the training; an image would take too much memory.
+        Training continues from ``checkpoint`` if that exists and belongs to this work, on the CPU with the same result
+        as without an interruption. It stays at the end.
         """
         scenes = (self.splats, self.original)
         key = ""
@@ -198,16 +159,7 @@ class Popspa:
 
 @dataclass(slots=True, eq=False)
 class _Run:
-    """One compaction and its state, which a checkpoint saves.
-
-    Attributes:
-        task: scene, views and settings.
-        count: number of Gaussians to keep.
-        checkpoint: where the state is saved.
-        log: steps for the report.
-        training: the scene as pruned and trained so far.
-        checkpoint_note: note for the user if a checkpoint could not be saved.
-    """
+    """One compaction and its state, which a checkpoint saves."""
 
     task: Popspa
     count: int
@@ -293,11 +245,7 @@ class _Run:
         return sparsifier
 
     def _save(self, number: int, done: int, sparsifier_state: State) -> None:
-        """Save the state in phase ``number`` after ``done`` of its steps.
-
-        Raises:
-            OutputError: the first checkpoint cannot be written. Later, the work continues without one.
-        """
+        """Save the state in phase ``number`` after ``done`` of its steps."""
         status = Status(number, done, self.log.seconds, self.log.steps)
         training = self.training
         state = {**training.trained.state(), **sparsifier_state, "index": training.index, **status.as_state()}

@@ -24,13 +24,6 @@ def erank_loss(scales: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
     equation 9. The effective rank is e^H, from 1 to 3, with the entropy H of the shares s² / Σ s². It is computed from
     logarithms relative to the largest scale: nothing under- or overflows whatever the scales, and erank - 1 = expm1(H)
     keeps its digits for needles.
-
-    Args:
-        scales: ``(N, 3)`` natural logarithms of standard deviations, any finite values. Each component of the gradient
-            is at most 2 in absolute value.
-
-    Returns:
-        ``(N,)`` losses, 0 or more.
     """
     descending = scales.sort(dim=1, descending=True).values
     log_ratios = 2 * (descending[:, 1:] - descending[:, :1])  # logarithms of the other two s², the largest being 1
@@ -75,21 +68,10 @@ class AdmmSparsifier:
 
     - the loss of the step has the penalty rho/2 · ‖o - z + u‖²,
     - after the step, z becomes o + u with all but its ``count`` largest entries set to 0, and u becomes u + o - z.
-
-    Attributes:
-        z: ``(N,)`` float32, sparse copy of the opacities.
-        u: ``(N,)`` float32, dual variable.
     """
 
     def __init__(self, opacities: Float[Tensor, " N"], count: int, rho: float, interval: int) -> None:
-        """Start with z from the current opacities and u = 0.
-
-        Args:
-            opacities: ``(N,)`` logits, as stored.
-            count: number of opacities that may differ from 0.
-            rho: weight of the penalty.
-            interval: number of steps between two updates, 1 or more.
-        """
+        """Start with z from the current opacities and u = 0."""
         self._count, self._rho, self._interval = count, rho, interval
         activated = _sigmoid(opacities.detach())
         self.z, self.u = keep_largest(activated, count), torch.zeros_like(activated)

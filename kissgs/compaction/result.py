@@ -14,44 +14,29 @@ from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompactionStep:
-    """One step of a compaction, and the scene after it.
+    """One step of a compaction, and the scene after it; quality and size are None if not requested.
 
-    Attributes:
-        name: "input", "prune", "merge", "sparsify" or "refine".
-        count: number of Gaussians after the step.
-        seconds: wall time, evaluation excluded.
-        psnr: decibels, mean over held-out views, to their photographs; without photographs, over cameras drawn over the
-            whole scene, to renderings of the input, so that the input itself has infinity. None if not requested.
-        ssim: SSIM of the same images, mean over views. None if not requested.
-        ms_ssim: MS-SSIM of the same images, mean over views. None if not requested.
-        bytes: size of its container with the preset ``fast``. None if not requested.
+    PSNR is the mean over held-out views, to their photographs; without photographs, over cameras drawn over the whole
+    scene, to renderings of the input, so that the input itself has infinity.
     """
 
-    name: str
+    name: str  # "input", "prune", "merge", "sparsify" or "refine"
     count: int
-    seconds: float
-    psnr: float | None = None
+    seconds: float  # without evaluation
+    psnr: float | None = None  # decibels
     ssim: float | None = None
     ms_ssim: float | None = None
-    bytes: int | None = None
+    bytes: int | None = None  # of its container with the preset fast
 
 
 @dataclass(frozen=True, slots=True)
 class CountTrial:
-    """One number of Gaussians that a search tried, before any encoding.
-
-    Attributes:
-        count: number of Gaussians.
-        drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.results.drop_of`).
-        ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.results.ssim_drop_of`); None where that is
-            no goal.
-        ssim_decides: whether the limit of SSIM leaves the least room.
-    """
+    """One number of Gaussians that a search tried, before any encoding."""
 
     count: int
-    drop: float
-    ssim_drop: float | None = None
-    ssim_decides: bool = False
+    drop: float  # of PSNR as goals count it, decibels
+    ssim_drop: float | None = None  # None where that is no goal
+    ssim_decides: bool = False  # whether the limit of SSIM leaves the least room
 
     def summary(self) -> str:
         """Return the loss that decides in one phrase: "50,000 Gaussians lose 0.120 dB"."""

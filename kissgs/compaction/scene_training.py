@@ -259,7 +259,7 @@ class SceneTraining:
             stage=phase.name,
             pace=Pace(phase.steps, deadline),
             rates=lr_schedule(self.settings, phase, targets.target_source),
-            ssim_weight=self.settings.used_ssim_weight,
+            ssim_weight=self.settings.ssim_weight,
             mse_weight=self.settings.mse_weight,
             seed=seed,
             regularizers=(*self._shape_regularizers(targets), *regularizers),

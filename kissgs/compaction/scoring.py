@@ -39,24 +39,8 @@ def prune_by_score(
     GaussianPOP, section 3, with mean squared errors, so that every image has the same weight whatever its size. A score
     is the error of a single removal: of two Gaussians, one behind the other, each may be superfluous only while the
     other is there. So deep pruning is done in rounds that remove the same share each, and the remaining Gaussians are
-    scored anew after each.
-
-    Args:
-        splats: the scene, finite.
-        views: views to render.
-        background: ``(3,)`` RGB from 0 to 1 of the views that have no background of their own.
-        count: number of Gaussians to keep, at least 1. A smaller scene is kept whole.
-        min_keep_per_scoring: smallest share of the Gaussians that one round may leave, below 1; 0: a single round.
-        min_score: lowest score of any Gaussian, seen or not, in units of the score that an unobstructed camera nearby
-            would find, see :func:`_nearby_scores`.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        progress: receives the stage ``"score"``.
-
-    Returns:
-        ``(M,)`` indices, ascending.
-
-    Raises:
-        UnsupportedError: an image would take too much memory.
+    scored anew after each. No round leaves less than ``min_keep_per_scoring`` of them (0: a single round), and no score
+    is below ``min_score`` of what an unobstructed camera nearby would find.
     """
     kept = np.arange(len(splats))
     close_up = Coverage(splats).close_up

@@ -19,6 +19,8 @@ COARSE_SHARE = 0.01
 CONTAINER_LEVELS = (1 << 16) - 1
 """Steps between the smallest and the largest signed logarithm of a container's positions."""
 
+ORIGIN = '--origin auto (in Python origin="auto")'
+
 STREAMED_REMEDY = "no origin helps here, but compressing into FOLDER/lod-meta.json does, whose parts have fine steps"
 """Remedy for coarse positions where no origin helps: streamed SOG."""
 
@@ -32,9 +34,7 @@ TRIED = 1 << 16
 def coarse_share(errors: Float[np.ndarray, " N"], scales: Float32[np.ndarray, "N 3"]) -> float:
     """Return the share of Gaussians whose position is off by more than a quarter of their visible size.
 
-    Args:
-        errors: ``(N,)`` largest error of a coordinate, world units.
-        scales: ``(N, 3)`` logarithms of standard deviations.
+    ``errors`` are those of the coordinate that is off most, world units.
     """
     return float((errors > COARSE_ERROR * visible_sizes(scales)).mean()) if len(errors) else 0.0
 
@@ -48,14 +48,8 @@ def coarse_note(
 ) -> str:
     """Return a sentence with the remedy if a container's finest steps are too coarse for a scene, else an empty string.
 
-    The planner's own steps may be coarser for small Gaussians, where it chooses so: that is no loss by distance.
-
-    Args:
-        means: ``(N, 3)`` positions, world units.
-        scales: ``(N, 3)`` logarithms of standard deviations.
-        low: ``(3,)`` smallest signed logarithm of the positions in the container, per axis.
-        high: ``(3,)`` largest one.
-        count: number of Gaussians of the scene, of which these are a sample.
+    The planner's own steps may be coarser for small Gaussians, where it chooses so: that is no loss by distance. The
+    ends ``low`` and ``high`` are signed logarithms; ``count`` is that of the scene, of which the rows are a sample.
     """
     wide = means.astype(np.float64)
     extents, sizes = high.astype(np.float64) - low, visible_sizes(scales)
@@ -71,16 +65,16 @@ def coarse_note(
         return coarse_in_chunks(rows, cuts_without_coarse(rows, Cuts.of(rows[:, :3], 0), count))
 
     remedies: dict[str, Callable[[], float]] = {
-        "origin=auto moves the scene there": lambda: float(
+        f"{ORIGIN} moves the scene there": lambda: float(
             coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean()
         ),
         STREAMED_REMEDY: lambda: coarse_in_parts(wide),
-        "compressing into FOLDER/lod-meta.json with origin=auto gives its parts fine steps": lambda: coarse_in_parts(
+        f"compressing into FOLDER/lod-meta.json with {ORIGIN} gives its parts fine steps": lambda: coarse_in_parts(
             near
         ),
     }
     helpful = (name for name, coarse in remedies.items() if coarse() <= COARSE_SHARE)
-    remedy = next(helpful, "compress objects so far apart into files of their own, with origin=auto")
+    remedy = next(helpful, f"compress objects so far apart into files of their own, with {ORIGIN}")
     return (
         f"positions have steps of about {step:.2g}, too coarse for {share:.0%} of the Gaussians, because a container "
         f"has fine steps only near the origin: {remedy}"
@@ -92,10 +86,7 @@ def coarse_chances(
 ) -> Float64[np.ndarray, " N"]:
     """Return the chance of each position to be coarse in a container: errors are even, up to half a step of each axis.
 
-    Args:
-        positions: ``(N, 3)`` world units.
-        sizes: ``(N,)`` those of :func:`visible_sizes`.
-        extents: ``(3,)`` extents of the signed logarithms' ranges, per axis.
+    Positions and :func:`visible_sizes` are in world units, extents in signed logarithms.
     """
     half_steps = np.maximum(container_steps(positions, extents) / 2, 1e-300)
     chances: Float64[np.ndarray, " N"] = 1 - np.minimum(COARSE_ERROR * sizes[:, None] / half_steps, 1).prod(axis=1)
@@ -105,37 +96,27 @@ def coarse_chances(
 def container_steps(
     positions: Float64[np.ndarray, "N 3"], extents: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, "N 3"]:
-    """Return a container's finest steps at positions, world units, with the rounding of the range's ends to float32.
-
-    Arguments are those of :func:`coarse_chances`.
-    """
+    """Return a container's finest steps at positions, world units, with the rounding of the range's ends to float32."""
     rounded = np.spacing(np.abs(signed_log(positions)).astype(np.float32))
     steps: Float64[np.ndarray, "N 3"] = (1 + np.abs(positions)) * (extents / CONTAINER_LEVELS + rounded)
     return steps
 
 
 def visible_sizes(scales: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-    """Return the second of the three standard deviations: the smaller one that a flat Gaussian shows from its front.
-
-    ``scales`` are logarithms of standard deviations; the sizes are in world units.
-    """
+    """Return the second of the three standard deviations: the smaller one that a flat Gaussian shows from its front."""
     sizes: Float64[np.ndarray, " N"] = np.exp(np.sort(scales, axis=1)[:, 1].astype(np.float64))
     return sizes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cuts:
-    """Axis-parallel cuts of space: a complete binary tree, whose leaves are the chunks.
-
-    Attributes:
-        depth: D; there are 2^D chunks.
-        axes: ``(2^D,)`` axis of each inner node; node n has the children 2 n and 2 n + 1, the root is 1.
-        values: ``(2^D,)`` coordinate of each cut; positions at and above it belong to the second child.
-    """
+    """Axis-parallel cuts of space: a complete binary tree, whose leaves are the chunks."""
 
     depth: int
     axes: UInt8[np.ndarray, " nodes"]
+    """Axis of each inner node; node n has the children 2 n and 2 n + 1, the root is 1."""
     values: Float64[np.ndarray, " nodes"]
+    """Coordinate of each cut; positions at and above it belong to the second child."""
 
     @classmethod
     def of(cls, positions: Float32[np.ndarray, "S 3"], depth: int) -> Cuts:
@@ -180,13 +161,7 @@ def coarse_in_chunks(rows: Float32[np.ndarray, "S 4"], cuts: Cuts) -> float:
 
 
 def cuts_without_coarse(sample: Float32[np.ndarray, "S 4"], cuts: Cuts, count: int) -> Cuts:
-    """Return deeper cuts if positions are coarse in the chunks of ``cuts``, unless about as many are in small chunks.
-
-    Args:
-        sample: positions and visible sizes.
-        cuts: the fewest cuts.
-        count: number of Gaussians of the scene.
-    """
+    """Return deeper cuts if positions are coarse in the chunks of these, unless about as many are in small chunks."""
     tried = [(coarse_in_chunks(sample, cuts), cuts)]
     while tried[-1][0] > COARSE_SHARE and tried[-1][1].depth < MOST_CUTS and count >> tried[-1][1].depth > LEAST:
         deeper = Cuts.of(sample[:, :3], tried[-1][1].depth + 1)

@@ -14,11 +14,6 @@ def write_harmonics(x: float, y: float, z: float, degree: int, basis: np.ndarray
 
     Order and signs are those of 3DGS. The associated Legendre functions, divided by sinᵐ, follow from those of the two
     degrees below; sinᵐ cos(m phi) and sinᵐ sin(m phi) are powers of x + i y.
-
-    Args:
-        x, y, z: the vector.
-        degree: largest degree.
-        basis: receives ``(degree + 1)² - 1`` values.
     """
     cosine, sine = np.sqrt(2.0), 0.0
     start = 0.28209479177387814  # of degree m and order m

@@ -13,6 +13,7 @@ from typing import Any, TypeVar, cast
 
 from numba import njit
 from numba.core.event import Event, Listener, install_listener
+from numba.core.typing.templates import Signature
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
@@ -24,7 +25,7 @@ _uncached: list[str] = []
 """Names of kernels for which numba found no folder to cache them in."""
 
 
-def compiled(signature: str, **options: Any) -> Callable[[Kernel], Kernel]:  # noqa: ANN401
+def compiled(signature: str | Signature, **options: Any) -> Callable[[Kernel], Kernel]:  # noqa: ANN401
     """Compile with numba's njit at the first call; cached if numba finds a writable folder, else once per process."""
 
     def decorate(function: Kernel) -> Kernel:
@@ -41,7 +42,7 @@ def compiled(signature: str, **options: Any) -> Callable[[Kernel], Kernel]:  # n
     return decorate
 
 
-def _defer(kernel: Any, signature: str) -> None:  # noqa: ANN401
+def _defer(kernel: Any, signature: str | Signature) -> None:  # noqa: ANN401
     """Let a kernel compile its signature, and no other, when Python or another kernel calls it first."""
     template = kernel.get_call_template
 

@@ -59,12 +59,7 @@ def middle_of(blocks: Iterable[Float64[np.ndarray, "n 3"]], count: int) -> Origi
 def from_world(splats: Splats, positions: Float64[np.ndarray, "N 3"], origin: Origin | None = None) -> Splats:
     """Return the scene at positions of the world, as float32 relative to an origin.
 
-    A note says if float32 is too coarse for objects so far apart.
-
-    Args:
-        splats: the scene, whose own positions are ignored.
-        positions: ``(N, 3)`` world units.
-        origin: the origin; None for that of :func:`origin_for`.
+    Without an origin it is that of :func:`origin_for`. A note says if float32 is too coarse for objects so far apart.
     """
     origin = origin_for(positions, splats.scales) if origin is None else origin
     relative = positions - np.array(origin)
@@ -78,12 +73,7 @@ def from_world(splats: Splats, positions: Float64[np.ndarray, "N 3"], origin: Or
 
 
 def origin_for(positions: Float64[np.ndarray, "N 3"], scales: Float32[np.ndarray, "N 3"]) -> Origin:
-    """Return the origin for positions as float32: that of the world unless they would be coarse, else their middle.
-
-    Args:
-        positions: ``(N, 3)`` in the world, world units; NaN and infinities are left out.
-        scales: ``(N, 3)`` logarithms of standard deviations.
-    """
+    """Return the origin for positions as float32: that of the world unless they would be coarse, else their middle."""
     return middle_of([positions], len(positions)) if _rounded_share(positions, scales) > COARSE_SHARE else WORLD
 
 
@@ -106,11 +96,7 @@ def recorded(origin: Origin) -> dict[str, list[float]]:
 
 
 def read_origin(document: Mapping[str, Any], name: str) -> Origin:
-    """Return the origin that the metadata ``document`` of the file ``name`` records.
-
-    Raises:
-        InvalidContainerError: it is not three finite numbers.
-    """
+    """Return the origin that the metadata ``document`` of the file ``name`` records."""
     own = document.get("kissgs")
     found = own.get("origin", WORLD) if isinstance(own, dict) else WORLD
     try:

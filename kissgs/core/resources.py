@@ -99,17 +99,12 @@ def _libc_function(name: str) -> ctypes._NamedFuncPointer | None:
 
 @dataclass
 class StageTimer:
-    """Receiver that forwards progress events and measures the time of each stage.
-
-    Attributes:
-        receiver: receiver of the events.
-        seconds: wall time by stage, seconds.
-        cpu_seconds: processor time of this process, seconds, up to the last :meth:`stop`.
-    """
+    """Receiver that forwards progress events and measures the wall time of each stage, and processor time."""
 
     receiver: Progress
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: float = 0.0
+    """Processor time of this process up to the last :meth:`stop`."""
     _stage: str | None = None
     _since: float = 0.0
     _cpu_since: float = field(default_factory=time.process_time)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -96,16 +96,7 @@ class Sensitivity:
                 coverage or view uncertainty outside 0 to 1.
         """
         wanted = Sensitivity.none(len(splats), splats.sh_degree, captured=self.higher_harmonics.shape[-1] > 0)
-        for name in (
-            "position_hessian",
-            "shape_hessian",
-            "color_weight",
-            "mean_harmonics",
-            "higher_harmonics",
-            "prior",
-            "coverage",
-            "captured",
-        ):
+        for name in (each.name for each in fields(self) if each.name != "view_uncertainty"):
             found, shape = getattr(self, name), getattr(wanted, name).shape
             if found.shape != shape or found.dtype != np.float32:
                 raise InvalidSceneError(

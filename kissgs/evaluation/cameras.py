@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from kissgs.cameras.random_cameras import Vec3, camera_at, log_uniform, random_direction
 from kissgs.cameras.views import View, Views
 from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.core.errors import InvalidViewsError
@@ -25,11 +26,8 @@ from kissgs.evaluation.scene_parts import (
     mahalanobis_distances,
     prominence,
 )
-from kissgs.rendering.camera import Camera, look_at
-from kissgs.rendering.constants import NEAR
+from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
-
-# Settings and helpers of all evaluation cameras: fields of view, backgrounds, smallest distance.
 
 BACKGROUNDS = (0.0, 0.5, 1.0)
 """Grey levels of the views' backgrounds, in turn: on black, missing parts of a dark scene would not show."""
@@ -37,47 +35,11 @@ BACKGROUNDS = (0.0, 0.5, 1.0)
 FIELDS_OF_VIEW = np.radians((50.0, 90.0))
 """Smallest and largest field of view along the longer side of the image, radians."""
 
-MIN_DISTANCE = 5 * NEAR
-"""Smallest distance of a camera to its target, world units. Gaussians nearer than ``NEAR`` are not drawn; a camera that
-would be closer gets a narrower field of view instead."""
-
 MAX_DRAWS = 12
 """Largest number of cameras drawn for one view until one is accepted."""
 
 THUMBNAIL = 64
 """Longer side of the thumbnails that decide whether a camera is accepted, pixels."""
-
-UP = np.array([0.0, -1.0, 0.0])
-"""Up vector of all evaluation cameras."""
-
-Point = Float64[np.ndarray, "3"]
-
-
-def random_direction(rng: np.random.Generator) -> Point:
-    """Return a unit vector, uniformly distributed over the sphere."""
-    vector = rng.standard_normal(3)
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-9))
-
-
-def camera_at(position: Point, target: Point, fov: float, size: tuple[int, int]) -> Camera:
-    """Return a camera at ``position`` that looks at ``target``.
-
-    If that is nearer than :data:`MIN_DISTANCE`, the camera moves back and its field of view shrinks, so that the image
-    shows the same section.
-
-    Args:
-        position: of the camera, world units.
-        target: point in the middle of the image, world units.
-        fov: field of view along the longer side, radians.
-        size: width and height of the image, pixels.
-    """
-    distance = float(np.linalg.norm(position - target))
-    if distance < MIN_DISTANCE:
-        away = (position - target) / distance if distance > 0 else -UP
-        position = target + MIN_DISTANCE * away
-        fov = max(2 * float(np.arctan(np.tan(fov / 2) * distance / MIN_DISTANCE)), 1e-9)
-    return look_at(position, target, UP, fov=fov, width=size[0], height=size[1])
-
 
 # Cameras for overlooked parts of a scene: parts whose loss would hardly change any image of the drawn cameras.
 
@@ -95,34 +57,25 @@ into the image."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AddedCamera:
-    """A camera that was added for a part.
-
-    Attributes:
-        camera: the camera, at full image size.
-        target: centre of the part.
-        background: grey level of :data:`BACKGROUNDS` over which the loss of the part is most visible.
-        psnr: PSNR between thumbnails with and without the part, decibels.
-    """
+    """A camera that was added for a part."""
 
     camera: Camera
-    target: Point
+    target: Vec3
+    """Centre of the part."""
     background: float
+    """Grey level of :data:`BACKGROUNDS` over which the loss of the part is most visible."""
     psnr: float
+    """Between thumbnails with and without the part, decibels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """Separate parts of a scene.
-
-    Attributes:
-        splats: the scene, finite.
-        parts: see :func:`kissgs.evaluation.scene_parts.find_parts`.
-        part_of: ``(N,)`` index of each Gaussian's part, -1 for none.
-    """
+    """Separate parts of a scene."""
 
     splats: Splats
     parts: list[Part]
     part_of: Int[np.ndarray, " N"]
+    """Index of each Gaussian's part, -1 for none."""
 
     @classmethod
     def of(cls, splats: Splats, counts: Float64[np.ndarray, " N"]) -> Parts:
@@ -136,13 +89,7 @@ class Parts:
     def overlooked(
         self, shares: Float64[np.ndarray, "V P"], views: Sequence[tuple[Camera, float]], pool: Workers
     ) -> list[int]:
-        """Return the parts whose loss hardly changes the view that shows them best, least visible parts first.
-
-        Args:
-            shares: share of each image that each part covers, see :meth:`shares`.
-            views: cameras and the grey levels of their backgrounds.
-            pool: threads.
-        """
+        """Return the parts whose loss hardly changes the view that shows them best, least visible parts first."""
 
         def psnr(part: int) -> float:
             camera, background = views[int(shares[:, part].argmax())]
@@ -154,14 +101,7 @@ class Parts:
     def cameras_for(
         self, parts: Sequence[int], size: tuple[int, int], rng: np.random.Generator, pool: Workers
     ) -> list[AddedCamera]:
-        """Draw a camera for each part until its loss is visible; after the last attempt, return the best one.
-
-        Args:
-            parts: indices of the parts.
-            size: width and height of the images, pixels.
-            rng: draws cameras, part after part.
-            pool: threads.
-        """
+        """Draw a camera for each part until its loss is visible; after the last attempt, return the best one."""
         best: dict[int, AddedCamera] = {}
         remaining = list(parts)
         for _ in range(MAX_DRAWS):
@@ -175,7 +115,7 @@ class Parts:
     def _draw_camera(self, part: Part, size: tuple[int, int], rng: np.random.Generator) -> Camera:
         fov = float(rng.uniform(*FIELDS_OF_VIEW))
         narrow = np.arctan(np.tan(fov / 2) * min(size) / max(size))
-        distance = part.radius / np.sin(narrow) * np.exp(rng.uniform(*np.log(DISTANCES)))
+        distance = part.radius / np.sin(narrow) * log_uniform(rng, *DISTANCES)
         return camera_at(part.center + distance * random_direction(rng), part.center, fov, size)
 
     def _added(self, part: int, camera: Camera) -> AddedCamera:
@@ -204,7 +144,7 @@ def _psnr(one: Float32[np.ndarray, "H W 3"], other: Float32[np.ndarray, "H W 3"]
 # Evaluation cameras: drawn at random over a whole scene, at all scales, from a seed.
 #
 # The encoder has cameras of its own (:mod:`kissgs.cameras.virtual`) and stores coarsely what these do not see;
-# evaluated with the same cameras, these errors would not show. So evaluation shares nothing with them: cameras are
+# evaluated with the same cameras, these errors would not show. So evaluation chooses its own: cameras are
 # drawn at random instead of optimised, and every Gaussian that can be visible may become a target.
 
 COUNT = 24
@@ -253,18 +193,6 @@ def evaluation_views(
     Gaussians that contain the camera or by a single one. Cameras are added for separate parts of the scene whose loss
     would hardly change any of these images (:mod:`kissgs.evaluation.cameras`). The cameras depend on the scene and
     the seed only, not on the number of threads.
-
-    Args:
-        splats: the scene, cleaned (:func:`kissgs.clean`).
-        count: number of views, without the added ones.
-        width: width of the images, pixels.
-        height: height of the images, pixels.
-        seed: seed of the random numbers, 0 or more.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the stage ``"cameras"``.
-
-    Raises:
-        InvalidViewsError: ``count``, ``width`` or ``height`` is below 1, or the seed is negative.
     """
     if min(width, height, count) < 1:
         raise InvalidViewsError(f"cannot draw {count} views of {width}x{height} pixels; ask for at least 1 view of 1x1")
@@ -292,11 +220,7 @@ def evaluation_views(
 
 
 def farther(views: Views, distance: float) -> Views:
-    """Return drawn views with their cameras at ``distance`` times the distance from the points that they look at.
-
-    Raises:
-        InvalidViewsError: the distance is not positive and finite.
-    """
+    """Return drawn views with their cameras at ``distance`` times the distance from the points that they look at."""
     if not 0 < distance < math.inf:
         raise InvalidViewsError(f"a distance of {distance} times that of the cameras is none; give a number above 0")
     if distance == 1:
@@ -351,26 +275,22 @@ def _grey(level: float) -> Float32[np.ndarray, "3"]:
 class _Pose:
     kind: Kind
     camera: Camera
-    target: Point
+    target: Vec3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PoseSampler:
-    """Draws poses relative to the visible Gaussians of a scene.
-
-    Attributes:
-        any_visible: whether there are any; if not, one at the origin stands in, so that there are cameras.
-        columns: ``(3, n)`` positions, as stored.
-        sizes: ``(n,)`` standard deviations along the middle axis.
-        gaussians: draws the target Gaussians.
-        size: width and height of the images, pixels.
-    """
+    """Draws poses relative to the visible Gaussians of a scene."""
 
     any_visible: bool
+    """Whether there are any; if not, one at the origin stands in, so that there are cameras."""
     columns: Float32[np.ndarray, "3 n"]
+    """Positions, as stored."""
     sizes: Float64[np.ndarray, " n"]
+    """Standard deviations along the middle axis."""
     gaussians: GaussianSampler
     size: tuple[int, int]
+    """Width and height of the images, pixels."""
 
     @classmethod
     def of(cls, splats: Splats, counts: Float64[np.ndarray, " N"], size: tuple[int, int]) -> _PoseSampler:
@@ -391,7 +311,7 @@ class _PoseSampler:
         fov, direction = float(rng.uniform(*FIELDS_OF_VIEW)), random_direction(rng)
         halvings = 2 * attempt * (attempt % 2)  # every other attempt: an isolated cluster may have fewer Gaussians
         fewest, most = (max(1, min(limit, self.columns.shape[1]) >> halvings) for limit in CLOSE_UP_RANKS)
-        close_rank = _log_uniform(fewest, most, rng)
+        close_rank = _whole_log_uniform(rng, fewest, most)
         if kind == "far":
             target, radius = self._bounding_sphere(EXTENT_SHARES[(number // len(KINDS) + attempt) % len(EXTENT_SHARES)])
             narrow = np.tan(fov / 2) * min(self.size) / max(self.size)
@@ -403,14 +323,14 @@ class _PoseSampler:
         rank = (
             close_rank
             if kind == "close-up"
-            else _log_uniform(fewest, max(fewest, self.columns.shape[1] >> halvings), rng)
+            else _whole_log_uniform(rng, fewest, max(fewest, self.columns.shape[1] >> halvings))
         )
         return self._looking(kind, target + direction * self._distance(target_index, rank), target, fov)
 
-    def _looking(self, kind: Kind, position: Point, target: Point, fov: float) -> _Pose:
+    def _looking(self, kind: Kind, position: Vec3, target: Vec3, fov: float) -> _Pose:
         return _Pose(kind, camera_at(position, target, fov, self.size), target)
 
-    def _position(self, index: int) -> Point:
+    def _position(self, index: int) -> Vec3:
         return self.columns[:, index].astype(np.float64)
 
     def _distance(self, index: int, count: int) -> float:
@@ -422,16 +342,15 @@ class _PoseSampler:
         radius = float(np.sqrt(np.partition(squares, count - 1)[count - 1], dtype=np.float64))
         return max(radius, MIN_SIGMAS * float(self.sizes[index]))
 
-    def _bounding_sphere(self, share: float) -> tuple[Point, float]:
+    def _bounding_sphere(self, share: float) -> tuple[Vec3, float]:
         """Return centre and radius of the sphere around the box that holds this share of Gaussians along each axis."""
         low, high = np.quantile(self.columns.astype(np.float64), [(1 - share) / 2, (1 + share) / 2], axis=1)
         radius = 0.5 * float(np.linalg.norm(high - low))
         return 0.5 * (low + high), max(radius, MIN_SIGMAS * float(np.median(self.sizes)))
 
 
-def _log_uniform(low: int, high: int, rng: np.random.Generator) -> int:
-    """Return a whole number from ``low`` to ``high``, its logarithm uniformly distributed."""
-    return int(np.clip(np.rint(np.exp(rng.uniform(np.log(low), np.log(high)))), low, high))
+def _whole_log_uniform(rng: np.random.Generator, low: int, high: int) -> int:
+    return int(np.clip(np.rint(log_uniform(rng, low, high)), low, high))
 
 
 def _check_camera(parts: Parts, camera: Camera) -> tuple[bool, Float64[np.ndarray, " P"]]:

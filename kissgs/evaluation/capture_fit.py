@@ -49,18 +49,14 @@ _Sample = tuple[View, Float32[np.ndarray, "h w 3"]]
 class _Fit:
     """How well a capture fits a scene.
 
-    Attributes:
-        seen: whether any rendering shows any of the scene.
-        psnr: median PSNR of renderings to photographs, decibels; NaN if there are none.
-        psnr_inside: the same where the scene is opaque, with the best exposure of each photograph: scenes that were
-            trained with masks or on white have another background than the photographs, or than is known here.
-        shown: share of the scene that the cameras show, 0 to 1; NaN if there are photographs.
+    ``psnr_inside`` is that where the scene is opaque, with the best exposure of each photograph: scenes that were
+    trained with masks or on white have another background than the photographs, or than is known here.
     """
 
-    seen: bool
-    psnr: float
+    seen: bool  # whether any rendering shows any of the scene
+    psnr: float  # median of renderings to photographs, decibels; NaN if there are none
     psnr_inside: float
-    shown: float
+    shown: float  # share of the scene that the cameras show, 0 to 1; NaN if there are photographs
 
     @property
     def quality(self) -> float:
@@ -80,12 +76,6 @@ def in_scene_frame(splats: Splats, views: Views, *, threads: int = 0, progress: 
 
     Each of :attr:`Views.similarities` is tried, and the best is kept if it is better than none: the one with the
     highest median PSNR to some photographs; without photographs, the one whose cameras show most of the scene.
-
-    Args:
-        splats: the scene, finite.
-        views: a capture, with cameras in the coordinates of its files, or what this function returned for it.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the stages ``"kernels"`` and ``"cameras"``.
     """
     if not views.similarities or not views.all:
         return _moved(views, None, splats.origin)
@@ -98,20 +88,9 @@ def in_scene_frame(splats: Splats, views: Views, *, threads: int = 0, progress: 
 def fitting_views(
     splats: Splats, views: Views, *, force: bool = False, threads: int = 0, progress: Progress = silent
 ) -> tuple[Views, str]:
-    """Return views in the coordinates of the scene, as :func:`in_scene_frame` does, and whatever is odd about them.
+    """Return views in the coordinates of the scene, as :func:`in_scene_frame` does, and what is odd about them.
 
-    Args:
-        splats: the scene, finite.
-        views: a capture.
-        force: accept photographs that do not show the scene; the note says so.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the stages ``"kernels"`` and ``"cameras"``.
-
-    Returns:
-        The views, with their own note, and a note on the choice of coordinates and on a bad fit.
-
-    Raises:
-        InvalidViewsError: the photographs do not show the scene, and ``force`` is false.
+    Photographs that do not show the scene are refused, unless ``force``.
     """
     if not views.all or not drawn_opacities(splats).any():
         return _moved(views, None, splats.origin), ""

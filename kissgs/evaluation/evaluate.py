@@ -1,13 +1,12 @@
 """Image metrics of a candidate scene's renderings against photographs and against the reference's renderings.
 
-Renderings are clamped to [0, 1], as a screen does, but not rounded to 8 bits: rounding would limit every PSNR to about
-59 dB. (Published values often come from 8-bit files; near 30 dB the difference is below 0.01 dB.)
+Rounded to 8 bits, as published values often are, PSNR would end at about 59 dB; near 30 dB it hardly differs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -78,30 +77,31 @@ def evaluate(
     """
     reference, candidate = clean(reference)[0], with_origin(clean(candidate)[0], reference.origin)
     measure = _measure(flip, lpips, device)
+    groups = list[tuple[Views, Split]]()
     if views is not None:
         _select_split(views, split)  # refused before any work
-        views = in_scene_frame(reference, views, threads=threads, progress=progress)
-    given = [] if views is None else [_select_split(views, split)]
+        groups.append((in_scene_frame(reference, views, threads=threads, progress=progress), split))
     load_kernels(progress)
     drawn = farther(evaluation_views(reference, seed=seed, threads=threads, progress=progress), distance)
-    groups = [*given, _select_split(drawn, "all")]
-    total, done, evaluations = sum(len(group.views) for group in groups), 0, list[Evaluation]()
-    for group in groups:
-        begin, share = done / total, len(group.views) / total
+    groups.append((drawn, "all"))
+    counts = [len(_select_split(*group)[1]) for group in groups]
+    found = list[Evaluation]()
+    for (chosen, wanted), count in zip(groups, counts, strict=True):
+        begin, share = sum(len(each.views) for each in found) / sum(counts), count / sum(counts)
         evaluation = _compare_views(
             reference,
             candidate,
-            group,
+            chosen,
+            wanted,
             measure,
             device,
             threads,
             progress=lambda stage, fraction, begin=begin, share=share: progress(stage, begin + share * fraction),
         )
-        shown = share_shown(reference, [view.camera for view in group.views], threads=threads)
-        evaluations.append(replace(evaluation, shown=shown))
-        done += len(group.views)
+        shown = share_shown(reference, [each.view.camera for each in evaluation.views], threads=threads)
+        found.append(replace(evaluation, shown=shown))
     progress("evaluate", 1.0)
-    return evaluations[0] if len(evaluations) == 1 else replace(evaluations[0], surroundings=evaluations[1])
+    return found[0] if len(found) == 1 else replace(found[0], surroundings=found[1])
 
 
 def compare_images(
@@ -116,53 +116,25 @@ def compare_images(
 ) -> Evaluation:
     """Compare two scenes from these views alone: the test views, or the training views if there are none.
 
-    Args:
-        reference: the original scene.
-        candidate: the scene to evaluate.
-        views: the views, in the coordinates of the reference.
-        device: see :func:`evaluate`.
-        threads: see :func:`evaluate`.
-        reference_images: cache of the reference's renderings by view name, read and filled; for comparisons of many
-            candidates with one reference.
-        progress: receives the stages ``"kernels"`` and ``"evaluate"``.
-
-    Raises:
-        InvalidViewsError: see :func:`evaluate`.
-        UnsupportedError: see :func:`evaluate`.
+    ``reference_images`` are the reference's renderings by view name, read and filled, for comparisons of many
+    candidates with one reference.
     """
     reference, candidate = clean(reference)[0], clean(candidate)[0]
-    group = _select_split(views, "test")
     if device == "cpu":
         load_kernels(progress)
     measure = _measure(False, False, device)
     evaluation = _compare_views(
-        reference, candidate, group, measure, device, threads, reference_images, progress=progress
+        reference, candidate, views, "test", measure, device, threads, reference_images, progress=progress
     )
     progress("evaluate", 1.0)
     return evaluation
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _SplitViews:
-    """The views of one split.
-
-    Attributes:
-        all_views: all views, with their source, background and note.
-        split: the split that is used.
-        views: its views, one or more.
-        photographed: whether they have photographs: all or none of them do.
-    """
-
-    all_views: Views
-    split: Split
-    views: tuple[View, ...]
-    photographed: bool
-
-
 def _compare_views(
     reference: Splats,
     candidate: Splats,
-    group: _SplitViews,
+    views: Views,
+    split: Split,
     measure: Measure,
     device: Device,
     threads: int,
@@ -171,29 +143,30 @@ def _compare_views(
     progress: Progress,
 ) -> Evaluation:
     """Compare two clean scenes view by view."""
+    used, chosen = _select_split(views, split)
+    photographed = _have_photos(chosen)
     compared, blank = [], len(reference) > 0
-    for done, view in enumerate(group.views):
-        progress("evaluate", done / len(group.views))
-        background = background_of(view, group.all_views.background)
-        image = None if reference_images is None else reference_images.get(view.name)
+    for done, view in enumerate(chosen):
+        progress("evaluate", done / len(chosen))
+        background = background_of(view, views.background)
+        image = (reference_images or {}).get(view.name)
         if image is None:
             image = render_clamped(reference, view.camera, background, device, threads)
         if reference_images is not None:
             reference_images[view.name] = image
         other = render_clamped(candidate, view.camera, background, device, threads)
         blank = blank and bool((image == np.clip(background, 0, 1)).all())
-        photo = view.load_photo() if group.photographed else None
-        comparison = _compare(image, other, photo, measure)
+        comparison = _compare(image, other, view.load_photo() if photographed else None, measure)
         compared.append(ViewComparison(view=view, comparison=comparison, origin=reference.origin))
     return Evaluation(
-        against="photos" if group.photographed else "renderings",
-        split=group.split,
-        source=group.all_views.source,
-        background=group.all_views.background,
+        against="photos" if photographed else "renderings",
+        split=used,
+        source=views.source,
+        background=views.background,
         reference_count=len(reference),
         candidate_count=len(candidate),
         views=tuple(compared),
-        note="; ".join(filter(None, [group.all_views.note, NOTHING_VISIBLE if blank else ""])),
+        note="; ".join(filter(None, [views.note, NOTHING_VISIBLE if blank else ""])),
     )
 
 
@@ -228,13 +201,9 @@ def _measure(flip: bool, lpips: bool, device: Device) -> Measure:
     return measure
 
 
-def _select_split(views: Views, split: str) -> _SplitViews:
-    """Return the views of a split; if "test" is empty, those of "train"."""
-    splits = {
-        "test": views.test,
-        "train": views.train,
-        "all": views.all,
-    }
+def _select_split(views: Views, split: str) -> tuple[Split, tuple[View, ...]]:
+    """Return the split that is used, and its views; if "test" is empty, those of "train"."""
+    splits: dict[str, tuple[View, ...]] = {"test": views.test, "train": views.train, "all": views.all}
     used = "train" if split == "test" and not views.test else split
     if used not in splits:
         raise UnsupportedError(f"there is no split {split!r}; choose test, train or all")
@@ -242,7 +211,8 @@ def _select_split(views: Views, split: str) -> _SplitViews:
         raise InvalidViewsError(
             f"there is no view to evaluate from: the split {used!r} of {views.source} is empty; choose another split"
         )
-    return _SplitViews(views, cast(Split, used), splits[used], _have_photos(splits[used]))
+    _have_photos(splits[used])
+    return cast(Split, used), splits[used]
 
 
 def _compare(
@@ -251,15 +221,11 @@ def _compare(
     photo: Shaped[np.ndarray, "H W 3"] | None,
     measure: Measure,
 ) -> Comparison:
-    candidate_vs_reference = measure(candidate, reference)
+    vs_reference = measure(candidate, reference)
     if photo is None:
-        return Comparison(
-            reference=None, candidate=candidate_vs_reference, candidate_vs_reference=candidate_vs_reference
-        )
+        return Comparison(reference=None, candidate=vs_reference, candidate_vs_reference=vs_reference)
     return Comparison(
-        reference=measure(reference, photo),
-        candidate=measure(candidate, photo),
-        candidate_vs_reference=candidate_vs_reference,
+        reference=measure(reference, photo), candidate=measure(candidate, photo), candidate_vs_reference=vs_reference
     )
 
 

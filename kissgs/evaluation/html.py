@@ -80,10 +80,6 @@ def worst_crop(levels: Float32[np.ndarray, "H W"], side: int) -> tuple[slice, sl
 
     The largest error is the window of :data:`WINDOW` pixels with the largest mean square; without any error, the
     middle.
-
-    Args:
-        levels: error of each pixel; NaN counts as 255.
-        side: side of the crop, pixels.
     """
     height, width = levels.shape
     down, across = min(WINDOW, height), min(WINDOW, width)
@@ -106,27 +102,27 @@ def _interval(middle: int, side: int, length: int) -> slice:
     return slice(start, min(start + side, length))
 
 
-# Values of an evaluation's HTML page: summary, cards and table.
+# Text and tables of the page.
 
 
-def summary_line(evaluation: Evaluation, shown: int) -> str:
+def _summary(evaluation: Evaluation, shown: int) -> str:
     """Return what was compared, as plain text to be escaped; ``shown`` is the number of views with images."""
     rest = " Their images are below" if shown == len(evaluation.views) else f" Images of the worst {shown} are below"
     rest += ", the worst first."
     return f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}.{rest}"
 
 
-def metric_cards(evaluation: Evaluation, before: int | None, after: int | None) -> Iterable[str]:
+def _cards(evaluation: Evaluation, before: int | None, after: int | None) -> Iterable[str]:
     """Yield cards with the means, and the bytes of both files if known."""
     mean = evaluation.mean
     if mean.reference is not None:
-        change = f"{psnr_change(mean)} dB: the reference has {format_metric(mean.reference.psnr, 2)} dB"
+        change = f"{_psnr_change(mean)} dB: the reference has {format_metric(mean.reference.psnr, 2)} dB"
         yield _card("PSNR, candidate to photographs", f"{format_metric(mean.candidate.psnr, 2)} dB", change)
         of_reference, of_candidate = mean.reference.texts(), mean.candidate.texts()
         for name in list(of_candidate)[1:]:
             remark = f"the reference has {of_reference[name]}"
             yield _card(f"{name}, candidate to photographs", of_candidate[name], remark)
-    remark = f"of their renderings; {other_metrics(mean.candidate_vs_reference)}"
+    remark = f"of their renderings; {_other_metrics(mean.candidate_vs_reference)}"
     yield _card("PSNR, candidate to reference", f"{format_metric(mean.candidate_vs_reference.psnr, 2)} dB", remark)
     fifth = f"{format_metric(evaluation.fifth_percentile, 2)} dB is the 5th percentile"
     yield _card(
@@ -140,13 +136,13 @@ def metric_cards(evaluation: Evaluation, before: int | None, after: int | None) 
         yield _card("Gaussians", f"{evaluation.candidate_count:,}", counts)
 
 
-def worst_views_text(evaluation: Evaluation) -> str:
+def _worst_views(evaluation: Evaluation) -> str:
     """Return the worst views, those of the surroundings included, as plain text to be escaped."""
     text, surroundings = f"Candidate to reference: {evaluation.extremes}.", evaluation.surroundings
     if surroundings is None:
         return text
     metrics = surroundings.mean.candidate_vs_reference
-    mean = f"PSNR {format_metric(metrics.psnr, 2)} dB, {other_metrics(metrics)}"
+    mean = f"PSNR {format_metric(metrics.psnr, 2)} dB, {_other_metrics(metrics)}"
     return f"{text} Surroundings, {surroundings.views_used} ({surroundings.source}): {mean}; {surroundings.extremes}."
 
 
@@ -154,18 +150,18 @@ def _card(name: str, value: str, remark: str) -> str:
     return f'<div class="card"><dt>{name}</dt><dd>{value}</dd><dd class="remark">{remark}</dd></div>'
 
 
-def other_metrics(metrics: ImageMetrics) -> str:
+def _other_metrics(metrics: ImageMetrics) -> str:
     """Return all metrics but the PSNR, as text."""
     return ", ".join(f"{name} {text}" for name, text in list(metrics.texts().items())[1:])
 
 
-def psnr_change(comparison: Comparison) -> str:
+def _psnr_change(comparison: Comparison) -> str:
     """Return the change of the PSNR to the photograph as HTML, a loss in red."""
     text = "" if comparison.change is None else format_metric(comparison.change, 2, signed=True)
     return f'<span class="worse">−{text[1:]}</span>' if text.startswith("-") else text
 
 
-def views_table(evaluation: Evaluation, shown: Sequence[int]) -> str:
+def _views_table(evaluation: Evaluation, shown: Sequence[int]) -> str:
     """Return a table with a row for each view, linked to its images if it is among ``shown``, and the means."""
     mean = evaluation.mean
     metrics = list(mean.candidate_vs_reference.texts())
@@ -210,13 +206,7 @@ MAX_CROP, MIN_CROP = 160, 64
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ReportScene:
-    """One of the two scenes of a report.
-
-    Attributes:
-        name: name to display.
-        splats: the scene, clean.
-        bytes: size of its file; None if it has none.
-    """
+    """One of the two scenes of a report, clean; ``bytes`` is the size of its file, if it has one."""
 
     name: str
     splats: Splats
@@ -234,47 +224,33 @@ def html_report(
 ) -> str:
     """Return an evaluation as a self-contained HTML page, with styles, script and images embedded.
 
-    The worst :data:`MAX_VIEWS` views are shown with images, the worst first. The worst
-    :data:`MAX_SURROUNDINGS` views of the ``surroundings`` follow.
-
-    Args:
-        evaluation: evaluation of the two scenes.
-        reference: the original scene.
-        candidate: the evaluated scene.
-        device: see :func:`kissgs.evaluate`.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the stage ``"html"``.
-
-    Raises:
-        InvalidViewsError: a photograph cannot be read.
-        UnsupportedError: an image would take too much memory, or CUDA is missing.
+    The worst :data:`MAX_VIEWS` views are shown with images, the worst first. The worst :data:`MAX_SURROUNDINGS` views
+    of the ``surroundings`` follow. ``progress`` receives the stage "html".
     """
-    shown, surroundings = select_views(evaluation), evaluation.surroundings
+    shown = _worst_first(evaluation)[:MAX_VIEWS]
     entries = [(f"view-{i}", evaluation, evaluation.views[i]) for i in shown]
-    if surroundings is not None:
-        worst_first = sorted(range(len(surroundings.views)), key=lambda i: surroundings.views[i].ranking_psnr)
-        entries += [(f"surroundings-{i}", surroundings, surroundings.views[i]) for i in worst_first[:MAX_SURROUNDINGS]]
-    worst = min((compared for _, _, compared in entries), key=lambda compared: compared.ranking_psnr)
-    full, sections = full_scale(worst.comparison.candidate_vs_reference.psnr), []
+    if (around := evaluation.surroundings) is not None:
+        worst = _worst_first(around)[:MAX_SURROUNDINGS]
+        entries += [(f"surroundings-{i}", around, around.views[i]) for i in worst]
+    lowest = min((compared for _, _, compared in entries), key=lambda compared: compared.ranking_psnr)
+    full, sections = full_scale(lowest.comparison.candidate_vs_reference.psnr), []
     for done, (anchor, group, compared) in enumerate(entries):
         progress("html", done / len(entries))
-        view = compared.view
-        background = background_of(view, group.background)
-        images = _ViewImages(
-            reference=render_clamped(reference.splats, view.camera, background, device, threads),
-            candidate=render_clamped(candidate.splats, view.camera, background, device, threads),
-            photo=view.load_photo() if group.against == "photos" else None,
-        )
-        sections.append(_section(anchor, compared, images, full))
+        view, background = compared.view, background_of(compared.view, group.background)
+        renderings = [
+            render_clamped(scene.splats, view.camera, background, device, threads) for scene in (reference, candidate)
+        ]
+        photo = view.load_photo() if group.against == "photos" else None
+        sections.append(_section(anchor, compared, renderings, photo, full))
     progress("html", 1.0)
     return Template(files("kissgs.evaluation").joinpath("report.html").read_text(encoding="utf-8")).substitute(
         title=escape(f"{candidate.name} compared with {reference.name}"),
         reference=escape(reference.name),
         candidate=escape(candidate.name),
-        summary=escape(summary_line(evaluation, len(shown)) + _sentence(evaluation.note)),
-        cards="\n".join(metric_cards(evaluation, reference.bytes, candidate.bytes)),
-        table=views_table(evaluation, shown),
-        worst_views=escape(worst_views_text(evaluation)),
+        summary=escape(_summary(evaluation, len(shown)) + _sentence(evaluation.note)),
+        cards="\n".join(_cards(evaluation, reference.bytes, candidate.bytes)),
+        table=_views_table(evaluation, shown),
+        worst_views=escape(_worst_views(evaluation)),
         sections="\n".join(sections),
         colours=", ".join("#" + bytes(color).hex() for color in INFERNO),
         quality=QUALITY,
@@ -282,36 +258,35 @@ def html_report(
     )
 
 
-def select_views(evaluation: Evaluation) -> list[int]:
-    """Return the indices of the views to show: those of the lowest PSNR, the worst first."""
-    views = evaluation.views
-    return sorted(range(len(views)), key=lambda i: views[i].ranking_psnr)[:MAX_VIEWS]
+def _worst_first(evaluation: Evaluation) -> list[int]:
+    """Return the indices of all views, that of the lowest PSNR first."""
+    return sorted(range(len(evaluation.views)), key=lambda i: evaluation.views[i].ranking_psnr)
 
 
 def _sentence(note: str) -> str:
     return f" {note[0].upper()}{note[1:]}." if note else ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _ViewImages:
-    reference: Float32[np.ndarray, "H W 3"]
-    candidate: Float32[np.ndarray, "H W 3"]
-    photo: UInt8[np.ndarray, "H W 3"] | None
-
-
-def _section(anchor: str, compared: ViewComparison, images: _ViewImages, full: int) -> str:
-    name = escape(compared.view.name)
-    levels = rms_difference(images.candidate, images.reference)
+def _section(
+    anchor: str,
+    compared: ViewComparison,
+    renderings: Sequence[Float32[np.ndarray, "H W 3"]],
+    photo: UInt8[np.ndarray, "H W 3"] | None,
+    full: int,
+) -> str:
+    """Return the images of a view; the renderings are those of reference and candidate."""
+    name, (reference, candidate) = escape(compared.view.name), renderings
+    levels = rms_difference(candidate, reference)
     crop = worst_crop(levels, max(MIN_CROP, min(MAX_CROP, min(levels.shape) // 2)))
     layers = {
-        "reference": to_bytes(images.reference),
-        "candidate": to_bytes(images.candidate),
-        **({} if images.photo is None else {"photograph": images.photo}),
+        "reference": to_bytes(reference),
+        "candidate": to_bytes(candidate),
+        **({} if photo is None else {"photograph": photo}),
         "difference": heat_map(levels, full),
     }
     mark, sources = _mark(crop, levels.shape), {layer: _large(pixels) for layer, pixels in layers.items()}
     figures = [_slider(name, sources["reference"], sources["candidate"], mark)]
-    if images.photo is not None:
+    if photo is not None:
         figures.append(_figure(sources["photograph"], f"photograph {name}", "the photograph"))
     caption = (
         f'<span class="legend">0 <i></i> {full} levels of 255 or more</span>difference of the two '
@@ -319,7 +294,7 @@ def _section(anchor: str, compared: ViewComparison, images: _ViewImages, full: i
     )
     figures.append(_figure(sources["difference"], f"difference in {name}", caption, mark))
     crops = [_figure(_lossless(pixels[crop]), f"{layer}, enlarged", layer) for layer, pixels in layers.items()]
-    shape = "tall" if levels.shape[0] > levels.shape[1] else "wide" if images.photo is None else "wide photographed"
+    shape = "tall" if levels.shape[0] > levels.shape[1] else "wide" if photo is None else "wide photographed"
     return (
         f'<section class="card" id="{anchor}"><h2>{name}</h2><p class="numbers">{_numbers(compared.comparison)} · '
         f"{compared.pose}</p>"
@@ -330,11 +305,11 @@ def _section(anchor: str, compared: ViewComparison, images: _ViewImages, full: i
 
 def _numbers(comparison: Comparison) -> str:
     metrics = comparison.candidate_vs_reference
-    to_reference = f"candidate to reference {format_metric(metrics.psnr, 2)} dB, {other_metrics(metrics)}"
+    to_reference = f"candidate to reference {format_metric(metrics.psnr, 2)} dB, {_other_metrics(metrics)}"
     if comparison.reference is None:
         return to_reference
-    psnr = f"candidate to photograph {format_metric(comparison.candidate.psnr, 2)} dB ({psnr_change(comparison)})"
-    return f"{psnr}, {other_metrics(comparison.candidate)} · {to_reference}"
+    psnr = f"candidate to photograph {format_metric(comparison.candidate.psnr, 2)} dB ({_psnr_change(comparison)})"
+    return f"{psnr}, {_other_metrics(comparison.candidate)} · {to_reference}"
 
 
 def _slider(name: str, reference: str, candidate: str, mark: str) -> str:

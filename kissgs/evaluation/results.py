@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from kissgs.cameras.views import View
-from kissgs.core.array_types import Float32, Float64
+from kissgs.core.array_types import Float32
 from kissgs.core.origin import WORLD, Origin
 from kissgs.evaluation.metric_text import format_metric
 
@@ -27,22 +27,15 @@ single unchanged view, at 120 dB or infinite, would hide damage in others."""
 class ImageMetrics:
     """Metrics of an image against a target, or their means over views.
 
-    NaN in an image gives NaN in the metrics and their means, so that no mean hides a failed rendering.
-
-    Attributes:
-        psnr: decibels; infinite for equal images. In a mean, each view counts for at most :data:`MAX_VIEW_PSNR`; it is
-            infinite only if all images are equal.
-        ssim: -1 to 1; 1 for equal images.
-        ms_ssim: 0 to 1; 1 for equal images.
-        flip: 0 for equal images, up to 1; None if not requested.
-        lpips: 0 for equal images, up to about 1; None if not requested.
+    NaN in an image gives NaN in the metrics and their means, so that no mean hides a failed rendering. In a mean of
+    PSNR, each view counts for at most :data:`MAX_VIEW_PSNR`; it is infinite only if all images are equal.
     """
 
-    psnr: float
-    ssim: float
-    ms_ssim: float
-    flip: float | None = None
-    lpips: float | None = None
+    psnr: float  # decibels; infinite for equal images
+    ssim: float  # -1 to 1; 1 for equal images
+    ms_ssim: float  # 0 to 1; 1 for equal images
+    flip: float | None = None  # 0 for equal images, up to 1; None if not requested
+    lpips: float | None = None  # 0 for equal images, up to about 1; None if not requested
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the metrics for JSON: an infinite value is None (null), NaN the string ``"NaN"``."""
@@ -57,16 +50,10 @@ class ImageMetrics:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """Metrics of one view, or their means over all views.
+    """Metrics of one view, or their means over all views."""
 
-    Attributes:
-        reference: the reference's rendering against the photograph; None without photographs.
-        candidate: the candidate's rendering against the photograph; without photographs, ``candidate_vs_reference``.
-        candidate_vs_reference: the candidate's rendering against the reference's.
-    """
-
-    reference: ImageMetrics | None
-    candidate: ImageMetrics
+    reference: ImageMetrics | None  # to the photograph; None without photographs
+    candidate: ImageMetrics  # to the photograph; without photographs, to the reference's rendering
     candidate_vs_reference: ImageMetrics
 
     @property
@@ -117,33 +104,24 @@ class ViewComparison:
     @property
     def pose(self) -> str:
         """Position of the camera, and its target or direction, in the world, as text."""
-        position, target, direction = self._pose
-        if target is not None:
-            return f"at {_point(position)} looking at {_point(target)}"
-        return f"at {_point(position)} looking along {_point(direction)}"
+        pose = self.pose_as_dict()
+        if pose["target"] is None:
+            return f"at {_point(pose['position'])} looking along {_point(pose['direction'])}"
+        return f"at {_point(pose['position'])} looking at {_point(pose['target'])}"
 
     def pose_as_dict(self) -> dict[str, Any]:
         """Return the view's name, its PSNR of the candidate to the reference, and the camera's pose, for JSON.
 
         ``position``, ``target`` (None if unknown) and the unit vector ``direction`` are in the world's coordinates.
         """
-        position, target, direction = self._pose
+        camera, target = self.view.camera, self.view.target
         return {
             "name": self.view.name,
             "psnr": as_json(self.comparison.candidate_vs_reference.psnr),
-            "position": position.tolist(),
-            "target": None if target is None else target.tolist(),
-            "direction": direction.tolist(),
+            "position": (camera.position + self.origin).tolist(),
+            "target": None if target is None else (target + self.origin).tolist(),
+            "direction": camera.viewmat[2, :3].tolist(),
         }
-
-    @property
-    def _pose(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"] | None, Float64[np.ndarray, "3"]]:
-        camera, target = self.view.camera, self.view.target
-        return (
-            camera.position + self.origin,
-            None if target is None else target + self.origin,
-            camera.viewmat[2, :3],
-        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return name, size in pixels and metrics, for JSON."""
@@ -265,18 +243,18 @@ class Evaluation:
 
 
 def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:
+    def mean(numbers: Sequence[float]) -> float:
+        return sum(numbers) / len(numbers)
+
+    flips = [value.flip for value in values if value.flip is not None]
+    lpips = [value.lpips for value in values if value.lpips is not None]
     return ImageMetrics(
         psnr=_mean_decibels([value.psnr for value in values]),
-        ssim=sum(value.ssim for value in values) / len(values),
-        ms_ssim=sum(value.ms_ssim for value in values) / len(values),
-        flip=_mean_if_measured([value.flip for value in values]),
-        lpips=_mean_if_measured([value.lpips for value in values]),
+        ssim=mean([value.ssim for value in values]),
+        ms_ssim=mean([value.ms_ssim for value in values]),
+        flip=mean(flips) if flips else None,
+        lpips=mean(lpips) if lpips else None,
     )
-
-
-def _mean_if_measured(values: Sequence[float | None]) -> float | None:
-    measured = [value for value in values if value is not None]
-    return sum(measured) / len(measured) if measured else None
 
 
 def _mean_decibels(values: Sequence[float]) -> float:
@@ -285,7 +263,7 @@ def _mean_decibels(values: Sequence[float]) -> float:
     return sum(value if math.isnan(value) else min(value, MAX_VIEW_PSNR) for value in values) / len(values)
 
 
-def _point(point: Float64[np.ndarray, "3"]) -> str:
+def _point(point: Sequence[float]) -> str:
     return f"({', '.join(f'{value:.4g}' if abs(value) < 1000 else f'{value:.1f}' for value in point)})"
 
 

@@ -63,12 +63,7 @@ def mahalanobis_distances(splats: Splats, point: Float64[np.ndarray, "3"]) -> Fl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianSampler:
-    """Maps numbers from 0 to 1 to Gaussians; near numbers give Gaussians near to each other.
-
-    Attributes:
-        order: ``(N,)`` Gaussians in Morton order.
-        cumulative: ``(N,)`` cumulative probabilities in that order.
-    """
+    """Maps numbers from 0 to 1 to Gaussians; near numbers give Gaussians near to each other."""
 
     order: Int[np.ndarray, " N"]
     cumulative: Float64[np.ndarray, " N"]
@@ -80,10 +75,6 @@ class GaussianSampler:
         The fair half is shared in an octree: the children of a cell get parts of its probability in proportion to the
         fourth roots of their weights. So a small isolated cluster is not missed beside a large one, nor a large one
         beside a few outliers.
-
-        Args:
-            means: ``(N, 3)`` positions of one or more Gaussians.
-            weights: ``(N,)`` at least 0, not all 0.
         """
         codes = morton_codes(means)
         order = np.argsort(codes, kind="stable")
@@ -158,15 +149,10 @@ RADIUS_QUANTILE = 0.75
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A group of Gaussians that are near to each other and far from all others.
+    """A group of Gaussians that are near to each other and far from all others."""
 
-    Attributes:
-        center: ``(3,)`` median position along each axis, world units.
-        radius: radius of the sphere around the centre that holds most of them, world units.
-    """
-
-    center: Float64[np.ndarray, "3"]
-    radius: float
+    center: Float64[np.ndarray, "3"]  # median position along each axis, world units
+    radius: float  # of the sphere around the centre that holds most of them
 
 
 def find_parts(splats: Splats, counts: Float64[np.ndarray, " N"]) -> tuple[list[Part], Int[np.ndarray, " N"]]:
@@ -175,13 +161,7 @@ def find_parts(splats: Splats, counts: Float64[np.ndarray, " N"]) -> tuple[list[
     A sample of the Gaussians is clustered by single linkage; as in HDBSCAN, no two Gaussians are nearer than their own
     size. A cluster that has reached :data:`MIN_SHARE` of the scene is a part if the gap to the next cluster of at least
     that size is :data:`MIN_GAP_RATIO` times the gap at which it reached the share.
-
-    Args:
-        splats: the scene, finite.
-        counts: ``(N,)`` prominence of each Gaussian (:func:`kissgs.evaluation.scene_parts.prominence`).
-
-    Returns:
-        the parts, and the index of each Gaussian's part, ``(N,)``, -1 for none.
+    Returns the parts, and the index of each Gaussian's part, -1 for none; ``counts`` are prominences.
     """
     part_of = np.full(len(splats), -1)
     visible = np.flatnonzero(counts > 0)
@@ -230,19 +210,12 @@ def _spanning_tree(positions: Float64[np.ndarray, "n 3"], sizes: Float64[np.ndar
 
 @dataclass(slots=True, eq=False)
 class _Cluster:
-    """Sampled Gaussians joined by edges up to some length.
-
-    Attributes:
-        members: indices in the sample.
-        share: share of the scene's prominence.
-        formed: length of the edge with which it became large enough for a part; infinite before.
-        parts: members of each part in it.
-    """
+    """Sampled Gaussians joined by edges up to some length."""
 
     members: list[int]
-    share: float
-    formed: float = np.inf
-    parts: list[list[int]] = field(default_factory=list)
+    share: float  # of the scene's prominence
+    formed: float = np.inf  # length of the edge with which it became large enough for a part
+    parts: list[list[int]] = field(default_factory=list)  # members of each part in it
 
     def mark_if_separate(self, length: float) -> None:
         """Mark the cluster as a part if the next one, at distance ``length``, is far enough away."""
@@ -281,17 +254,13 @@ def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
 
     The weight in a pixel is alpha times the transmittance in front of the Gaussian; with the background's weights, the
     total is the number of pixels.
-
-    Args:
-        frame: a rendering, with the lists of Gaussians per tile.
-        pool: threads.
     """
     height, width = frame.transmittance.shape
     ones, zeros = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     ones[:, :, 0] = 1  # so the gradient with respect to a red value is the sum of weights
     v_slots, slots, _ = differentiate_footprints(frame, ones, zeros, pool)
-    weights = np.zeros(len(frame.splats), np.float64)
-    blending.sum_errors(np.ascontiguousarray(v_slots[:, 6]), slots.rows, slots.first, frame.footprints.visible, weights)
+    weights = np.zeros(len(frame.footprints.visible), np.float64)
+    blending.sum_errors(np.ascontiguousarray(v_slots[:, 6]), slots, frame.footprints.visible, weights)
     return weights
 
 
@@ -300,11 +269,6 @@ def share_shown(splats: Splats, cameras: Sequence[Camera], *, threads: int = 0) 
 
     A Gaussian is shown if it covers more than :data:`SHOWN_SHARE` of an image, and counts by its prominence
     (:func:`kissgs.evaluation.scene_parts.prominence`). Gaussians hidden behind others in all images are not shown.
-
-    Args:
-        splats: the scene, finite.
-        cameras: any number of cameras; large ones are reduced to :data:`MAX_SIDE` pixels.
-        threads: number of threads; 0 means one per processor.
     """
     counts, plain = prominence(splats), base_colors_only(splats)
     if not counts.any():

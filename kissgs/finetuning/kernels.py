@@ -1,8 +1,4 @@
-"""Numba kernels of fine-tuning: one pass over the levels in place of a dozen operations with arrays in float64.
-
-Values and gradients are those of :class:`kissgs.finetuning.planes.EvenPlane` and
-:class:`kissgs.finetuning.losses.RateLoss`.
-"""
+"""Numba kernels of fine-tuning: one pass over the levels in place of a dozen operations with arrays in float64."""
 
 from __future__ import annotations
 
@@ -10,7 +6,9 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
+from numba import njit
 
+from kissgs.core.array_types import Float32, Float64, Int64
 from kissgs.core.numba_kernels import compiled
 from kissgs.core.resources import Workers
 
@@ -27,77 +25,79 @@ def each_part(work: Callable[[int, int], T], rows: int, threads: int) -> list[T]
 
 
 @compiled(
-    "void(float64[:, ::1], float32[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[::1], int64, int64,"
-    " float64[:, ::1])"
+    "void(float64[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1], float64[:, ::1], int64, int64, float64[:, ::1])"
 )
-def even_values(
-    base: np.ndarray,
-    latents: np.ndarray,
-    stride: np.ndarray,
-    shift: np.ndarray,
-    low: np.ndarray,
-    step: np.ndarray,
+def level_values(
+    base: Float64[np.ndarray, "R C"],
+    latents: Float32[np.ndarray, "R C"],
+    start: Int64[np.ndarray, "R _"],
+    lists: Int64[np.ndarray, " P"],
+    table: Float64[np.ndarray, "L _"],
     first: int,
     last: int,
-    values: np.ndarray,
+    values: Float64[np.ndarray, "R C"],  # written
 ) -> None:
-    """Write the decoded values of rows ``first`` to ``last`` (exclusive).
-
-    Args:
-        base, stride, shift, low, step: attributes of an :class:`kissgs.finetuning.planes.EvenPlane`.
-        latents: ``(R, C)``.
-        first: first row.
-        last: end of the rows, exclusive.
-        values: out, ``(R, C)``.
-    """
-    per_channel = stride.shape[1] > 1
+    """Write the values of the levels of a plane, rows ``first`` to before ``last``."""
     for n in range(first, last):
         for c in range(base.shape[1]):
-            level = np.rint(base[n, c] + latents[n, c]) * stride[n, c if per_channel else 0] + shift[n, c]
-            values[n, c] = low[c] + step[c] * level
+            at = start[n, c if start.shape[1] > 1 else 0] + np.int64(np.rint(base[n, c] + latents[n, c]))
+            values[n, c] = table[lists[at], c if table.shape[1] > 1 else 0]
 
 
-@compiled("void(float64[:, ::1], float64[:, ::1], float64[::1], int64, int64, float32[:, ::1])")
-def even_values_backward(
-    gradient: np.ndarray, stride: np.ndarray, step: np.ndarray, first: int, last: int, v_latents: np.ndarray
-) -> None:
-    """Write the gradients by the latents of rows ``first`` to ``last`` (exclusive), given those by the values."""
-    per_channel = stride.shape[1] > 1
-    for n in range(first, last):
-        for c in range(gradient.shape[1]):
-            v_latents[n, c] = gradient[n, c] * step[c] * stride[n, c if per_channel else 0]
+@njit(nogil=True, error_model="numpy", inline="always")
+def _unit(place: float, start: int, lists: np.ndarray, table: np.ndarray, column: int) -> float:
+    """Return the change of a value per unit of its latent, see :meth:`kissgs.finetuning.planes.Plane.units`."""
+    near = np.rint(place)
+    at = start + np.int64(near)
+    here = table[lists[at], column]
+    below, above = here - table[lists[at - 1], column], table[lists[at + 1], column] - here
+    down, up = below if below > 0 else above, above if above > 0 else below  # outside of either end
+    return down if place < near else up if place > near else (down + up) / 2
 
 
 @compiled(
-    "void(float64[:, ::1], float32[:, ::1], float64[:, ::1], float64[::1], float64[:, ::1], float64, int64, int64,"
+    "void(float64[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1], int64, int64,"
     " float32[:, ::1])"
 )
+def level_gradients(
+    base: Float64[np.ndarray, "R C"],
+    latents: Float32[np.ndarray, "R C"],
+    start: Int64[np.ndarray, "R _"],
+    lists: Int64[np.ndarray, " P"],
+    table: Float64[np.ndarray, "L _"],
+    gradient: Float64[np.ndarray, "R C"],  # by the values
+    first: int,
+    last: int,
+    v_latents: Float32[np.ndarray, "R C"],  # written
+) -> None:
+    """Write the gradients by the latents of rows ``first`` to before ``last``."""
+    for n in range(first, last):
+        for c in range(base.shape[1]):
+            own, column = start[n, c if start.shape[1] > 1 else 0], c if table.shape[1] > 1 else 0
+            v_latents[n, c] = gradient[n, c] * _unit(base[n, c] + latents[n, c], own, lists, table, column)
+
+
+@compiled(
+    "void(float64[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1], float64,"
+    " int64, int64, float32[:, ::1])"
+)
 def attract(
-    base: np.ndarray,
-    latents: np.ndarray,
-    stride: np.ndarray,
-    step: np.ndarray,
-    weights: np.ndarray,
+    base: Float64[np.ndarray, "R C"],
+    latents: Float32[np.ndarray, "R C"],
+    start: Int64[np.ndarray, "R _"],
+    lists: Int64[np.ndarray, " P"],
+    table: Float64[np.ndarray, "L _"],
+    weights: Float64[np.ndarray, "R 1"],  # curvature of the loss by the values
     factor: float,
     first: int,
     last: int,
-    gradient: np.ndarray,
+    gradient: Float32[np.ndarray, "R C"],  # changed
 ) -> None:
-    """Add the gradient of the quadratic attraction of each latent to its level, rows ``first`` to ``last`` (exclusive).
-
-    Args:
-        base, stride, step: attributes of an :class:`kissgs.finetuning.planes.EvenPlane`.
-        latents: ``(R, C)``.
-        weights: ``(R, 1)`` curvature of the loss by the values.
-        factor: factor of the attraction.
-        first: first row.
-        last: end of the rows, exclusive.
-        gradient: ``(R, C)`` gradient by the latents; changed.
-    """
-    per_channel = stride.shape[1] > 1
+    """Add the gradient of the quadratic attraction of latents to their levels, rows ``first`` to before ``last``."""
     for n in range(first, last):
         for c in range(base.shape[1]):
-            unit = step[c] * stride[n, c if per_channel else 0]
+            own, column = start[n, c if start.shape[1] > 1 else 0], c if table.shape[1] > 1 else 0
+            unit = _unit(base[n, c] + latents[n, c], own, lists, table, column)
             level = np.float32(np.rint(base[n, c] + latents[n, c]) - base[n, c])
             gradient[n, c] += np.float32(factor * weights[n, 0] * unit * unit) * (latents[n, c] - level)
 
@@ -106,27 +106,16 @@ def attract(
     "float64(float64[:, ::1], float32[:, ::1], int64[:, ::1], float32[::1], int64, int64, int64, float32[:, ::1])"
 )
 def level_bits(
-    base: np.ndarray,
-    latents: np.ndarray,
-    rows: np.ndarray,
-    table: np.ndarray,
-    symbols: int,
+    base: Float64[np.ndarray, "R C"],  # symbol of each level of the plan
+    latents: Float32[np.ndarray, "R C"],
+    rows: Int64[np.ndarray, "R C"],  # index of each level's code in ``table``
+    table: Float32[np.ndarray, " _"],  # bits of the symbols of all codes; between two symbols they are interpolated
+    symbols: int,  # number of symbols of a code; ``symbols + 1`` entries of ``table`` belong to it
     first: int,
-    last: int,
-    slopes: np.ndarray,
+    last: int,  # exclusive
+    slopes: Float32[np.ndarray, "R C"],  # written: gradient by the latents
 ) -> float:
-    """Return the bits of the levels of rows ``first`` to ``last`` (exclusive).
-
-    Args:
-        base: ``(R, C)`` symbol of each level of the plan.
-        latents: ``(R, C)``.
-        rows: ``(R, C)`` index of each level's code in ``table``.
-        table: bits of the symbols of all codes; between two symbols they are interpolated.
-        symbols: number of symbols of a code; ``symbols + 1`` entries of ``table`` belong to it.
-        first: first row.
-        last: end of the rows, exclusive.
-        slopes: out, ``(R, C)``, gradient by the latents.
-    """
+    """Return the bits of the levels of rows ``first`` to ``last`` (exclusive)."""
     total = 0.0
     for n in range(first, last):
         for c in range(base.shape[1]):
@@ -140,25 +129,15 @@ def level_bits(
 
 @compiled("void(float32[:, ::1], int64[::1], int64[::1], int64[::1], int64, int64, float32[:, ::1])")
 def sum_by_label(
-    rows: np.ndarray,
-    order: np.ndarray,
-    used: np.ndarray,
-    starts: np.ndarray,
+    rows: Float32[np.ndarray, "M C"],
+    order: Int64[np.ndarray, " M"],  # rows sorted by label
+    used: Int64[np.ndarray, " U"],  # labels that occur
+    starts: Int64[np.ndarray, " U+1"],  # start of each of these in ``order``, and the end
     first: int,
-    last: int,
-    totals: np.ndarray,
+    last: int,  # exclusive
+    totals: Float32[np.ndarray, "E C"],  # sums; rows are added
 ) -> None:
-    """Add up the rows of each label, of the labels ``used[first:last]``.
-
-    Args:
-        rows: ``(M, C)``.
-        order: ``(M,)`` rows sorted by label.
-        used: ``(U,)`` labels that occur.
-        starts: ``(U + 1,)`` start of each of these in ``order``, and the end.
-        first: first index into ``used``.
-        last: end of the indices, exclusive.
-        totals: ``(E, C)`` sums; rows are added.
-    """
+    """Add up the rows of each label, of the labels ``used[first:last]``."""
     for u in range(first, last):
         for i in range(starts[u], starts[u + 1]):
             for c in range(rows.shape[1]):

@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.core.progress import Pace
 from kissgs.finetuning import kernels
-from kissgs.finetuning.planes import EvenPlane, Plane, TablePlane
+from kissgs.finetuning.planes import Plane
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.planning.layout import Grid
 from kissgs.planning.rdo_quantize import UNUSED_COUNT
@@ -35,15 +35,11 @@ class CodebookRate:
     level are those of its difference from the entries beside and above it, in Laplace distributions: the mean of both
     differences, over ln 2 times the mean difference of its colour and coefficient. Only their derivative matters; the
     constant is left out.
-
-    Attributes:
-        table: ``(3, 15)`` float32, mean difference by colour and coefficient, plus :data:`DIFFERENCE_OFFSET`,
-            levels; the colours are red - green, green and blue - green.
     """
 
-    table: Float32[np.ndarray, "3 15"]
+    table: Float32[np.ndarray, "3 15"]  # mean difference plus DIFFERENCE_OFFSET of red - green, green and blue - green
 
-    def __init__(self, plane: EvenPlane) -> None:
+    def __init__(self, plane: Plane) -> None:
         """Prepare the rate of the codebook ``plane``, of S · S entries in row-major order."""
         self._base = plane.base_multiples.float()
         self._side = math.isqrt(len(self._base))
@@ -99,13 +95,13 @@ class RateLoss:
             plane = scene.planes[name]
             self._rates[name] = _LevelRate(plane, scene.classes, np.arange(plane.base_multiples.shape[1]))
         codebook = scene.planes["f_rest_centroids"]
-        if isinstance(codebook, EvenPlane):
+        if not scene.trained_tables:
             self._rates["f_rest_centroids"] = CodebookRate(codebook)
-        elif isinstance(codebook, TablePlane):
+        else:
             used = (codebook.min_latent < codebook.max_latent).any(dim=0).cpu().numpy()
             # An image has one code per colour, for all coefficients; those that are not stored get one of their own.
             colors = np.where(used, np.arange(len(used)) // COEFFICIENTS, 3)
-            self._rates["f_rest_centroids"] = _LevelRate(codebook, np.zeros(len(codebook.first), np.int64), colors)
+            self._rates["f_rest_centroids"] = _LevelRate(codebook, np.zeros(len(codebook.start), np.int64), colors)
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
         """Return the weighted bits of the current levels, but for a constant; ``parameters`` are not used."""
@@ -145,13 +141,7 @@ class TotalVariationLoss:
     """
 
     def __init__(self, scene: QuantizedScene, weight: float, pace: Pace) -> None:
-        """Prepare the loss.
-
-        Args:
-            scene: the scene that is trained.
-            weight: factor of the paper's weights.
-            pace: number of training steps.
-        """
+        """Prepare the loss."""
         self._scene, self._weight, self._pace = scene, weight, pace
         device = scene.latents["means"].device
         self._one, self._other = (torch.from_numpy(side).to(device) for side in _neighbours(scene.grid))
@@ -191,13 +181,9 @@ def _bytes(levels: Float64[Tensor, "M 3"]) -> tuple[Float64[Tensor, "M 3"], Floa
 
 
 class _LevelRate:
-    """Rate of the levels of one field.
+    """Rate of the levels of one field."""
 
-    Attributes:
-        table: ``(classes, channels, symbols + 1)`` float32, bits of each level; the last entry is repeated.
-    """
-
-    table: Float32[np.ndarray, "classes channels symbols"]
+    table: Float32[np.ndarray, "classes channels symbols"]  # bits of each level; the last entry is repeated
 
     def __init__(self, plane: Plane, classes: Int[np.ndarray, " M"], channels: Int[np.ndarray, " C"]) -> None:
         """Prepare the rate of ``plane``; rows of one of ``classes`` and columns of one of ``channels`` share a code."""

@@ -15,7 +15,7 @@ from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.finetuning.kernels import each_part, sum_by_label
-from kissgs.finetuning.planes import EvenPlane, planes_of
+from kissgs.finetuning.planes import planes_of
 from kissgs.planning import smallest_three
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoding_plan import EncodingPlan
@@ -32,17 +32,9 @@ SMALLEST_DIVISOR = 0.05
 """Smallest missing component of a rotation by which its gradient is divided."""
 
 
-def positions(logs: Float64[Tensor, "..."]) -> Float32[Tensor, "..."]:
-    """Return the positions of signed logarithms, sign(y) (e^|y| - 1): computed in float64, rounded to float32."""
-    return _SignedExp.apply(logs)  # type: ignore[no-untyped-call]
-
-
-def quaternions(small: Float64[Tensor, "M 3"], omitted: Int[Tensor, "M 1"]) -> Float32[Tensor, "M 4"]:
-    """Return quaternions of length 1 from three components and the index of the missing one, which is not negative."""
-    return _SmallestThree.apply(small, omitted)  # type: ignore[no-untyped-call]
-
-
 class _SignedExp(torch.autograd.Function):
+    """Positions of signed logarithms, sign(y) (e^|y| - 1): computed in float64, rounded to float32."""
+
     @staticmethod
     def forward(ctx: Any, y: Float64[Tensor, "..."]) -> Float32[Tensor, "..."]:  # noqa: ANN401
         x = torch.from_numpy(signed_exp(y.detach().cpu().numpy())).to(y.device)
@@ -57,6 +49,8 @@ class _SignedExp(torch.autograd.Function):
 
 
 class _SmallestThree(torch.autograd.Function):
+    """Quaternions of length 1 from three components and the index of the missing one, which is not negative."""
+
     @staticmethod
     def forward(ctx: Any, small: Float64[Tensor, "M 3"], omitted: Int[Tensor, "M 1"]) -> Float32[Tensor, "M 4"]:  # noqa: ANN401
         whole = smallest_three.whole(small.detach().cpu().numpy(), omitted[:, 0].cpu().numpy())
@@ -74,15 +68,7 @@ class _SmallestThree(torch.autograd.Function):
 
 
 class Labels:
-    """Codebook entry of each Gaussian.
-
-    Attributes:
-        entries: number of entries.
-        index: ``(M,)`` entry of each Gaussian.
-        order: ``(M,)`` Gaussians sorted by entry.
-        used: entries that occur, ascending.
-        starts: start of each of these in ``order``, and its end.
-    """
+    """Codebook entry of each Gaussian."""
 
     def __init__(self, labels: Int[np.ndarray, " M"], entries: int, device: Device) -> None:
         self.entries = entries
@@ -92,15 +78,9 @@ class Labels:
         self.starts = np.append(starts, len(labels))
 
 
-def look_up(entries: Float32[Tensor, "E K 3"], labels: Labels) -> Float32[Tensor, "M K 3"]:
-    """Return the codebook entry of each Gaussian.
-
-    On the CPU, gradients are summed in a fixed order, unlike those of torch's indexing.
-    """
-    return _LookUp.apply(entries, labels)  # type: ignore[no-untyped-call]
-
-
 class _LookUp(torch.autograd.Function):
+    """Codebook entry of each Gaussian. On the CPU, gradients are summed in a fixed order, unlike those of torch."""
+
     @staticmethod
     def forward(ctx: Any, entries: Float32[Tensor, "E K 3"], labels: Labels) -> Float32[Tensor, "M K 3"]:  # noqa: ANN401
         ctx.labels = labels
@@ -129,12 +109,11 @@ class _LookUp(torch.autograd.Function):
 
 # ``QuantizedScene``: the differentiable decoder of fine-tuning, from latents to levels to a scene.
 #
-# Every level has a latent, which is rounded to one of the levels that its row may use. Levels are even
-# (:class:`~kissgs.finetuning.planes.EvenPlane`) or stand for the values of a table
-# (:class:`~kissgs.finetuning.planes.TablePlane`), which is trained as well. The unit of a latent is the step size of
-# the row's sensitivity class. Rounding passes gradients straight through (Bengio et al. 2013): the gradient of a
-# decoded value becomes that of its latent. Order, rotation forms, labels and ranges are those of the plan; the images
-# that are written contain exactly the rounded levels.
+# Every level has a latent, which is rounded to one of the levels that its row may use
+# (:class:`~kissgs.finetuning.planes.Plane`). Free tables of values are trained as well. The unit of a latent is the
+# step size of the row's sensitivity class. Rounding passes gradients straight through (Bengio et al. 2013): the
+# gradient of a decoded value becomes that of its latent. Order, rotation forms, labels and ranges are those of the
+# plan; the images that are written contain exactly the rounded levels.
 #
 # Straight-through training alone does not converge: if the best value is between two levels, its latent oscillates
 # across the boundary and may end at the worse level. So a quadratic term attracts each latent to its current level,
@@ -147,14 +126,7 @@ ATTRIBUTE_FIELDS = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}
 
 
 class QuantizedScene:
-    """An encoding plan whose levels :func:`kissgs.training.loop.train` can fit.
-
-    Attributes:
-        planes: planes by field of the plan.
-        trained_tables: tables whose values are trained, by field; none for even levels.
-        classes: ``(M,)`` sensitivity class of each Gaussian.
-        grid: cell of each Gaussian.
-    """
+    """An encoding plan whose levels :func:`kissgs.training.loop.train` can fit."""
 
     def __init__(
         self, plan: EncodingPlan, sh_degree: int, device: Device = "cpu", container: ContainerModel = EVEN_LEVELS
@@ -191,12 +163,7 @@ class QuantizedScene:
         return {name: self.trained_tables[name].values(latents) for name, latents in self.table_latents.items()}
 
     def set_curvature(self, costs: Costs, loss_per_error: float) -> None:
-        """Set the curvature of the quadratic attraction, 0 before, to that of the loss.
-
-        Args:
-            costs: mean squared image error per squared unit of each attribute, ``(M,)`` each.
-            loss_per_error: derivative of the loss with respect to the mean squared image error.
-        """
+        """Set the curvature of the quadratic attraction, 0 before, from the loss per mean squared image error."""
         labels = self._labels
         # All SH basis functions have one norm, so a coefficient of shN costs as much as one of the base colour.
         entries = np.bincount(labels.index.cpu().numpy(), costs.color, labels.entries)
@@ -221,11 +188,11 @@ class QuantizedScene:
         values = {name: self.planes[name].values(latents, tables.get(name)) for name, latents in self.latents.items()}
         decoded = {name: values[field].float() for name, field in ATTRIBUTE_FIELDS.items()}
         if self._omitted is not None:
-            decoded["quats"] = quaternions(values["quaternions"], self._omitted)
+            decoded["quats"] = _SmallestThree.apply(values["quaternions"], self._omitted)  # type: ignore[no-untyped-call]
         coefficients = SH_REST_COUNTS[self._sh_degree]
         entries = values["f_rest_centroids"].float().reshape(-1, 3, COEFFICIENTS)[:, :, :coefficients]
-        decoded["shN"] = look_up(entries.transpose(1, 2).contiguous(), self._labels)
-        decoded["means"] = positions(values["means"])
+        decoded["shN"] = _LookUp.apply(entries.transpose(1, 2).contiguous(), self._labels)  # type: ignore[no-untyped-call]
+        decoded["means"] = _SignedExp.apply(values["means"])  # type: ignore[no-untyped-call]
         decoded["opacities"] = values["opacities"][:, 0].float()
         return decoded
 
@@ -241,9 +208,7 @@ class QuantizedScene:
     def step(self, rates: Mapping[str, float]) -> None:
         """Make an Adam step of the latents, with quadratic attraction, within the levels that the images can hold.
 
-        Args:
-            rates: learning rates by field and by :func:`table_name`, and ``"attraction"``: factor of the quadratic
-                attraction, 0 to 1.
+        ``rates`` has learning rates by field and :func:`table_name`, and the factor of the ``"attraction"``, 0 to 1.
         """
         rotations = self.latents["quaternions"].detach().clone() if self._omitted is not None else None
         if self._weights and rates["attraction"] > 0:
@@ -263,13 +228,7 @@ class QuantizedScene:
             tables = self.tables()
             for name, latents in self.latents.items():
                 if latents.grad is not None:
-                    plane = self.planes[name]
-                    if isinstance(plane, EvenPlane) and latents.device.type == "cpu":
-                        plane.add_attraction(latents.grad, latents, self._weights[name], factor)
-                        continue
-                    level = (torch.round(plane.base_multiples + latents) - plane.base_multiples).float()
-                    curvature = (self._weights[name] * plane.units(latents, tables.get(name)) ** 2).float()
-                    latents.grad += factor * curvature * (latents - level)
+                    self.planes[name].attract(latents.grad, latents, tables.get(name), self._weights[name], factor)
 
     def _keep_unit_length(self, former: Float32[Tensor, "M 3"]) -> None:
         """Take back a step after which the three components of a rotation leave no room for a fourth."""

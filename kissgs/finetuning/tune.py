@@ -70,34 +70,21 @@ Decode = Callable[..., Splats]
 
 @dataclass(slots=True, eq=False)
 class Tuner:
-    """Fine-tunes encoding plans of one scene.
+    """Fine-tunes encoding plans of one scene."""
 
-    Attributes:
-        original: the original scene, clean; its renderings are the targets if there are no photographs.
-        settings: settings of the training.
-        supervision: training and evaluation views.
-        targets: target images of the training views.
-        device: device that trains.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        progress: receives the stage "finetune", and then those of writing.
-        container: what the container can hold.
-        decode: decoder of the container.
-        deadline: time until which a container shall be finished: training makes as many steps as fit in, up to
-            :data:`MOST_STEPS` times the setting ``steps``. None for exactly that setting.
-        ending_seconds: expected time of what comes after the training, seconds; measured by the first container.
-    """
-
-    original: Splats
+    original: Splats  # the original scene, clean; its renderings are the targets if there are no photographs
     settings: FinetuneSettings
     supervision: SupervisionViews
     targets: TrainingTargets
     device: Device
     threads: int
-    progress: Progress
+    progress: Progress  # receives the stage "finetune", and then those of writing
     container: ContainerModel = EVEN_LEVELS
     decode: Decode = decode_sogxt
-    deadline: Deadline | None = None
-    ending_seconds: float = 0.0
+    deadline: Deadline | None = (
+        None  # until then training makes as many steps as fit in; None for those of the settings
+    )
+    ending_seconds: float = 0.0  # expected time of what comes after the training; measured by the first container
 
     @classmethod
     def of(
@@ -117,10 +104,6 @@ class Tuner:
         """Prepare the targets: photographs of ``views``, or renderings of the original from virtual cameras.
 
         ``prepared`` are views and targets that exist already for these settings.
-
-        Raises:
-            InvalidViewsError: a photograph cannot be read.
-            UnsupportedError: an image would take too much memory.
         """
         if prepared is None:
             views_by_role = supervision_views(
@@ -138,20 +121,10 @@ class Tuner:
         write: Write,
         checkpoint: Path | None = None,
     ) -> tuple[Encoded, FinetuneReport]:
-        """Fine-tune, and return the better container with a report: the tuned one, or that of ``plan``.
+        """Fine-tune from ``start``, and return the better container with a report: the tuned one, or that of ``plan``.
 
-        Args:
-            plan: plan of the container without fine-tuning, with at least one Gaussian; None where the training is part
-                of that of the scene, so that no such container is made.
-            start: plan from which training starts: ``plan``, or one with fewer Gaussians, at least one.
-            scene: the scene of both plans.
-            write: writes the files of a plan.
-            checkpoint: file for the state of the training, saved every half minute. If it exists and belongs to this
-                work, training continues from it.
-
-        Raises:
-            InvalidViewsError: a photograph cannot be read.
-            OutputError: ``checkpoint`` belongs to other work.
+        Without ``plan``, the training is part of that of the scene, and no container is made before it. If the file
+        ``checkpoint`` exists and belongs to this work, training continues from it.
         """
         started = time.perf_counter()
         as_finetune = as_stage("finetune", self.progress)
@@ -170,40 +143,31 @@ class Tuner:
             pace = Pace(most, self.deadline.earlier(self.ending_seconds))
             pace.update(0)
         if before is not None and first is not None and pace.steps == 0:
-            return before, self._untuned(first, started)
+            return before, self._report(0, first, first, started, kept=False, notes=[NO_TIME])
         tuned, checkpoint_note = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, pace, checkpoint)
         trained = time.perf_counter()
         after = write(tuned, pace.steps, self.progress)
         second = self._evaluate(after, self._report_images_done)
         self.ending_seconds = time.perf_counter() - trained
         kept = first is None or second.cost(rd_lambda) < first.cost(rd_lambda)
-        report = FinetuneReport(
-            steps=pace.steps,
-            target_source=self.targets.target_source,
-            source=self.supervision.source,
-            psnr_before=None if first is None else first.psnr,
-            psnr_after=second.psnr,
-            bytes_before=None if first is None else first.bytes,
-            bytes_after=second.bytes,
-            kept=kept,
-            seconds=time.perf_counter() - started,
-            note="; ".join(filter(None, [self.supervision.note, "" if kept else NOT_KEPT, checkpoint_note])),
-        )
+        notes = ["" if kept else NOT_KEPT, checkpoint_note]
+        report = self._report(pace.steps, first, second, started, kept=kept, notes=notes)
         return (after if kept or before is None else before), report
 
-    def _untuned(self, result: _Result, started: float) -> FinetuneReport:
-        """Return the report where no training step fits into the time."""
+    def _report(
+        self, steps: int, before: _Result | None, after: _Result, started: float, *, kept: bool, notes: list[str]
+    ) -> FinetuneReport:
         return FinetuneReport(
-            steps=0,
+            steps=steps,
             target_source=self.targets.target_source,
             source=self.supervision.source,
-            psnr_before=result.psnr,
-            psnr_after=result.psnr,
-            bytes_before=result.bytes,
-            bytes_after=result.bytes,
-            kept=False,
+            psnr_before=None if before is None else before.psnr,
+            psnr_after=after.psnr,
+            bytes_before=None if before is None else before.bytes,
+            bytes_after=after.bytes,
+            kept=kept,
             seconds=time.perf_counter() - started,
-            note="; ".join(filter(None, [self.supervision.note, NO_TIME])),
+            note="; ".join(filter(None, [self.supervision.note, *notes])),
         )
 
     def _report_images_done(self, stage: str, fraction: float, note: str = "") -> None:
@@ -261,7 +225,7 @@ class Tuner:
             stage="finetune",
             pace=pace,
             rates=_lr_schedule(settings, self.targets),
-            ssim_weight=settings.used_ssim_weight,
+            ssim_weight=settings.ssim_weight,
             mse_weight=settings.mse_weight,
             seed=(settings.seed,),
             regularizers=(rate_loss, TotalVariationLoss(scene, settings.tv_weight, pace)),
@@ -285,7 +249,7 @@ class Tuner:
                     parameters,
                     self.targets,
                     n,
-                    ssim_weight=settings.used_ssim_weight,
+                    ssim_weight=settings.ssim_weight,
                     mse_weight=0.0,
                     antialiased=scene.antialiased,
                     threads=self.threads,
@@ -317,9 +281,8 @@ class Tuner:
         settings = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {plan.rd_lambda} "
         key = hashlib.sha256(f"{settings}{targets.synthetic} {targets.synthetic_per_epoch}".encode())
         for name, field in plan.fields.items():
-            key.update(f"{name} {field.top} {field.level_offset} {field.levels.shape}".encode())
-            table = np.zeros(0) if field.table is None else field.table
-            for array in (field.levels, field.low, field.high, np.asarray(field.level_stride), table):
+            key.update(f"{name} {field.level_offset} {field.levels.shape} {field.table.shape}".encode())
+            for array in (field.levels, field.table, np.asarray(field.level_stride)):
                 key.update(array.tobytes())
         for array in (plan.codebook.labels, plan.classes, plan.grid.mask):
             key.update(array.tobytes())

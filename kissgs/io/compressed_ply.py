@@ -47,13 +47,7 @@ def is_compressed(header: Header) -> bool:
 
 
 def check_compressed(ply: PlyFile) -> int:
-    """Check everything except the values, without reading them, and return the scene's SH degree.
-
-    Raises:
-        InvalidSceneError: an element or property is missing or of another type, the elements' counts are inconsistent,
-            or the file is cut short.
-        UnsupportedError: the file is ascii, which no tool writes.
-    """
+    """Check everything except the values, without reading them, and return the scene's SH degree."""
     elements = ply.header.elements
     if ply.header.encoding == "ascii":
         raise UnsupportedError(f"{ply.name} is a compressed .ply in ascii; export it as binary")
@@ -174,16 +168,7 @@ def _require(ply: PlyFile, element: Element, names: tuple[str, ...], code: str) 
 
 
 def write_compressed(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
-    """Write a clean scene in Morton order, so that the 256 Gaussians of a chunk are close to one another.
-
-    Args:
-        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
-        splats: The scene, cleaned.
-        progress: Receives events of stage ``write``.
-
-    Returns:
-        What the format cannot hold, one phrase each.
-    """
+    """Write a clean scene in Morton order, so that the 256 Gaussians of a chunk are close to one another."""
     n, k = len(splats), splats.shN.shape[1]
     order = morton_order(splats.means)
     chunks = np.empty((-(-n // _CHUNK), 18), "<f4")

@@ -25,6 +25,10 @@ MAX_VALUES = 1 << 18
 """Largest number of values in a document: each takes up to 240 bytes of memory. A primitive of glTF has some 400, the
 metadata of a container a thousand."""
 
+MAX_DEPTH = 200
+"""Largest nesting of lists and objects, also of ``web_decoder/container.js``: parsers end at different depths. The tree
+of a streamed scene has two levels for each of its own."""
+
 
 def parse_json(
     data: bytes,
@@ -36,23 +40,32 @@ def parse_json(
 ) -> Any:  # noqa: ANN401
     """Parse JSON; NaN and Infinity are refused, as browsers refuse them.
 
-    Args:
-        data: the document, UTF-8.
-        name: name of the file, for messages.
-        most: largest number of values, lists and objects, checked before any is built. Commas and brackets in texts
-            count as well.
-        parse_int: converts whole numbers.
-        error: class of the errors.
-
-    Raises:
-        KissgsError: it is not JSON, or has too many values.
+    The number of values is bounded before any is built, so commas and brackets in texts count as well.
     """
     if 1 + data.count(b",") + data.count(b"[") + data.count(b"{") > most:
         raise error(f"{name} has more than {most:,} values, which is the limit; export the scene again")
     try:
-        return json.loads(data.decode("utf-8-sig"), parse_int=parse_int, parse_constant=_refuse_constant)
+        document = json.loads(data.decode("utf-8-sig"), parse_int=parse_int, parse_constant=_refuse_constant)
+        _check_depth(document)
     except (ValueError, RecursionError) as problem:
         raise error(f"{name} is not readable JSON; export the scene again") from problem
+    return document
+
+
+def whole_number(value: object, least: int, most: int) -> int | None:
+    """Return a whole number of JSON, which may be written 8.0, within bounds; None for anything else."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return value if isinstance(value, int) and not isinstance(value, bool) and least <= value <= most else None
+
+
+def _check_depth(document: object) -> None:
+    level = [document]
+    for _ in range(MAX_DEPTH + 1):
+        nested = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
+        level = [value for values in nested for value in values]
+    if any(isinstance(each, dict | list) for each in level):
+        raise ValueError(f"nested more than {MAX_DEPTH} deep")
 
 
 def _refuse_constant(name: str) -> NoReturn:
@@ -67,11 +80,7 @@ BLOCK = 4096
 
 @contextlib.contextmanager
 def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[BinaryIO]:
-    """Open a binary file that replaces ``path`` when the block succeeds, and is deleted when it fails.
-
-    Raises:
-        OutputError: ``path`` exists and ``overwrite`` is false, or the file system refuses.
-    """
+    """Open a binary file that replaces ``path`` when the block succeeds, and is deleted when it fails."""
     refuse_existing(path, overwrite=overwrite)
     temporary: Path | None = None
     try:
@@ -91,11 +100,7 @@ def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[BinaryIO]:
 
 
 def move_into_place(made: Path, path: Path) -> None:
-    """Rename a complete file or folder to ``path`` on the same file system, replacing what is there.
-
-    Raises:
-        OutputError: the file system refuses; what was there stays.
-    """
+    """Rename a complete file or folder to ``path`` on the same file system, replacing what is there: all or nothing."""
     old: Path | None = None
     try:
         if path.is_dir():
@@ -131,11 +136,7 @@ def check_writable(path: Path) -> None:
 
 
 def path_state(path: Path) -> tuple[bool, bool]:
-    """Return whether ``path`` exists, and whether it is a folder.
-
-    Raises:
-        OutputError: the parent folder does not exist, or the name is invalid.
-    """
+    """Return whether ``path`` exists, and whether it is a folder."""
     try:
         present, folder, above = False, path.is_dir(), path.absolute().parent.is_dir()
         with contextlib.suppress(FileNotFoundError):
@@ -177,11 +178,7 @@ class SceneFile:
     size: int
 
     def read(self, offset: int, count: int) -> bytes:
-        """Return ``count`` bytes at ``offset``.
-
-        Raises:
-            InvalidSceneError: the file ends before.
-        """
+        """Return ``count`` bytes at ``offset``."""
         if offset + count > self.size:
             raise self.cut_short(offset + count)
         self.file.seek(offset)
@@ -191,11 +188,7 @@ class SceneFile:
         return data
 
     def read_into(self, offset: int, array: np.ndarray) -> None:
-        """Fill ``array``, which is contiguous, with the bytes at ``offset``.
-
-        Raises:
-            InvalidSceneError: the file ends before.
-        """
+        """Fill ``array``, which is contiguous, with the bytes at ``offset``."""
         target: UInt8[np.ndarray, " bytes"] = array.view(np.uint8).reshape(-1)
         self.file.seek(offset)
         if self.file.readinto(target.data) < target.size:
@@ -218,11 +211,7 @@ class BinaryWriter(Protocol):
 
 @contextlib.contextmanager
 def open_scene_file(source: Path | bytes, remedy: str = "name a scene file") -> Iterator[SceneFile]:
-    """Open a file, or the bytes of one; ``remedy`` is what to do where there is no file, for messages.
-
-    Raises:
-        InvalidSceneError: the file cannot be read.
-    """
+    """Open a file, or the bytes of one; ``remedy`` is what to do where there is no file, for messages."""
     if isinstance(source, bytes):
         yield SceneFile("the data", io.BytesIO(source), len(source))
         return

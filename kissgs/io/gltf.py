@@ -19,13 +19,13 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.origin import WORLD, from_world, origin_for
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
-from kissgs.io.conventions import Signs, log_scales, mirror, move, opacity_logits, steps
+from kissgs.io.conventions import log_scales, mirror, move, opacity_logits, steps
 from kissgs.io.files import listed, marked, open_scene_file, refuse_more_than
-from kissgs.io.gltf_document import GLB_MAGIC, Document, node_matrix
+from kissgs.io.gltf_document import EXTENSION, GLB_MAGIC, SPZ_EXTENSIONS, TO_PLY, Document, node_matrix
+from kissgs.io.gltf_writer import write_glb, write_spz_glb
+from kissgs.io.scene_format import Codec, Facts, Match, titled
 from kissgs.io.spz import largest_spz, read_spz, read_spz_info
 
-EXTENSION = "KHR_gaussian_splatting"
-SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
 INSTANCING, VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
 
 _COMPRESSIONS = ("EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_draco_mesh_compression")
@@ -50,27 +50,6 @@ _MAX_INSTANCES = 1000
 _MAX_ATTRIBUTES = 100
 """Largest number of attributes of a primitive; a scene of SH degree 3 has 21."""
 
-TO_PLY: Signs = (-1, -1, 1)
-"""Signs from glTF's axes to those of a ``.ply``."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GltfInfo:
-    """Properties of a scene that its JSON states."""
-
-    count: int
-    """Number of Gaussians."""
-    sh_degree: int
-    """SH degree, 0 to 3; the highest of all primitives."""
-    primitives: int
-    """Number of primitives, each counted at every node that shows it."""
-    binary: bool
-    """Whether it is GLB."""
-    spz: bool
-    """Whether attributes are compressed as ``.spz``."""
-    antialiased: bool = False
-    """Whether the ``.spz`` inside say that the scene was trained with antialiasing."""
-
 
 @dataclass(frozen=True, slots=True)
 class _Primitive:
@@ -84,41 +63,34 @@ class _Primitive:
     antialiased: bool = False
 
 
-def read_gltf_info(source: Path | bytes) -> GltfInfo:
-    """Read the JSON, and the headers of ``.spz`` inside.
+def _sniff(head: bytes, size: int) -> Match:
+    start = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    is_text = start.startswith(b"{") and not any(byte < 32 and byte not in b"\t\r\n" for byte in start)
+    return Match.SURE if head.startswith(GLB_MAGIC) else Match.POSSIBLE if is_text else Match.NO
 
-    Raises:
-        InvalidSceneError: as for :func:`read_gltf`.
-        UnsupportedError: as for :func:`read_gltf`.
-    """
+
+def describe(source: Path | bytes, level: int = 0) -> Facts:
+    """Read the JSON, and the headers of ``.spz`` inside."""
     with open_scene_file(source) as opened:
         binary = opened.file.read(4) == GLB_MAGIC
         document = Document(opened, None if isinstance(source, bytes) else source.parent)
         found = list(_primitives(document, {}))
-    return GltfInfo(
+    spz = any(primitive.spz is not None for primitive in found)
+    antialiased = all(primitive.antialiased for primitive in found)
+    kinds = ("GLB" if binary else "JSON", "compressed as SPZ" if spz else "", "antialiased" if antialiased else "")
+    return Facts(
+        title=titled("glTF scene", *kinds),
         count=sum(primitive.count for primitive in found),
         sh_degree=max(primitive.degree for primitive in found),
-        primitives=len(found),
-        binary=binary,
-        spz=any(primitive.spz is not None for primitive in found),
-        antialiased=all(primitive.antialiased for primitive in found),
+        details={"binary": binary, "primitives": len(found), "spz": spz, "antialiased": antialiased},
     )
 
 
 def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
     """Read a scene without cleaning it. Primitives of a lower SH degree get zeros for the coefficients above it.
 
-    What the scene has beyond Gaussians is named in ``notes``; so are hidden nodes, which are left out too.
-
-    Args:
-        source: A ``.glb`` or ``.gltf`` file, or the bytes of one. Buffers in other files must be below its folder.
-        max_gaussians: Largest number of Gaussians; more are refused before memory is allocated. None: no limit.
-        progress: Receives events of stage ``read``.
-
-    Raises:
-        InvalidSceneError: the file cannot be read, is not valid glTF, or has no Gaussians.
-        UnsupportedError: a required extension that is unknown, another kernel or colour space, an unknown compression,
-            a node that stretches or mirrors, or more Gaussians than ``max_gaussians``.
+    What the scene has beyond Gaussians is named in ``notes``; so are hidden nodes, which are left out too. Buffers in
+    other files must be below the folder of the scene.
     """
     with open_scene_file(source) as opened:
         document = Document(opened, None if isinstance(source, bytes) else source.parent)
@@ -151,12 +123,7 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
 
 
 def _primitives(document: Document, left_out: dict[str, None]) -> Iterator[_Primitive]:
-    """Yield the primitives that hold Gaussians; add what else the scene has to the keys of ``left_out``.
-
-    Raises:
-        InvalidSceneError: there is none.
-        UnsupportedError: the file requires an extension that is not read.
-    """
+    """Yield the primitives that hold Gaussians; add what else the scene has to the keys of ``left_out``."""
     _check_required(document)
     left_out |= dict.fromkeys(key for key in ("animations", "skins") if document.items(key))
     left_out |= dict.fromkeys(f"extension {name[:60]}" for name in _extensions(document, "extensionsUsed"))
@@ -403,3 +370,17 @@ def _turn_to_ply(splats: Splats) -> None:
     w, x, y, z = (splats.quats[:, i].copy() for i in range(4))
     for i, values in enumerate((z, -y, x, -w)):
         splats.quats[:, i] = values
+
+
+FORMAT = Codec(
+    sniff=_sniff,
+    info=describe,
+    read=lambda source, reading, threads, progress: read_gltf(
+        source, max_gaussians=reading.max_compressed, progress=progress
+    ),
+    write={
+        ".glb": lambda file, splats, raw_axes, progress: write_glb(file, splats, progress=progress),
+        ".spz.glb": lambda file, splats, raw_axes, progress: write_spz_glb(file, splats, progress=progress),
+    },
+    records_origin=True,
+)

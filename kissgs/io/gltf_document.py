@@ -15,9 +15,16 @@ import numpy as np
 from kissgs.core.array_types import Float64, Shaped
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.io.containers import is_below
-from kissgs.io.files import SceneFile, open_scene_file, parse_json
+from kissgs.io.conventions import Signs
+from kissgs.io.files import SceneFile, open_scene_file, parse_json, whole_number
 
 GLB_MAGIC = b"glTF"
+
+EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
+
+TO_PLY: Signs = (-1, -1, 1)
+"""Signs from glTF's axes to those of a ``.ply``."""
 
 MAX_JSON_BYTES = 1 << 22
 """Largest size of the JSON in a GLB; a primitive of a scene takes some kilobytes."""
@@ -82,10 +89,8 @@ class Document:
 
     def whole(self, parent: dict[str, Any], key: str, default: int = 0) -> int:
         """Return a whole number that is not negative."""
-        found = parent.get(key, default)
-        if isinstance(found, float) and found.is_integer():
-            found = int(found)
-        if not isinstance(found, int) or isinstance(found, bool) or not 0 <= found < 1 << 53:
+        found = whole_number(parent.get(key, default), 0, (1 << 53) - 1)
+        if found is None:
             raise self.invalid(f"{key} is not a whole number")
         return found
 

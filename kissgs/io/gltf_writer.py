@@ -23,8 +23,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.io.conventions import colors_of, note_mark, opacities_of, sh_signs, steps, to_bytes
 from kissgs.io.files import BinaryWriter
-from kissgs.io.gltf import EXTENSION, SPZ_EXTENSIONS, TO_PLY
-from kissgs.io.gltf_document import GLB_MAGIC
+from kissgs.io.gltf_document import EXTENSION, GLB_MAGIC, SPZ_EXTENSIONS, TO_PLY
 from kissgs.io.spz import decode_positions, encode_positions, fractional_bits_for, write_spz
 
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
@@ -51,16 +50,7 @@ class _Attribute:
 
 
 def write_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
-    """Write a clean scene in glTF's axes (x left, y up, z forward); return what the format cannot hold.
-
-    Args:
-        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
-        splats: The scene, cleaned.
-        progress: Receives events of stage ``write``.
-
-    Raises:
-        UnsupportedError: the scene has no Gaussians, which glTF does not allow, or takes 4 GiB or more.
-    """
+    """Write a clean scene in glTF's axes (x left, y up, z forward); return what the format cannot hold."""
     count = _count(splats, ".glb")
     attributes = list(_attributes(splats))
     body = count * sum(attribute.row_bytes for attribute in attributes)
@@ -89,14 +79,6 @@ def write_spz_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = si
 
     The ``.spz`` has its own axes (x right, y up, z back), as the extension wants it, whose text has the library of
     ``.spz`` turn them from and to those of glTF. Accessors have types and counts, and no data.
-
-    Args:
-        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
-        splats: The scene, cleaned.
-        progress: Receives events of stage ``write``.
-
-    Raises:
-        UnsupportedError: the scene has no Gaussians, or takes 4 GiB or more.
     """
     count = _count(splats, ".glb")
     packed = io.BytesIO()  # its size stands before it
@@ -120,22 +102,14 @@ def _in_gltf(origin: Origin) -> list[float]:
 
 
 def _count(splats: Splats, ending: str) -> int:
-    """Return the number of Gaussians.
-
-    Raises:
-        UnsupportedError: there are none, which glTF does not allow.
-    """
+    """Return the number of Gaussians."""
     if not len(splats):
         raise UnsupportedError(f"a scene without Gaussians cannot be written as {ending}; write it as .ply")
     return len(splats)
 
 
 def _write_head(file: BinaryWriter, count: int, text: bytes, body: int) -> None:
-    """Write all that stands before the ``body`` bytes of the buffer.
-
-    Raises:
-        UnsupportedError: the file would have 4 GiB or more.
-    """
+    """Write all that stands before the ``body`` bytes of the buffer."""
     body += -body % 4
     size = 12 + 8 + len(text) + 8 + body
     if size > _MAX_BYTES:

@@ -18,6 +18,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.conventions import OPACITY_OF_BYTE, SH0_OF_BYTE, log_scales
 from kissgs.io.files import SceneFile, open_scene_file, refuse_more_than
+from kissgs.io.scene_format import Codec, Facts, Match, titled
 
 MAIN_BYTES, SECTION_BYTES = 4096, 1024
 
@@ -36,20 +37,6 @@ _SH = ("<f4", "<f2", "u1")
 _DEFAULT_RANGE = (1, 32767, 32767)
 _DEFAULT_SH_RANGE = (-1.5, 1.5)
 _BLOCK = 1 << 14
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KsplatInfo:
-    """Properties of a scene that the headers of its file state."""
-
-    count: int
-    """Number of Gaussians."""
-    sh_degree: int
-    """SH degree, 0 to 3; the highest of all sections."""
-    level: int
-    """Compression level, 0 to 2."""
-    sections: int
-    """Number of sections."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,39 +70,29 @@ class _Headers:
         return max((section.degree for section in self.sections), default=0)
 
 
-def is_ksplat(head: bytes, size: int) -> bool:
-    """Whether the first 24 bytes of a file of ``size`` bytes are those of a ``.ksplat``, which has no magic number."""
+def _sniff(head: bytes, size: int) -> Match:
+    """Compare the first 24 bytes with what a header, which has no magic number, may hold."""
     if size < MAIN_BYTES or len(head) < 24 or head[:4] != b"\0\1\0\0":
-        return False
+        return Match.NO
     most, sections, most_splats, splats, level = struct.unpack_from("<IIIIH", head, 4)
-    return 0 < sections <= most <= size // SECTION_BYTES and splats <= most_splats <= size // 24 and level <= 2
+    fits = 0 < sections <= most <= size // SECTION_BYTES and splats <= most_splats <= size // 24 and level <= 2
+    return Match.LIKELY if fits else Match.NO
 
 
-def read_ksplat_info(source: Path | bytes) -> KsplatInfo:
-    """Read the headers and check them against the file's size.
-
-    Raises:
-        InvalidSceneError: as for :func:`read_ksplat`.
-        UnsupportedError: as for :func:`read_ksplat`.
-    """
-    with open_scene_file(source) as opened:
+def describe(path: Path | bytes, level: int = 0) -> Facts:
+    """Read the headers and check them against the file's size."""
+    with open_scene_file(path) as opened:
         headers = _read_headers(opened)
-        sections = len(headers.sections)
-        return KsplatInfo(count=headers.count, sh_degree=headers.degree, level=headers.level, sections=sections)
+    return Facts(
+        title=titled(".ksplat scene", f"compression level {headers.level}"),
+        count=headers.count,
+        sh_degree=headers.degree,
+        details={"compression_level": headers.level, "sections": len(headers.sections)},
+    )
 
 
 def read_ksplat(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
-    """Read a scene without cleaning it. Sections of a lower SH degree get zeros for the coefficients above it.
-
-    Args:
-        source: A file, or the bytes of one.
-        max_gaussians: Largest number of Gaussians; more are refused before memory is allocated. None: no limit.
-        progress: Receives events of stage ``read``.
-
-    Raises:
-        InvalidSceneError: the file cannot be read, is damaged or cut short.
-        UnsupportedError: another version or compression level, or more Gaussians than ``max_gaussians``.
-    """
+    """Read a scene without cleaning it. Sections of a lower SH degree get zeros for the coefficients above it."""
     with open_scene_file(source) as opened:
         headers = _read_headers(opened)
         count = headers.count
@@ -249,3 +226,12 @@ def _decode_rest(
         values *= np.float32((high - low) / 255)
         values += np.float32(low)
     out[:, :width] = values.reshape(len(rows), width, 3)
+
+
+FORMAT = Codec(
+    sniff=_sniff,
+    info=describe,
+    read=lambda source, reading, threads, progress: read_ksplat(
+        source, max_gaussians=reading.max_gaussians, progress=progress
+    ),
+)

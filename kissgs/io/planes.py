@@ -54,11 +54,6 @@ def effort_of(shape: tuple[int, ...], quality: int, method: int) -> tuple[int, i
 
     Large images take less effort where it saves next to nothing (docs/benchmarks.md), unless the settings ask for more
     than :data:`USUAL_EFFORT`. Those of one channel even become smaller with a lower quality.
-
-    Args:
-        shape: height, width, channels.
-        quality: 0 to 100.
-        method: 0 to 6.
     """
     height, width, channels = shape
     if height * width < LARGE or quality > USUAL_EFFORT[0] or method > USUAL_EFFORT[1]:

@@ -14,7 +14,7 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.origin import WORLD, Origin, from_world, in_world, origin_for, world_positions
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats, sampled_rows
-from kissgs.io.compressed_ply import PACKED, check_compressed, is_compressed, read_compressed
+from kissgs.io.compressed_ply import PACKED, check_compressed, is_compressed, read_compressed, write_compressed
 from kissgs.io.files import BinaryWriter, listed, refuse_more_than
 from kissgs.io.ply_rows import (
     MIP_COMMENT,
@@ -27,6 +27,7 @@ from kissgs.io.ply_rows import (
     rows,
     sh_degree,
 )
+from kissgs.io.scene_format import Codec, Facts, Match, titled
 
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
@@ -96,16 +97,6 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
     coefficients. The filters of Mip-Splatting, ``filter_3D``, are applied to scales and opacities. Elements and
     properties that are unknown are left out and named in ``notes``; bytes after the end are ignored.
     Needs some megabytes of memory besides the scene itself.
-
-    Args:
-        source: A file, or the bytes of one.
-        max_gaussians: Largest number of Gaussians; more are refused before memory is allocated. None: no limit.
-        progress: Receives events of stage ``read``.
-
-    Raises:
-        InvalidSceneError: the file cannot be read, is not a PLY file, is damaged or cut short, or has no Gaussians.
-        UnsupportedError: 2D Gaussians, Gaussians that move, an SH degree above 3, lists before or among the Gaussians,
-            or more Gaussians than ``max_gaussians``.
     """
     with open_ply(source) as ply:
         info = _check(ply)
@@ -140,16 +131,11 @@ def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Sp
                 progress("read", done / info.count)
 
 
-def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> None:
+def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
     Positions are those of the world: float64 (``property double``) where float32 cannot hold them. An antialiased scene
     is marked by a comment, :data:`kissgs.io.ply_rows.MIP_COMMENT`.
-
-    Args:
-        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
-        splats: The scene; its float32 values are written bit-identically, except positions relative to an origin.
-        progress: Receives events of stage ``write``.
     """
     splats = in_world(splats)
     wide = _POSITION if splats.origin != WORLD else ()
@@ -165,6 +151,7 @@ def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent
         table = np.concatenate([part.means, normals, part.sh0, rest, opacities, part.scales, part.quats], axis=1)
         file.write((_with_doubles(part, table) if wide else table.astype("<f4", copy=False)).data)
         progress("write", min(1.0, (start + _WRITE_ROWS) / n))
+    return ()
 
 
 def _with_doubles(splats: Splats, table: Float32[np.ndarray, "B F"]) -> np.ndarray:
@@ -334,3 +321,27 @@ def _colour_to_sh(colour: Float32[np.ndarray, "N 3"]) -> None:
     colour /= 255
     colour -= 0.5
     colour /= np.float32(SH_C0)
+
+
+def _sniff(head: bytes, size: int) -> Match:
+    return Match.SURE if head[:3] == b"ply" and head[3:4].isspace() else Match.NO
+
+
+def _describe(path: Path | bytes, level: int) -> Facts:
+    found = read_ply_info(path)
+    kinds = (found.encoding, "compressed" if found.compressed else "", "antialiased" if found.antialiased else "")
+    details = {"encoding": found.encoding, "compressed": found.compressed, "antialiased": found.antialiased}
+    return Facts(title=titled("3DGS scene", *kinds), count=found.count, sh_degree=found.sh_degree, details=details)
+
+
+FORMAT = Codec(
+    sniff=_sniff,
+    info=_describe,
+    read=lambda source, reading, threads, progress: read_ply(
+        source, max_gaussians=reading.max_gaussians, progress=progress
+    ),
+    write={
+        ".ply": lambda file, splats, raw_axes, progress: write_ply(file, splats, progress=progress),
+        ".compressed.ply": lambda file, splats, raw_axes, progress: write_compressed(file, splats, progress=progress),
+    },
+)

@@ -125,9 +125,6 @@ def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFi
     """Open a file, or the bytes of one, and parse the header. The body is not read.
 
     ``size`` is that of the whole file if ``source`` is only its beginning.
-
-    Raises:
-        InvalidSceneError: the file cannot be read, or it has no valid PLY header.
     """
     with open_scene_file(source) as opened:
         header = _read_header(opened.file, opened.name)
@@ -135,12 +132,7 @@ def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFi
 
 
 def sh_degree(element: Element, name: str) -> int:
-    """Return the SH degree of the ``f_rest_*`` properties of ``element``; ``name`` is the file's, for messages.
-
-    Raises:
-        UnsupportedError: the degree is above 3.
-        InvalidSceneError: their number fits no degree, or one is missing.
-    """
+    """Return the SH degree of the ``f_rest_*`` properties of ``element``; ``name`` is the file's, for messages."""
     rest = {p.name for p in element.properties if re.fullmatch(r"f_rest_[0-9]+", p.name)}
     count = len(rest)
     missing = [f"f_rest_{i}" for i in range(count) if f"f_rest_{i}" not in rest]
@@ -297,12 +289,7 @@ _NAN = re.compile(r"(?<!\S)[+-]?(nan(\([^\s()]*\)|[qs])|[qs]nan|1\.#[a-z]+\d*(e[
 
 
 def check_complete(ply: PlyFile, element: Element) -> None:
-    """Check that the file is large enough for all rows of ``element``, before memory for them is allocated.
-
-    Raises:
-        InvalidSceneError: the file ends before the last row does.
-        UnsupportedError: a list property makes the positions of the rows unknown.
-    """
+    """Check that the file is large enough for all rows of ``element``, before memory for them is allocated."""
     if any(p.is_list for p in element.properties):
         raise UnsupportedError(f"{ply.name} has a list property in element {element.name!r}; export it without")
     if ply.header.encoding == "ascii":
@@ -318,9 +305,6 @@ def rows(ply: PlyFile, element: Element) -> Iterator[np.ndarray]:
     """Yield all rows of ``element``, in order, as structured arrays with one field per property.
 
     The fields have the types of the file; in ascii files all are float64. Each block is overwritten by the next.
-
-    Raises:
-        InvalidSceneError: the file ends too soon, or a line of an ascii file is not a row of numbers.
     """
     return _ascii_rows(ply, element) if ply.header.encoding == "ascii" else _binary_rows(ply, element)
 

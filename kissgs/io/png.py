@@ -21,11 +21,7 @@ def is_png(data: bytes) -> bool:
 
 
 def probe_png(data: bytes, name: str) -> tuple[int, int]:
-    """Return width and height in pixels, from the header alone.
-
-    Raises:
-        InvalidContainerError: the header is damaged, or of 16 bits per channel.
-    """
+    """Return width and height in pixels, from the header alone."""
     if len(data) < len(_MAGIC) + _HEADER.size or data[12:16] != b"IHDR":
         raise InvalidContainerError(f"{name} is damaged: its PNG header is missing; export the scene again")
     _, _, width, height, depth = _HEADER.unpack_from(data, len(_MAGIC))
@@ -38,9 +34,6 @@ def decode_png(data: bytes, name: str, channels: int) -> UInt8[np.ndarray, "pixe
     """Decompress one image, whose size has been checked, to rows of pixels of its first 3 or 4 channels.
 
     Grey images and those with a palette, to which tools for smaller PNG turn others, become what they stand for.
-
-    Raises:
-        InvalidContainerError: the image is damaged.
     """
     try:
         with PngImagePlugin.PngImageFile(io.BytesIO(data)) as image_file:

@@ -17,8 +17,7 @@ from kissgs.io.files import atomic_file, reason_of, refuse_existing
 def read_sensitivity(path: Path, key: str) -> Sensitivity | None:
     """Read what :func:`write_sensitivity` has written with ``key``; None if the file is missing or has another key.
 
-    Raises:
-        OutputError: ``path`` is another file, which must not be replaced, or cannot be written.
+    Any other file is refused, because it would be replaced.
     """
     refuse_existing(path, overwrite=True)  # before the measurement, whose result is written there
     try:
@@ -38,11 +37,7 @@ def read_sensitivity(path: Path, key: str) -> Sensitivity | None:
 
 
 def write_sensitivity(path: Path, sensitivity: Sensitivity, key: str) -> None:
-    """Write sensitivity and ``key`` to an ``.npz``, atomically; an existing file is replaced.
-
-    Raises:
-        OutputError: the file system refuses.
-    """
+    """Write sensitivity and ``key`` to an ``.npz``, atomically; an existing file is replaced."""
     arrays: dict[str, Any] = {field.name: getattr(sensitivity, field.name) for field in fields(Sensitivity)}
     with atomic_file(path, overwrite=True) as file:
         np.savez(file, key=np.asarray(key), **arrays)

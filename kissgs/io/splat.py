@@ -26,6 +26,7 @@ from kissgs.io.conventions import (
     to_bytes,
 )
 from kissgs.io.files import BinaryWriter, SceneFile, open_scene_file, refuse_more_than
+from kissgs.io.scene_format import Codec, Facts
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 """One Gaussian."""
@@ -33,28 +34,8 @@ ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("
 _BLOCK = 1 << 14
 
 
-def count_splat(source: Path | bytes) -> int:
-    """Return the number of Gaussians, from the size of the file.
-
-    Raises:
-        InvalidSceneError: the file cannot be read, or its size is not a multiple of 32 bytes.
-    """
-    with open_scene_file(source) as opened:
-        return _count(opened)
-
-
 def read_splat(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
-    """Read a scene without cleaning it.
-
-    Args:
-        source: A file, or the bytes of one.
-        max_gaussians: Largest number of Gaussians; more are refused before memory is allocated. None: no limit.
-        progress: Receives events of stage ``read``.
-
-    Raises:
-        InvalidSceneError: the file cannot be read, or its size is not a multiple of 32 bytes.
-        UnsupportedError: more Gaussians than ``max_gaussians``.
-    """
+    """Read a scene without cleaning it."""
     with open_scene_file(source) as opened:
         count = _count(opened)
         refuse_more_than(max_gaussians, count, opened.name)
@@ -70,16 +51,7 @@ def read_splat(source: Path | bytes, *, max_gaussians: int | None = None, progre
 
 
 def write_splat(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
-    """Write a clean scene, large and opaque Gaussians first, as viewers that draw while they load expect.
-
-    Args:
-        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
-        splats: The scene, cleaned.
-        progress: Receives events of stage ``write``.
-
-    Returns:
-        What the format cannot hold, one phrase each.
-    """
+    """Write a clean scene, large and opaque Gaussians first, as viewers that draw while they load expect."""
     order = _largest_first(splats)
     for start in range(0, len(splats), _BLOCK):
         file.write(_encode(splats.select(order[start : start + _BLOCK])).tobytes())
@@ -126,3 +98,17 @@ def _decode(rows: Shaped[np.ndarray, " B"], out: Splats) -> None:
     out.quats[:] = byte_quats(rows["quats"])
     out.sh0[:] = SH0_OF_BYTE[rows["rgba"][:, :3]]
     out.opacities[:] = OPACITY_OF_BYTE[rows["rgba"][:, 3]]
+
+
+def _describe(path: Path | bytes, level: int) -> Facts:
+    with open_scene_file(path) as opened:
+        return Facts(title=".splat scene", count=_count(opened), sh_degree=0)
+
+
+FORMAT = Codec(
+    info=_describe,
+    read=lambda source, reading, threads, progress: read_splat(
+        source, max_gaussians=reading.max_gaussians, progress=progress
+    ),
+    write={".splat": lambda file, splats, raw_axes, progress: write_splat(file, splats, progress=progress)},
+)

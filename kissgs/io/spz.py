@@ -32,6 +32,7 @@ from kissgs.io.conventions import (
     to_codes,
 )
 from kissgs.io.files import BinaryWriter, SceneFile, listed, open_scene_file, refuse_more_than
+from kissgs.io.scene_format import Codec, Facts, Match, titled
 
 # Decompression of ``.spz``: gzip and zstd, bounded by what the header needs.
 
@@ -55,11 +56,7 @@ def inflate_start(head: bytes) -> bytes:
 
 
 def inflate(opened: SceneFile, size: int, most_behind: int) -> tuple[UInt8[np.ndarray, " size"], bytes]:
-    """Unpack a gzip file of ``size`` bytes and up to ``most_behind`` more; return both parts.
-
-    Raises:
-        InvalidSceneError: the file is damaged, or has fewer or more bytes.
-    """
+    """Unpack a gzip file of ``size`` bytes and up to ``most_behind`` more; return both parts."""
     if size > _MAX_RATIO * opened.size:
         raise InvalidSceneError(
             f"{opened.name} is cut short: {opened.size:,} bytes cannot hold what its header declares; download it again"
@@ -91,11 +88,7 @@ def inflate(opened: SceneFile, size: int, most_behind: int) -> tuple[UInt8[np.nd
 
 
 def unpack_frame(frame: bytes, size: int, what: str) -> bytes:
-    """Unpack one zstd frame of exactly ``size`` bytes; ``what`` names it in errors.
-
-    Raises:
-        InvalidSceneError: the frame is damaged, or has fewer or more bytes.
-    """
+    """Unpack one zstd frame of exactly ``size`` bytes; ``what`` names it in errors."""
     if sys.version_info >= (3, 14):
         from compression import zstd
     else:
@@ -291,18 +284,8 @@ def header_bytes(count: int, sh_degree: int, fractional_bits: int, *, antialiase
     return _HEADER.pack(MAGIC, 3, count, sh_degree, fractional_bits, _ANTIALIASED * antialiased, 0)
 
 
-def is_spz(head: bytes) -> bool:
-    """Whether a file begins like ``.spz``; ``head`` are its first 512 bytes, which are unpacked if they are gzip."""
-    return (inflate_start(head) if head.startswith(GZIP_MAGIC) else head)[:4] == MAGIC
-
-
 def read_spz_info(source: Path | bytes) -> SpzInfo:
-    """Read the header.
-
-    Raises:
-        InvalidSceneError: the file cannot be read, is not ``.spz`` or is damaged.
-        UnsupportedError: another version, an SH degree above 4, or Spark's levels of detail.
-    """
+    """Read the header."""
     with open_scene_file(source) as opened:
         return _read_header(opened)
 
@@ -313,17 +296,6 @@ def read_spz(
     """Read a scene without cleaning it, and turn it to the axes of a ``.ply``.
 
     Of SH degree 4 the highest band is left out, as are unknown extension records, which ``notes`` says.
-
-    Args:
-        source: A file, or the bytes of one.
-        max_gaussians: Largest number of Gaussians; more are refused before memory is allocated. None: no limit.
-        raw_axes: Take the axes as those of a ``.ply``, whatever the file says.
-        progress: Receives events of stage ``read``.
-
-    Raises:
-        InvalidSceneError: the file cannot be read, is damaged or cut short.
-        UnsupportedError: another version, an SH degree above 4, Spark's levels of detail, or more Gaussians than
-            ``max_gaussians``.
     """
     with open_scene_file(source) as opened:
         info = _read_header(opened)
@@ -475,17 +447,7 @@ _Encode = Callable[[slice], UInt8[np.ndarray, "B width"]]
 def write_spz(
     file: BinaryWriter, splats: Splats, *, raw_axes: bool = False, progress: Progress = silent
 ) -> tuple[str, ...]:
-    """Write a clean scene; return what the format cannot hold, one phrase each.
-
-    Args:
-        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
-        splats: The scene, cleaned.
-        raw_axes: Store the axes of a ``.ply`` instead of the format's own (x right, y up, z back).
-        progress: Receives events of stage ``write``.
-
-    Raises:
-        UnsupportedError: the scene has no Gaussians, which readers of the format refuse.
-    """
+    """Write a clean scene; return what the format cannot hold, one phrase each."""
     count = len(splats)
     if not count:
         raise UnsupportedError("a scene without Gaussians cannot be written as .spz; write it as .ply")
@@ -531,3 +493,35 @@ def _notes(splats: Splats, reach: float, bits: int) -> tuple[str, ...]:
     note_clamped(notes, "colours", splats.sh0, -edge, edge, "coefficients of ±3.33")
     note_clamped(notes, "view-dependent colours", splats.shN, -1 - 1 / 32, 1 + 1 / 32, "coefficients of ±1")
     return tuple(notes)
+
+
+def _sniff(head: bytes, size: int) -> Match:
+    plain = inflate_start(head) if head.startswith(GZIP_MAGIC) else head
+    return Match.SURE if plain[:4] == MAGIC else Match.NO
+
+
+def _describe(path: Path | bytes, level: int) -> Facts:
+    found = read_spz_info(path)
+    antialiased = "antialiased" if found.antialiased else ""
+    return Facts(
+        title=titled("SPZ scene", f"version {found.version}", antialiased),
+        count=found.count,
+        sh_degree=found.sh_degree,
+        details={
+            "version": found.version,
+            "antialiased": found.antialiased,
+            "fractional_bits": found.fractional_bits,
+        },
+    )
+
+
+FORMAT = Codec(
+    sniff=_sniff,
+    info=_describe,
+    read=lambda source, reading, threads, progress: read_spz(
+        source, max_gaussians=reading.max_compressed, raw_axes=reading.raw_axes, progress=progress
+    ),
+    write={
+        ".spz": lambda file, splats, raw_axes, progress: write_spz(file, splats, raw_axes=raw_axes, progress=progress)
+    },
+)

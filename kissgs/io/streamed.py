@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.origin import Origin, read_origin
+from kissgs.core.origin import Origin, read_origin, recorded
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, MAX_GAUSSIANS, SH_REST_COUNTS, Splats, empty_splats
-from kissgs.io.containers import Source, is_file_name, open_source
+from kissgs.io.containers import Source, is_file_name, open_source, stored_size
 from kissgs.io.files import marked, parse_json, refuse_more_than
+from kissgs.io.scene_format import Codec, Facts, titled
 
 MAX_TREE_BYTES = 1 << 25
 """Largest size of a manifest, bytes; one of a thousand leaves and five levels takes 330 kB."""
@@ -34,12 +35,8 @@ MAX_LEVELS = 64
 
 
 @runtime_checkable
-class Container(Protocol):
-    """Container of a streamed scene, whose metadata is read and checked."""
-
-    @property
-    def count(self) -> int:
-        """Number of Gaussians."""
+class Layout(Protocol):
+    """Metadata of a container, read and checked."""
 
     @property
     def sh_degree(self) -> int:
@@ -53,29 +50,35 @@ class Container(Protocol):
     def notes(self) -> tuple[str, ...]:
         """Phrases for what reading the container leaves out, one phrase each."""
 
-    def decode(self, out: Splats, pool: Workers) -> None:
-        """Decode all Gaussians into ``out``, whose SH coefficients above the container's degree become zero."""
+
+Ranges = dict[str, tuple[float, float]]
+
+L = TypeVar("L", bound=Layout)
 
 
-C = TypeVar("C", bound=Container)
+@dataclass(frozen=True, slots=True)
+class Container(Generic[L]):
+    """Container among the files of a streamed scene."""
+
+    layout: L
+    count: int
+    stored: Callable[[], tuple[str, int]]
+    """Returns the name of the container and the bytes of all its files."""
+    decode: Callable[[Splats, Workers], None]
+    """Decodes all Gaussians into a scene, whose SH coefficients above the container's degree become zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Contents of a manifest.
-
-    Attributes:
-        levels: number of levels.
-        filenames: files of the containers: their metadata, or they themselves.
-        rows: per level, the row ranges ``(file, offset, count)`` of the leaves, by file and offset, without overlap.
-        environment: file of the environment; None without one.
-        origin: see :class:`kissgs.Splats`.
-    """
+    """Contents of a manifest."""
 
     levels: int
     filenames: tuple[str, ...]
+    """Files of the containers: their metadata, or they themselves."""
     rows: tuple[tuple[tuple[int, int, int], ...], ...]
+    """Row ranges of the leaves per level, ``(file, offset, count)``, by file and offset, without overlap."""
     environment: str | None
+    """File of the environment."""
     origin: Origin
 
     def count(self, level: int) -> int:
@@ -84,11 +87,11 @@ class Manifest:
 
 
 @dataclass(frozen=True, slots=True)
-class Part(Generic[C]):
+class Part(Generic[L]):
     """Container of which a level needs the row ranges ``rows``, offset and count; ``name`` is that of its file."""
 
     name: str
-    container: C
+    container: Container[L]
     rows: tuple[tuple[int, int], ...]
 
     @property
@@ -112,29 +115,64 @@ class Part(Generic[C]):
 
 
 @dataclass(frozen=True, slots=True)
-class StreamedFormat(Generic[C]):
-    """Format of streamed scenes.
+class StreamedFormat(Generic[L]):
+    """Format of streamed scenes."""
 
-    Attributes:
-        manifest: file name of the manifest.
-        containers: value that the manifest's key "format" must have where it has one; None if any value is valid.
-        opened: reads and checks the metadata of the container of a file.
-    """
-
+    title: str
     manifest: str
+    """File name of the manifest."""
     containers: str | None
-    opened: Callable[[Source, str], C]
+    """Value that the manifest's key "format" must have where it has one; None if any value is valid."""
+    opened: Callable[[Source, str], Container[L]]
+    """Reads and checks the metadata of the container of a file."""
+    ranges: Callable[[list[L]], Ranges]
+    """Returns the values of the lowest and the highest level of each attribute, over all containers."""
+
+    @property
+    def codec(self) -> Codec:
+        """Code of the format."""
+        return Codec(
+            info=self.describe,
+            read=lambda source, reading, threads, progress: self.decode(
+                source, level=reading.level, max_gaussians=reading.max_compressed, threads=threads, progress=progress
+            ),
+        )
+
+    def describe(self, path: Path | bytes, level: int) -> Facts:
+        """Return the facts of one level and the environment; no image is decoded."""
+        with self.open(path) as files:
+            manifest = self.read_manifest(files)
+            parts = list(self.parts(files, manifest, level))
+            sizes = {
+                self.manifest: stored_size(files, self.manifest),
+                **dict(part.container.stored() for part in parts),
+            }
+        antialiased = bool(parts) and all(part.container.layout.antialiased for part in parts)
+        levels = [manifest.count(one) for one in range(manifest.levels)]
+        environment = parts[-1].count if manifest.environment is not None else 0
+        beside = f"; in the environment, which belongs to every level: {environment:,}" if environment else ""
+        described = f"level {level} of 0 to {manifest.levels - 1}"
+        return Facts(
+            title=titled(self.title, described, "antialiased" if antialiased else ""),
+            count=sum(part.count for part in parts),
+            sh_degree=max((part.container.layout.sh_degree for part in parts), default=0),
+            parts=sizes,
+            ranges=self.ranges([part.container.layout for part in parts]),
+            notes=tuple(dict.fromkeys(note for part in parts for note in part.container.layout.notes)),
+            details={
+                **recorded(manifest.origin),
+                "level": level,
+                "levels": levels,
+                "environment": environment,
+                "files": len(manifest.filenames),
+                "antialiased": antialiased,
+            },
+            lines=(f"Gaussians by level, finest first: {', '.join(f'{count:,}' for count in levels)}{beside}",),
+        )
 
     @contextlib.contextmanager
     def open(self, source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
-        """Open a streamed scene for reading; errors about its files name the scene.
-
-        Args:
-            source: the folder of the manifest, a zip of it, the bytes of one, or files in memory.
-
-        Raises:
-            InvalidContainerError: ``source`` cannot be read or is not a zip file.
-        """
+        """Open a streamed scene for reading; errors about its files name the scene."""
         with open_source(source, self.manifest) as files:
             try:
                 yield files
@@ -162,46 +200,30 @@ class StreamedFormat(Generic[C]):
         threads: int = 0,
         progress: Progress = silent,
     ) -> Splats:
-        """Decode one level of a streamed scene, the environment included.
+        """Decode one level of a streamed scene: the rows in the order of the files, then the environment.
 
-        Args:
-            source: the folder of the manifest, a zip of it, the bytes of one, or files in memory.
-            level: level of detail; 0 is the finest.
-            max_gaussians: largest number of Gaussians; more are refused before memory is allocated.
-            threads: number of threads; 0 means one per processor.
-            progress: receives "decode" events.
-
-        Returns:
-            The Gaussians in the order of the files and their rows, then those of the environment. Containers of a lower
-            SH degree have zeros for the coefficients above it.
-
-        Raises:
-            InvalidContainerError: a part is missing, damaged or invalid.
-            UnsupportedError: there is no such level, another version, or more Gaussians than ``max_gaussians``.
+        Containers of a lower SH degree get zeros for the coefficients above it.
         """
         with self.open(source) as files, Workers(threads) as pool:
             manifest = self.read_manifest(files)
             parts = list(self.parts(files, manifest, level))
             count = sum(part.count for part in parts)
             refuse_more_than(max_gaussians, count, f"level {level}")
-            splats = empty_splats(count, max((SH_REST_COUNTS[part.container.sh_degree] for part in parts), default=0))
+            splats = empty_splats(
+                count, max((SH_REST_COUNTS[part.container.layout.sh_degree] for part in parts), default=0)
+            )
             start = 0
             for part in parts:
                 refuse_more_than(max_gaussians, part.container.count, f"the file {part.name}")
                 progress("decode", start / max(count, 1))
                 start = part.decode(splats, start, pool)
             progress("decode", 1.0)
-            notes = dict.fromkeys(note for part in parts for note in part.container.notes)
+            notes = dict.fromkeys(note for part in parts for note in part.container.layout.notes)
             splats = replace(splats, origin=manifest.origin, notes=tuple(notes))
-            return marked(splats, [part.container.antialiased for part in parts])
+            return marked(splats, [part.container.layout.antialiased for part in parts])
 
     def read_manifest(self, files: Source) -> Manifest:
-        """Read and check the manifest.
-
-        Raises:
-            InvalidContainerError: it is missing, damaged or invalid.
-            UnsupportedError: another version or format, or files elsewhere on the web.
-        """
+        """Read and check the manifest."""
         name = self.manifest
         document = parse_json(files.read(name, MAX_TREE_BYTES), name, most=MAX_TREE_VALUES)
         if not isinstance(document, dict):
@@ -234,13 +256,8 @@ class StreamedFormat(Generic[C]):
                     raise _invalid(name, f"two leaves share rows of {names[file]}")
         return Manifest(levels, tuple(names), tuple(map(tuple, rows)), environment, read_origin(document, name))
 
-    def parts(self, files: Source, manifest: Manifest, level: int) -> Iterator[Part[C]]:
-        """Yield the containers of a level, then the environment; their metadata is read and checked.
-
-        Raises:
-            InvalidContainerError: a container's metadata is missing or invalid, or has too few rows.
-            UnsupportedError: there is no such level, or a container is of another version.
-        """
+    def parts(self, files: Source, manifest: Manifest, level: int) -> Iterator[Part[L]]:
+        """Yield the containers of a level, then the environment; their metadata is read and checked."""
         last = manifest.levels - 1
         if not 0 <= level <= last:
             raise UnsupportedError(f"there is no level {level}; this scene has levels 0 (the finest) to {last}")

@@ -37,18 +37,9 @@ def pixels_crc32(image: UInt8[np.ndarray, "H W C"]) -> int:
 def decode_plane(
     data: bytes, name: str, *, width: int, height: int, channels: int, crc32: int | None = None
 ) -> UInt8[np.ndarray, "pixels C"]:
-    """Decompress one image to rows of pixels.
+    """Decompress one image to rows of pixels: of the first channel, of 3, or of 4 (the fourth is 255 if there is none).
 
-    Args:
-        data: a WebP file.
-        name: name of the file, for error messages.
-        width: required width, pixels; checked before memory is allocated.
-        height: required height, pixels; checked before memory is allocated.
-        channels: number of channels to return: 1 (the first), 3, or 4 (the fourth is 255 if the file has none).
-        crc32: required checksum of the pixels (:func:`pixels_crc32`); None if unknown.
-
-    Raises:
-        InvalidContainerError: not a lossless WebP, of a wrong size, or damaged.
+    The size is checked before memory is allocated; ``crc32`` is that of :func:`pixels_crc32`, None if it is unknown.
     """
     found = probe_webp(data, name)
     if found != (width, height):
@@ -71,11 +62,7 @@ def decode_plane(
 
 
 def probe_webp(data: bytes, name: str) -> tuple[int, int]:
-    """Return width and height in pixels, from the header alone.
-
-    Raises:
-        InvalidContainerError: not a WebP file, or lossy, animated or cut off.
-    """
+    """Return width and height in pixels, from the header alone."""
     if len(data) < 20 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
         raise InvalidContainerError(f"{name} is not a WebP image")
     if struct.unpack_from("<I", data, 4)[0] + 8 > len(data):

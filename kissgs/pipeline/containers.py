@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned
-from kissgs.io.containers import ContainerName
+from kissgs.formats import ContainerName
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.settings import EncodeSettings
@@ -39,9 +39,6 @@ def write_files(
     """Make the files of a plan for a container.
 
     The other parameters are those of :func:`kissgs.sogxt.encode.write_files`.
-
-    Raises:
-        UnsupportedError: the container cannot hold the plan.
     """
     if container == "sog":
         return sog.write_files(plan, settings, threads=threads, progress=progress)

@@ -9,15 +9,9 @@ from pathlib import Path
 from kissgs.core.origin import in_world
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
-from kissgs.pipeline.scene_files import (
-    CONTAINER_FORMATS,
-    AnyPath,
-    ReadOptions,
-    check_ply,
-    read_scene,
-    recognise,
-    save_ply,
-)
+from kissgs.formats import FORMATS
+from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline.scene_files import AnyPath, check_ply, read_scene, recognise, save_ply
 
 
 def decompress(
@@ -68,7 +62,7 @@ def decompress(
         progress=progress,
         only_containers=True,
     )
-    if recognise(scene) not in CONTAINER_FORMATS:
+    if not FORMATS[recognise(scene)].is_container:
         usable, cleaned = clean(splats)
         if cleaned.notes:
             splats = replace(usable, notes=(*splats.notes, *cleaned.notes))

@@ -18,7 +18,7 @@ from kissgs.core.progress import Progress, SearchNote, as_stage, load_kernels
 from kissgs.core.resources import blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
-from kissgs.io.containers import ContainerName
+from kissgs.formats import ContainerName
 from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
 from kissgs.pipeline.containers import DECODERS, MODELS, write_files
 from kissgs.pipeline.goal import Container

@@ -16,19 +16,11 @@ from kissgs.core.progress import Deadline, Progress, SearchNote, as_stage, ignor
 from kissgs.core.resources import StageTimer, peak_memory, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import MAX_GAUSSIANS, Splats, empty_splats
-from kissgs.io.containers import ContainerName, named_container
+from kissgs.formats import ContainerName, named_container
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.report import Report
-from kissgs.pipeline.scene_files import (
-    DEFAULT_READ_OPTIONS,
-    AnyPath,
-    ReadOptions,
-    check_ply,
-    open_scene,
-    read_scene,
-    reading_notes,
-    save_ply,
-)
+from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
 from kissgs.pipeline.training_choice import choose, decided
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
@@ -388,7 +380,7 @@ def _settings_as_used(decided: Settings, used: EncodeSettings, requested: Settin
         auto_count, tuned = requested.compact.auto_count, requested.finetune.enabled
         groups["compact"] = decided.compact.model_copy(update={"auto_count": auto_count})
         groups["finetune"] = decided.finetune.model_copy(update={"enabled": tuned})
-    return decided.model_copy(update=groups).model_dump(mode="json")
+    return decided.model_copy(update=groups).as_json()
 
 
 def _evaluate(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
@@ -12,12 +12,11 @@ from typing import Literal
 from kissgs.core.errors import InvalidContainerError, OutputError
 from kissgs.core.origin import WORLD, centred, in_world, origin_for, relative_to, world_positions
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import MAX_GAUSSIANS, Cleaned, Splats, clean
+from kissgs.core.splats import Cleaned, Splats, clean
+from kissgs.formats import ENDINGS, FORMATS, LEVELS_NAME, LOD_NAME, SCENE_ENDINGS, output_format
 from kissgs.io.containers import (
-    ENDINGS,
-    LEVELS_NAME,
-    LOD_NAME,
-    SCENE_ENDINGS,
+    MAX_METADATA_BYTES,
+    META_NAME,
     ZIP_MAGICS,
     MemorySource,
     Source,
@@ -26,74 +25,20 @@ from kissgs.io.containers import (
     zip_names,
 )
 from kissgs.io.files import BinaryWriter, atomic_file, listed, parse_json, reason_of, refuse_existing
-from kissgs.sog.metadata import MAX_METADATA_BYTES, META_NAME
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Match, ReadOptions
 from kissgs.sogxt.container import is_packed
 from kissgs.sogxt.names import YAML_NAME
 
-# Options for reading a scene from a file.
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReadOptions:
-    """Options for reading a scene, of which each format heeds those that concern it.
-
-    Attributes:
-        max_gaussians: largest number of Gaussians; more are refused before memory is allocated. By default 20 million
-            for formats whose scene can take far more memory than the file; no limit for ``.ply``, ``.splat`` and
-            ``.ksplat``, whose scene takes at most four times the bytes of the file.
-        level: level of detail of a streamed scene; 0 is the finest.
-        raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so, as some tools write it.
-        origin: "auto" makes positions relative to the whole numbers nearest to the middle of the scene
-            (:attr:`kissgs.Splats.origin`), where containers have the finest steps. By default the origin is that of the
-            file, or the middle of the scene where float32 cannot hold its positions.
-        antialiased: whether the scene was trained with antialiasing (:class:`kissgs.Splats`); None: as the file says.
-    """
-
-    max_gaussians: int | None = None
-    level: int = 0
-    raw_axes: bool = False
-    origin: Literal["auto"] | None = None
-    antialiased: bool | None = None
-
-    @property
-    def max_compressed(self) -> int:
-        """Largest number of Gaussians of formats whose scene can take far more memory than the file."""
-        return MAX_GAUSSIANS if self.max_gaussians is None else self.max_gaussians
-
-    def marked(self, splats: Splats) -> Splats:
-        """Return a scene that was read, antialiased or not as these options say."""
-        return splats if self.antialiased is None else replace(splats, antialiased=self.antialiased)
-
-
-DEFAULT_READ_OPTIONS = ReadOptions()
-
-
 # Recognition of scene formats: by content where a format has a mark, else by the ending of the name.
-
-SceneFormat = Literal["ply", "sogxt", "sog", "streamed-sog", "streamed-sogxt", "spz", "splat", "ksplat", "gltf"]
-"""All formats that are read. "ply" stands for unknown content too, about which its reader has the best messages."""
-
-STREAMED_FORMATS: frozenset[SceneFormat] = frozenset({"streamed-sog", "streamed-sogxt"})
-"""Formats with levels of detail."""
-
-CONTAINER_FORMATS: frozenset[SceneFormat] = STREAMED_FORMATS | {"sogxt", "sog"}
-"""Formats whose metadata describes them without decoding an image."""
 
 HEAD_BYTES = 512
 """Bytes at the beginning of a file that recognition needs."""
 
-_STREAMED: dict[str, SceneFormat] = {LOD_NAME: "streamed-sog", LEVELS_NAME: "streamed-sogxt"}
+_STREAMED = {each.manifest: name for name, each in FORMATS.items() if each.manifest}
 """Format of streamed scenes by the name of their manifest, the first of which decides."""
 
-_WITHOUT_MARK: dict[str, SceneFormat] = {".splat": "splat", ".ksplat": "ksplat"}
 
-_ENDINGS: dict[str, SceneFormat] = {".spz": "spz", ".glb": "gltf", ".gltf": "gltf", ".sog": "sog"}
-"""Format of files whose content is not recognised: damaged ones, about which the reader says more."""
-
-
-def recognise(
-    source: Path | bytes | Mapping[str, bytes], *, name: str | None = None, size: int | None = None
-) -> SceneFormat:
+def recognise(source: Path | bytes | Mapping[str, bytes], *, name: str | None = None, size: int | None = None) -> str:
     """Return the format of a scene: a file, a folder, the bytes of a file, or a container's files in memory.
 
     The metadata file of a container and the manifest of a streamed scene stand for their folder. ``.splat`` is
@@ -108,27 +53,38 @@ def recognise(
         InvalidContainerError: a folder holds no container and no streamed scene.
     """
     if isinstance(source, Mapping):
-        return _container_format(MemorySource(source))
+        return _container_format(MemorySource(source), "sogxt")
     name = ("" if isinstance(source, bytes) else source.name) if name is None else name
     name = name.lower()
-    ending = Path(name).suffix
     if isinstance(source, Path) and (_is_folder(source) or scene_root(source) != source):
         _check_folder(scene_root(source))
         return _STREAMED.get(name) or _packed_format(scene_root(source), "sogxt")
     head, found_size = _beginning(source)
-    if marked := _by_mark(head):
-        return marked
-    if ending in _WITHOUT_MARK and head[:4] not in ZIP_MAGICS:
-        return _WITHOUT_MARK[ending]
+    match, by_content = _by_content(head, found_size if size is None else size)
+    if match == Match.SURE:
+        return by_content
+    ending = Path(name).suffix
+    of_ending = next((kind for kind, each in FORMATS.items() if ending in each.endings), "ply")
+    if FORMATS[of_ending].by_ending and head[:4] not in ZIP_MAGICS:
+        return of_ending
     if is_container(source):
-        return _packed_format(source, "sog" if ending == ".sog" else "sogxt")
-    from kissgs.io.ksplat import is_ksplat
+        return _packed_format(source, "sog" if of_ending == "sog" else "sogxt")
+    if match == Match.LIKELY or (match == Match.POSSIBLE and of_ending == "ply"):
+        return by_content
+    return of_ending
 
-    if is_ksplat(head, found_size if size is None else size):
-        return "ksplat"
-    if ending not in _ENDINGS and _is_json(head):
-        return "gltf"
-    return _ENDINGS.get(ending, "ply")
+
+def _by_content(head: bytes, size: int) -> tuple[Match, str]:
+    """Return the format that the beginning of a file of ``size`` bytes matches best; none for a zip."""
+    best = Match.NO, "ply"
+    if head[:4] in ZIP_MAGICS:  # the modules of other formats need not be loaded
+        return best
+    for name, each in FORMATS.items():
+        if not each.is_container:
+            best = max(best, (each.codec.sniff(head, size), name), key=lambda found: found[0])
+            if best[0] == Match.SURE:
+                return best
+    return best
 
 
 def scene_root(path: Path) -> Path:
@@ -193,29 +149,11 @@ def _beginning(source: Path | bytes) -> tuple[bytes, int]:
     return b"", 0
 
 
-def _by_mark(head: bytes) -> SceneFormat | None:
-    if head[:3] == b"ply" and head[3:4].isspace():
-        return "ply"
-    if head[:4] in ZIP_MAGICS:  # the modules of other formats need not be loaded
-        return None
-    from kissgs.io.gltf_document import GLB_MAGIC
-    from kissgs.io.spz import is_spz
-
-    if head.startswith(GLB_MAGIC):
-        return "gltf"
-    return "spz" if is_spz(head) else None
-
-
-def _is_json(head: bytes) -> bool:
-    start = head.removeprefix(b"\xef\xbb\xbf").lstrip()
-    return start.startswith(b"{") and not any(byte < 32 and byte not in b"\t\r\n" for byte in start)
-
-
-def _packed_format(source: Path | bytes, damaged: SceneFormat) -> SceneFormat:
+def _packed_format(source: Path | bytes, damaged: str) -> str:
     """Return the format of a folder or a zip; ``damaged`` if it cannot be read, whose reader then says why."""
     try:
         if isinstance(source, bytes) or not _is_folder(source):
-            with _opened(source) as file:
+            with io.BytesIO(source) if isinstance(source, bytes) else source.open("rb") as file:
                 names = {name.replace("\\", "/").rsplit("/", 1)[-1] for name in zip_names(file)}
             if found := _streamed_format(names):
                 return found
@@ -225,15 +163,11 @@ def _packed_format(source: Path | bytes, damaged: SceneFormat) -> SceneFormat:
         return damaged
 
 
-def _opened(source: Path | bytes) -> io.BufferedIOBase:
-    return io.BytesIO(source) if isinstance(source, bytes) else source.open("rb")
-
-
-def _streamed_format(names: Collection[str]) -> SceneFormat | None:
+def _streamed_format(names: Collection[str]) -> str | None:
     return next((kind for manifest, kind in _STREAMED.items() if manifest in names), None)
 
 
-def _container_format(files: Source, unknown: SceneFormat = "sogxt") -> SceneFormat:
+def _container_format(files: Source, unknown: str) -> str:
     """Tell the containers apart: only SOG-XT has a YAML file, and a mask in ``meta.json``."""
     names = files.names()
     if found := _streamed_format(names):
@@ -248,78 +182,31 @@ def _container_format(files: Source, unknown: SceneFormat = "sogxt") -> SceneFor
     return "sog" if plain else unknown
 
 
-# Formats in which a scene is written, by the ending of a name. Containers are written by ``compress``.
-
-OutputFormat = Literal["ply", "compressed.ply", "spz", "splat", "glb", "spz.glb"]
-OUTPUT_FORMATS: tuple[OutputFormat, ...] = ("ply", "compressed.ply", "spz", "splat", "glb", "spz.glb")
-"""Formats that are written; each is the ending of its files without the first dot."""
-
-
-def output_format(path: Path) -> OutputFormat:
-    """Return the format that the ending of a name stands for.
-
-    Raises:
-        OutputError: no format that is written has this ending.
-    """
-    name = path.name.lower()
-    found = [kind for kind in OUTPUT_FORMATS if name.endswith(f".{kind}")]
-    if found:
-        return max(found, key=len)
-    if path.suffix.lower() in ENDINGS:
-        raise OutputError(f"{path!s:.100} is the name of a container; kissgs compress writes those")
-    raise OutputError(
-        f"{path!s:.100} has no ending of a format that is written: .{', .'.join(OUTPUT_FORMATS)}; choose one of them"
-    )
+# Writing of scenes. Containers are written by ``compress``.
 
 
 def write_scene(
-    file: BinaryWriter, splats: Splats, kind: OutputFormat, *, raw_axes: bool = False, progress: Progress = silent
+    file: BinaryWriter, splats: Splats, kind: str, *, raw_axes: bool = False, progress: Progress = silent
 ) -> tuple[str, ...]:
     """Write a scene in a format, which all but ``ply`` need cleaned; return what the format cannot hold.
 
-    Each loss beyond the steps that the format always has is one phrase. ``raw_axes`` is for ``spz``.
-
-    Raises:
-        UnsupportedError: the format cannot hold the scene.
+    Each loss beyond the steps that the format always has is one phrase.
     """
+    ending = f".{kind}"
+    codec = next(each.codec for each in FORMATS.values() if ending in each.written)
     if kind == "ply":
-        from kissgs.io.ply import write_ply
-
-        write_ply(file, splats, progress=progress)
-        return ()
+        return codec.write[ending](file, splats, raw_axes, progress)
     splats = clean(splats)[0]
-    notes = _write_cleaned(file, splats, kind, raw_axes, progress)
+    notes = codec.write[ending](file, splats, raw_axes, progress)
     if splats.origin != WORLD:
-        kept = "records it as a translation" if kind.endswith("glb") else "does not record it"
+        kept = "records it as a translation" if codec.records_origin else "does not record it"
         rounded = origin_for(world_positions(splats), splats.scales) != WORLD
         reason = ", because float32 would round those of the world" if rounded else ""
-        notes = (*notes, f"{relative_to(splats.origin)}{reason}; .{kind} {kept}")
+        notes = (*notes, f"{relative_to(splats.origin)}{reason}; {ending} {kept}")
     return notes
 
 
-def _write_cleaned(
-    file: BinaryWriter, splats: Splats, kind: OutputFormat, raw_axes: bool, progress: Progress
-) -> tuple[str, ...]:
-    if kind == "spz":
-        from kissgs.io.spz import write_spz
-
-        return write_spz(file, splats, raw_axes=raw_axes, progress=progress)
-    if kind == "compressed.ply":
-        from kissgs.io.compressed_ply import write_compressed
-
-        return write_compressed(file, splats, progress=progress)
-    if kind == "splat":
-        from kissgs.io.splat import write_splat
-
-        return write_splat(file, splats, progress=progress)
-    from kissgs.io.gltf_writer import write_glb, write_spz_glb
-
-    return (write_glb if kind == "glb" else write_spz_glb)(file, splats, progress=progress)
-
-
-# Scenes in files: read every format, write those that are no containers.
-#
-# The module of a format is loaded when a file of that format is read.
+# Scenes in files.
 
 AnyPath = str | PathLike[str]
 
@@ -391,22 +278,14 @@ def save(
 
 
 def save_ply(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Progress = silent) -> None:
-    """Write a scene atomically as an exact ``.ply``, also where its name ends in ``.compressed.ply``.
-
-    Raises:
-        OutputError: as for :func:`check_ply`, or writing fails.
-    """
+    """Write a scene atomically as an exact ``.ply``, also where its name ends in ``.compressed.ply``."""
     check_ply(Path(path), overwrite=overwrite)
     with atomic_file(Path(path), overwrite=overwrite) as file:
         write_scene(file, splats, "ply", progress=progress)
 
 
 def check_ply(path: Path, *, overwrite: bool) -> None:
-    """Check that a scene can be written to ``path``.
-
-    Raises:
-        OutputError: the ending is not ``.ply``, the file exists and ``overwrite`` is false, or there is no such folder.
-    """
+    """Raise OutputError if a scene cannot be written to ``path`` as ``.ply``."""
     if path.suffix.lower() != ".ply":
         raise OutputError(f"{path}: a scene is written as .ply; use compress to write a container")
     refuse_existing(path, overwrite=overwrite)
@@ -415,11 +294,7 @@ def check_ply(path: Path, *, overwrite: bool) -> None:
 def open_scene(
     source: Splats | AnyPath | bytes, reading: ReadOptions, threads: int, progress: Progress
 ) -> tuple[Splats, Cleaned, int]:
-    """Read and clean a scene; return it, the defects that were corrected, and the bytes of the source.
-
-    Raises:
-        KissgsError: the scene cannot be read.
-    """
+    """Read and clean a scene; return it, the defects that were corrected, and the bytes of the source."""
     if isinstance(source, Splats):
         splats = reading.marked(source)
         splats, cleaned = clean(centred(splats) if reading.origin == "auto" else splats)
@@ -438,11 +313,7 @@ def read_scene(
     progress: Progress = silent,
     only_containers: bool = False,
 ) -> Splats:
-    """Read a scene without cleaning. With ``only_containers``, a ``.ply`` is refused.
-
-    Raises:
-        KissgsError: the scene cannot be read.
-    """
+    """Read a scene without cleaning. With ``only_containers``, a ``.ply`` is refused."""
     splats = reading.marked(_read(source, reading, threads, progress, only_containers))
     return centred(splats) if reading.origin == "auto" else splats
 
@@ -456,47 +327,9 @@ def _read(
 ) -> Splats:
     found = recognise(source)
     root = scene_root(source) if isinstance(source, Path) else source
-    most = reading.max_compressed
-    if found == "streamed-sog":
-        from kissgs.sog import streamed
-
-        return streamed.decode(root, level=reading.level, max_gaussians=most, threads=threads, progress=progress)
-    if found == "streamed-sogxt":
-        from kissgs.sogxt import streamed as streamed_sogxt
-
-        return streamed_sogxt.decode(root, level=reading.level, max_gaussians=most, threads=threads, progress=progress)
-    if found == "sog":
-        from kissgs.sog.decode import decode as decode_sog
-
-        return decode_sog(root, max_gaussians=most, threads=threads, progress=progress)
-    if found == "sogxt" or (only_containers and found == "ply") or isinstance(source, Mapping):
-        from kissgs.sogxt.decode import decode as decode_sogxt
-
-        return decode_sogxt(root, max_gaussians=most, threads=threads, progress=progress)
-    if found == "spz":
-        from kissgs.io.spz import read_spz
-
-        return read_spz(source, max_gaussians=most, raw_axes=reading.raw_axes, progress=progress)
-    if found == "gltf":
-        from kissgs.io.gltf import read_gltf
-
-        return read_gltf(source, max_gaussians=most, progress=progress)
-    return _reader(found)(source, max_gaussians=reading.max_gaussians, progress=progress)
-
-
-def _reader(found: SceneFormat) -> Callable[..., Splats]:
-    """Return the reader of a format without options."""
-    if found == "splat":
-        from kissgs.io.splat import read_splat
-
-        return read_splat
-    if found == "ksplat":
-        from kissgs.io.ksplat import read_ksplat
-
-        return read_ksplat
-    from kissgs.io.ply import read_ply
-
-    return read_ply
+    if only_containers and found == "ply":
+        found = "sogxt"  # whose reader says what is wrong
+    return FORMATS[found].codec.read(root, reading, threads, progress)
 
 
 def reading_notes(splats: Splats) -> list[str]:
@@ -506,11 +339,7 @@ def reading_notes(splats: Splats) -> list[str]:
 
 
 def stored_bytes(path: Path) -> int:
-    """Return the size of a file, or of all files in a folder and below it, in bytes.
-
-    Raises:
-        InvalidContainerError: the path cannot be read.
-    """
+    """Return the size of a file, or of all files in a folder and below it, in bytes."""
     try:
         root = scene_root(path)
         if not root.is_dir():

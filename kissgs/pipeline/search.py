@@ -17,6 +17,7 @@ from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import SearchNote, as_stage, ignore_stop_search
 from kissgs.core.splats import MAX_GAUSSIANS, Splats
 from kissgs.evaluation.results import ESTIMATED_DROP, drop_of
+from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline.curves import (
     KEEP,
     LOG2_LAMBDA_RANGE,
@@ -32,7 +33,7 @@ from kissgs.pipeline.curves import (
 )
 from kissgs.pipeline.encoding import Measured, Work, encode, make_tuner, measure
 from kissgs.pipeline.goal import Attempt, Container, Goal
-from kissgs.pipeline.scene_files import ReadOptions, read_scene
+from kissgs.pipeline.scene_files import read_scene
 from kissgs.pipeline.search_time import SearchPlan
 from kissgs.pipeline.training_choice import has_photographs
 from kissgs.settings import EncodeSettings
@@ -285,12 +286,8 @@ class Search:
             self._search_all_gaussians(tunes=False)
             left = limited.plan(photographs=True, aims=self.aims).containers
             self.plan = replace(self.plan, containers=min(self.plan.containers, left))
-            if self.plan.containers > 1:
-                self._along_path(path, first)
-            elif self.best is None and not self.aims:
-                self._fine_tune()
-            return
-        self._along_path(path, first)
+        if not self._whole_searched or self.plan.containers > 1:
+            self._along_path(path, first)
         if self.best is None and not self.aims:
             self._search_all_gaussians()
 

@@ -53,29 +53,17 @@ class Vectors:
 
 @dataclass(slots=True, eq=False)
 class Clustering:
-    """A clustering that is being improved.
-
-    Attributes:
-        data: the vectors.
-        centroids: ``(K, D)``.
-        labels: ``(N,)`` centroid of each vector.
-        distances: ``(N,)`` squared distance of each vector to its centroid when it was last assigned.
-        near: ``(K, k)`` near centroids of each centroid, itself first.
-        members: ``(N,)`` vectors sorted by label.
-        edges: ``(K + 1,)`` where each cluster's members begin.
-        totals: ``(K,)`` sum of the weights of each cluster.
-        errors: ``(K,)`` weighted error of each cluster when its vectors were last assigned.
-    """
+    """A clustering that is being improved."""
 
     data: Vectors
     centroids: Float32[np.ndarray, "K D"]
-    labels: Int32[np.ndarray, " N"]
-    distances: Float32[np.ndarray, " N"]
-    near: UInt16[np.ndarray, "K k"]
-    members: Int32[np.ndarray, " N"]
-    edges: Int[np.ndarray, " edges"]
-    totals: Float64[np.ndarray, " K"]
-    errors: Float64[np.ndarray, " K"]
+    labels: Int32[np.ndarray, " N"]  # centroid of each vector
+    distances: Float32[np.ndarray, " N"]  # squared distance of each vector to its centroid when it was last assigned
+    near: UInt16[np.ndarray, "K k"]  # near centroids of each centroid, itself first
+    members: Int32[np.ndarray, " N"]  # vectors sorted by label
+    edges: Int[np.ndarray, " edges"]  # where each cluster's members begin
+    totals: Float64[np.ndarray, " K"]  # sum of the weights of each cluster
+    errors: Float64[np.ndarray, " K"]  # weighted error of each cluster when its vectors were last assigned
 
     def update(self, pool: Workers) -> None:
         """Move every centroid to the weighted mean of its vectors; one without vectors stays."""
@@ -212,14 +200,9 @@ class ShMetric:
     of the harmonics. Products of harmonics are sums of harmonics of up to twice the degree, so the means of these give
     all covariances. What the base colour's change costs in all other directions is left out: counting it made
     images worse, those of the capture and those from elsewhere.
-
-    Attributes:
-        sensitivity: sensitivity of the scene, with the means of harmonics to twice the scene's degree. A Gaussian that
-            no capture has seen has the identity.
-        degree: SH degree of the scene, at least 1.
     """
 
-    sensitivity: Sensitivity
+    sensitivity: Sensitivity  # with the means of harmonics to twice the scene's degree
     degree: int
 
     @classmethod

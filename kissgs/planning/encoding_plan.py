@@ -13,23 +13,13 @@ from kissgs.planning.quantize import Quantized
 from kissgs.planning.rd_criterion import Costs
 from kissgs.planning.sh_codebook import Codebook
 
-# ``EncodingPlan``: the encoder's decisions for a scene, independent of the container format.
-
 
 @dataclass(frozen=True, slots=True)
 class PlannedScene:
-    """Facts of the scene that was planned, so that the scene itself is not needed any more.
-
-    Attributes:
-        count: number of Gaussians.
-        visible: number of Gaussians that the plan could keep: those that a renderer draws, or all.
-        sh_degree: 0 to 3.
-        origin: see :class:`kissgs.Splats`.
-        antialiased: see :class:`kissgs.Splats`.
-    """
+    """Facts of the scene that was planned, so that the scene itself is not needed any more."""
 
     count: int
-    visible: int
+    visible: int  # number of Gaussians that the plan could keep: those that a renderer draws, or all
     sh_degree: int
     origin: Origin
     antialiased: bool
@@ -37,69 +27,37 @@ class PlannedScene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodingPlan:
-    """Levels of every cell, and the errors that they cause.
-
-    Attributes:
-        scene: the scene that was planned.
-        grid: cell of each Gaussian.
-        fields: levels by field of the metadata, one row per cell; ``f_rest_centroids``: one row per entry.
-        codebook: the SH codebook, and the entry of each Gaussian.
-        classes: ``(M,)`` sensitivity class of each Gaussian, from 0; each class has its own step.
-        form_error: largest relative change of a covariance by the choice of its equivalent form.
-        clipped_colors: number of Gaussians whose base colour, an outlier, was clipped.
-        errors: largest quantisation error per field and channel, in the field's own unit (positions: of their signed
-            logarithm; f_rest_centroids: of the codebook's entries). Base colours include the compensation of other
-            errors.
-        costs: squared error of one unit in each attribute, ``(M,)`` each; None for uniform planning.
-        rd_lambda: squared error per bit; None for uniform planning.
-        note: a sentence for the user if many Gaussians were pruned; else empty.
-        coarse: a sentence for the user if the positions are too coarse for the Gaussians; else empty.
-    """
+    """Levels of every cell, and the errors that they cause."""
 
     scene: PlannedScene
     grid: Grid
-    fields: dict[str, Quantized]
+    fields: dict[str, Quantized]  # by name in the metadata; one row per cell, or per entry of f_rest_centroids
     codebook: Codebook
-    classes: UInt8[np.ndarray, " M"]
-    form_error: float
-    clipped_colors: int
+    classes: UInt8[np.ndarray, " M"]  # sensitivity class of each Gaussian, from 0; each class has its own step
+    form_error: float  # largest relative change of a covariance by the choice of its equivalent form
+    clipped_colors: int  # number of Gaussians whose base colour, an outlier, was clipped
+    # largest quantisation error per field and channel, in the field's own unit (positions: of their signed logarithm;
+    # f_rest_centroids: of the codebook's entries). Base colours include the compensation of other errors
     errors: dict[str, list[float]]
-    costs: Costs | None = None
-    rd_lambda: float | None = None
-    note: str = ""
-    coarse: str = ""
-
-
-# ``Encoded``: the files of a container in memory, and figures of its encoding.
+    costs: Costs | None = None  # squared error of one unit in each attribute, ``(M,)`` each; None for uniform planning
+    rd_lambda: float | None = None  # squared error per bit; None for uniform planning
+    note: str = ""  # a sentence for the user if many Gaussians were pruned; else empty
+    coarse: str = ""  # a sentence for the user if the positions are too coarse for the Gaussians; else empty
 
 
 @dataclass(frozen=True, slots=True)
 class Encoded:
-    """A container in memory, and figures of its encoding.
+    """A container in memory, and figures of its encoding, some of them those of :class:`EncodingPlan`."""
 
-    Attributes:
-        files: name -> bytes, in the order in which they are best stored.
-        order: ``(M,)`` index in the encoded scene of every Gaussian of the container, in the container's order.
-        form_error: largest relative change of a covariance by the plan of its equivalent form.
-        invisible: number of Gaussians pruned because no renderer draws them.
-        pruned_by_rd: number of Gaussians pruned because removing them costs less than their bits.
-        clipped_colors: number of Gaussians with a clipped base colour (:func:`kissgs.planning.quantize.clip_outliers`).
-        errors: largest quantisation error by field and channel (:class:`kissgs.planning.encoding_plan.EncodingPlan`).
-        rd_lambda: squared error per bit; None for uniform planning.
-        codebook_side: S; the codebook has up to S × S entries.
-        note: a sentence for the user if many Gaussians were pruned; else empty.
-        coarse: a sentence for the user if the positions are too coarse for the Gaussians; else empty.
-    """
-
-    files: dict[str, bytes]
-    order: Int[np.ndarray, " M"]
+    files: dict[str, bytes]  # name -> bytes, in the order in which they are best stored
+    order: Int[np.ndarray, " M"]  # index in the encoded scene of every Gaussian, in the container's order
     form_error: float
-    invisible: int
-    pruned_by_rd: int
+    invisible: int  # number of Gaussians pruned because no renderer draws them
+    pruned_by_rd: int  # number of Gaussians pruned because removing them costs less than their bits
     clipped_colors: int
     errors: dict[str, list[float]]
     rd_lambda: float | None
-    codebook_side: int
+    codebook_side: int  # S; the codebook has up to S × S entries
     note: str = ""
     coarse: str = ""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from kissgs.core.array_types import Float32, Float64, Int64, UInt8
 from kissgs.core.numba_kernels import compiled
 
 
@@ -42,25 +43,15 @@ def largest_w(quats: np.ndarray, rotations: np.ndarray, forms: np.ndarray) -> No
     " float32[:, ::1])"
 )
 def apply_forms(
-    quats: np.ndarray,
-    scales: np.ndarray,
-    forms: np.ndarray,
-    rotations: np.ndarray,
-    permutations: np.ndarray,
-    new_quats: np.ndarray,
-    new_scales: np.ndarray,
+    quats: Float64[np.ndarray, "N 4"],
+    scales: Float32[np.ndarray, "N 3"],
+    forms: UInt8[np.ndarray, " N"],  # row of the table, plus 24 if the quaternion is negated
+    rotations: Float64[np.ndarray, "24 4"],
+    permutations: Int64[np.ndarray, "24 3"],  # scale order of each form
+    new_quats: Float64[np.ndarray, "N 4"],  # written
+    new_scales: Float32[np.ndarray, "N 3"],  # written
 ) -> None:
-    """Write rotations and log-scales in the forms 0 to 47: the Hamilton product with a row of the table, and its order.
-
-    Args:
-        quats: ``(N, 4)``.
-        scales: ``(N, 3)``.
-        forms: ``(N,)`` row of the table, plus 24 if the quaternion is negated.
-        rotations: ``(24, 4)`` quaternion of each form.
-        permutations: ``(24, 3)`` scale order of each form.
-        new_quats: ``(N, 4)``; written.
-        new_scales: ``(N, 3)``; written.
-    """
+    """Write rotations and log-scales in the forms: the Hamilton product with a row of the table, and its order."""
     for n in range(quats.shape[0]):
         row, sign = forms[n] % 24, 1.0 if forms[n] < 24 else -1.0
         w1, x1, y1, z1 = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from kissgs.core.array_types import Float32, Int32, Int64, UInt8
 from kissgs.core.numba_kernels import compiled
 
 
@@ -154,21 +155,17 @@ def _sort_four(items: np.ndarray, placed: np.ndarray, target: np.ndarray, cells:
 
 @compiled("float64(float32[:, ::1], int32[::1], float32[:, ::1], int64[::1], uint64, float64)")
 def plas_blocks(
-    items: np.ndarray, placed: np.ndarray, target: np.ndarray, tiling: np.ndarray, seed: np.uint64, threshold: float
+    items: Float32[np.ndarray, "S*S C"],
+    placed: Int32[np.ndarray, " S*S"],  # item in each cell; modified
+    target: Float32[np.ndarray, "S*S C"],
+    tiling: Int64[np.ndarray, " 6"],  # S, shift down and right, side of a block, first block and end of the blocks
+    seed: np.uint64,
+    threshold: float,
 ) -> float:
     """Move the items of some blocks of a shifted tiling towards their target, in random groups of four.
 
-    Args:
-        items: ``(S*S, C)`` vectors; not modified.
-        placed: ``(S*S,)`` item in each cell; modified.
-        target: ``(S*S, C)`` target vector of each cell.
-        tiling: side S of the grid, its shift down and right (on the torus), side of a block (even), first block and
-            the one after the last.
-        seed: seed of this tiling; a block's shuffles depend on it and the block's number alone, not on threads.
-        threshold: a block ends after a pass that reduces its squared distance by less than this share.
-
-    Returns:
-        Reduction of the sum of squared distances.
+    Shuffles of a block depend on ``seed`` and the block's number alone, not on threads. A block ends after a pass that
+    reduces its squared distance by less than the share ``threshold``. Return the reduction of all squared distances.
     """
     side, down, right, size, first, last = tiling
     per_row = side // size
@@ -204,24 +201,14 @@ def plas_blocks(
 
 @compiled("void(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], int64[:, ::1], uint8[::1])")
 def nearest_forms(
-    quats: np.ndarray,
-    scales: np.ndarray,
-    target: np.ndarray,
-    rotations: np.ndarray,
-    permutations: np.ndarray,
-    forms: np.ndarray,
+    quats: Float32[np.ndarray, "N 4"],  # unit quaternions times the proxy's levels per unit
+    scales: Float32[np.ndarray, "N 3"],  # log-scales times the proxy's levels per unit
+    target: Float32[np.ndarray, "N 7"],  # target w, x, y, z and three log-scales, in these units
+    rotations: Float32[np.ndarray, "24 4"],
+    permutations: Int64[np.ndarray, "24 3"],  # order of the scales in the forms
+    forms: UInt8[np.ndarray, " N"],  # row of the table, plus 24 for -q; modified: the form on entry wins ties
 ) -> None:
-    """Choose for each Gaussian the one of its 48 equivalent forms with the smallest L1 distance to its target.
-
-    Args:
-        quats: ``(N, 4)`` unit quaternions times the proxy's levels per unit.
-        scales: ``(N, 3)`` log-scales times the proxy's levels per unit.
-        target: ``(N, 7)`` target w, x, y, z and three log-scales, in these units.
-        rotations: ``(24, 4)`` quaternions of the forms.
-        permutations: ``(24, 3)`` order of the scales in the forms.
-        forms: ``(N,)`` chosen forms: row of the table, plus 24 if the quaternion is negated; modified. The form on
-            entry wins ties.
-    """
+    """Choose for each Gaussian the one of its 48 equivalent forms with the smallest L1 distance to its target."""
     for n in range(quats.shape[0]):
         w, x, y, z = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
         t = target[n]

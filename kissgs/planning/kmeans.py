@@ -28,21 +28,9 @@ CANDIDATES = 4
 """Centroids of nearby cells among which the nearest ones are found, in multiples of the number to be found."""
 
 
-def start(
-    data: Vectors, spread: float, size: int, *, seed: int, neighbors: int, tolerance: float, pool: Workers
-) -> Clustering:
-    """Return a hierarchical clustering: about K^(1/3) cells, each of them split likewise, and their centroids.
-
-    Args:
-        data: the vectors.
-        spread: their root mean square distance from the mean, per dimension.
-        size: K, largest number of centroids.
-        seed: seed of all random choices.
-        neighbors: number of near centroids of each centroid.
-        tolerance: root mean square error per dimension below which a cluster is not split further.
-        pool: threads.
-    """
-    rng = np.random.Generator(np.random.PCG64(seed))
+def start(data: Vectors, spread: float, size: int, options: KMeansOptions, pool: Workers) -> Clustering:
+    """Return a hierarchical clustering: about K^(1/3) cells, each of them split likewise, and their centroids."""
+    rng = np.random.Generator(np.random.PCG64(options.seed))
     dimensions = data.table.shape[1]
     labels = np.zeros(len(data.rows), dtype=np.int32)
     counts, errors = np.array([len(labels)]), np.array([len(labels) * dimensions * spread**2])
@@ -51,11 +39,11 @@ def start(
         (round(size ** (2 / 3)), CELL_ITERATIONS),
         (size, START_ITERATIONS),
     ):
-        shares = allocate(errors, counts, max(number, len(counts)), dimensions * tolerance**2)
+        shares = allocate(errors, counts, max(number, len(counts)), dimensions * options.tolerance**2)
         centroids, labels, distances = _split(data, labels, shares, iterations, rng, pool)
         counts = np.bincount(labels, minlength=len(centroids))
         errors = np.bincount(labels, distances * data.weights, minlength=len(centroids))
-    near = near_centroids(centroids, np.concatenate([[0], np.cumsum(shares)]), neighbors, pool)
+    near = near_centroids(centroids, np.concatenate([[0], np.cumsum(shares)]), options.neighbors, pool)
     members, edges = sorted_by_label(labels, len(centroids))
     state = Clustering(data, centroids, labels, distances, near, members, edges, np.zeros(len(centroids)), errors)
     state.update(pool)
@@ -70,11 +58,7 @@ def _split(
     rng: np.random.Generator,
     pool: Workers,
 ) -> tuple[Float32[np.ndarray, "K D"], Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
-    """Cluster the vectors of every cell into its share of clusters.
-
-    Returns:
-        The centroids, cell by cell; the nearest centroid of its cell to each vector; and the squared distance to it.
-    """
+    """Cluster the vectors of every cell into its share of clusters."""
     members, edges = sorted_by_label(cells, len(shares))
     firsts = np.concatenate([[0], np.cumsum(shares)])
     seeds = rng.integers(0, 2**63, len(shares))
@@ -176,18 +160,17 @@ def near_centroids(
     return near
 
 
-# Weighted k-means of many vectors with many centroids, in time proportional to the vectors.
-#
 # Comparing every vector with every centroid takes too long for a million vectors and 65,536 centroids. Three methods
 # from the literature replace it:
 #
 # - The start is hierarchical: vectors are split among cells, cells among smaller cells, and each of these gets
-# centroids   in proportion to sqrt(its error × its count). - A vector then moves only to one of the centroids nearest
-# to its present one (k²-means: Agustsson, Timofte and Van   Gool, CVPR 2017). The lists of near centroids are made from
-# the cells; later iterations search them again, because the   centroids move. - Between two such iterations, pairs of
-# similar clusters are merged and spread-out clusters are split, as long as that   lowers the error (iterative splitting
-# and merging: Kaukoranta, Fränti and Nevalainen, Optical Engineering 37, 1998).   Plain k-means cannot move a centroid
-# from where it is useless to where it is needed; with this step the error ends   below that of an exhaustive search.
+#   centroids in proportion to sqrt(its error × its count).
+# - A vector then moves only to one of the centroids nearest to its present one (k²-means: Agustsson, Timofte and Van
+#   Gool, CVPR 2017). The lists of near centroids are made from the cells, and searched again as the centroids move.
+# - Between two such iterations, pairs of similar clusters are merged and spread-out clusters are split, as long as that
+#   lowers the error (iterative splitting and merging: Kaukoranta, Fränti and Nevalainen, Optical Engineering 37, 1998).
+#   Plain k-means cannot move a centroid from where it is useless to where it is needed; with this step the error ends
+#   below that of an exhaustive search.
 #
 # Vectors are read where they are, by their index; beside them the clustering needs some 20 bytes for each and some 600
 # for each centroid. Sums run in a fixed order in float64, each cluster belongs to one task, and all random numbers come
@@ -202,40 +185,25 @@ OUTLIERS = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KMeansOptions:
-    """Options of :func:`fit`.
-
-    Attributes:
-        seed: seed of all random choices.
-        iterations: iterations after the hierarchical start.
-        neighbors: number of centroids, the nearest to a vector's present one, that are compared in an iteration.
-        tolerance: root mean square error per dimension below which a cluster is not split further.
-        lattice: step that centroids are rounded to, in units of the codebook's root mean square error; vectors are
-            then assigned to the rounded centroids. 0 does not round.
-        from_zero: whether the lattice holds 0 in all dimensions, instead of each dimension's smallest value, and any
-            number of its points may be used, instead of 255 per dimension.
-    """
+    """Options of :func:`fit`."""
 
     seed: int
-    iterations: int
-    neighbors: int
-    tolerance: float
-    lattice: float
+    iterations: int  # iterations after the hierarchical start
+    neighbors: int  # number of centroids, the nearest to a vector's present one, that are compared in an iteration
+    tolerance: float  # root mean square error per dimension below which a cluster is not split further
+    lattice: float  # step that centroids are rounded to, in units of the codebook's root mean square error
+    # whether the lattice holds 0 in all dimensions, instead of each dimension's smallest value, and any number of its
+    # points may be used, instead of 255 per dimension
     from_zero: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Clusters:
-    """Result of a clustering.
-
-    Attributes:
-        centroids: ``(K, D)``.
-        labels: ``(N,)`` centroid of each vector.
-        step: step of the lattice that the centroids lie on; 0 for none.
-    """
+    """Result of a clustering."""
 
     centroids: Float32[np.ndarray, "K D"]
-    labels: Int32[np.ndarray, " N"]
-    step: float
+    labels: Int32[np.ndarray, " N"]  # centroid of each vector
+    step: float  # step of the lattice that the centroids lie on; 0 for none
 
 
 def fit(
@@ -249,22 +217,7 @@ def fit(
     metric: ShMetric | None = None,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Clusters:
-    """Find at most ``size`` centroids of small weighted squared error.
-
-    Args:
-        table: finite vectors, of which some are clustered.
-        rows: their rows in the table, N at least 1.
-        weights: positive weight of each vector's squared error.
-        size: K, largest number of centroids, at most 65,536.
-        pool: threads.
-        options: options of the clustering.
-        metric: forms of the errors of the table's rows, by which the clustering is then improved; the Euclidean
-            distance for None.
-        report: receives the fraction done, 0 to 1.
-
-    Returns:
-        The clusters; fewer than ``size`` if the vectors are few, similar or repeated.
-    """
+    """Find at most ``size`` centroids of small weighted squared error."""
     # The kernels take contiguous, writeable arrays only, although they do not write to these.
     data = Vectors(
         np.require(table, requirements=("C", "W")),
@@ -279,15 +232,7 @@ def fit(
         step = _round_to_lattice(unique, 0.0, options) if options.lattice else 0.0
         return Clusters(unique, exact.reshape(-1).astype(np.int32), step)
 
-    state = start(
-        data,
-        spread,
-        size,
-        seed=options.seed,
-        neighbors=options.neighbors,
-        tolerance=options.tolerance,
-        pool=pool,
-    )
+    state = start(data, spread, size, options, pool)
     report(0.4)
     all_iterations = options.iterations + (0 if metric is None else METRIC_ITERATIONS)
     for iteration in range(options.iterations):
@@ -337,11 +282,7 @@ def _mean_square_error(state: Clustering, pool: Workers) -> float:
 
 
 def _round_to_lattice(centroids: np.ndarray, step: float, options: KMeansOptions) -> float:
-    """Round in place to whole steps from each dimension's smallest value; a constant dimension keeps its value.
-
-    Returns:
-        The step: ``step``, or the one that 256 levels or the tolerance need if that is larger.
-    """
+    """Round in place to whole steps from each dimension's smallest value; a constant dimension keeps its value."""
     tolerance, low = options.tolerance, np.zeros(centroids.shape[1])
     step = max(step, 2 * tolerance)
     if not options.from_zero:

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from kissgs.core.array_types import Bool, Float32, Float64, Int32, Int64, UInt16
 from kissgs.core.numba_kernels import compiled
-
-# Compiled inner loops of the k-means of the SH codebook: sorting by label, means, near centroids and assignment.
 
 
 @compiled("void(int32[::1], int64[::1], int32[::1])")
-def sort_by_label(labels: np.ndarray, edges: np.ndarray, members: np.ndarray) -> None:
-    """Write the numbers of the vectors, sorted by label, to ``members``.
+def sort_by_label(
+    labels: Int32[np.ndarray, " N"], edges: Int64[np.ndarray, " K"], members: Int32[np.ndarray, " N"]
+) -> None:
+    """Write the numbers of the vectors, sorted by label, to ``members``; vectors of equal label keep their order.
 
-    Args:
-        labels: ``(N,)`` label of each vector.
-        edges: ``(K,)`` number of vectors of smaller labels, for each label; modified.
-        members: ``(N,)`` result; vectors of equal label keep their order.
+    ``edges`` are the numbers of vectors of smaller labels; they are modified.
     """
     for n in range(labels.shape[0]):
         label = labels[n]
@@ -42,33 +40,19 @@ def weighted_sums(
     "float32[:, ::1], float64[::1], float64[::1])"
 )
 def means(
-    table: np.ndarray,
-    rows: np.ndarray,
-    weights: np.ndarray,
-    distances: np.ndarray,
-    members: np.ndarray,
-    edges: np.ndarray,
+    table: Float32[np.ndarray, "R D"],
+    rows: Int64[np.ndarray, " N"],  # row of each vector
+    weights: Float32[np.ndarray, " N"],
+    distances: Float32[np.ndarray, " N"],  # squared distances to the centroids before
+    members: Int32[np.ndarray, " N"],  # vectors sorted by cluster
+    edges: Int64[np.ndarray, " K+1"],  # where the members of each cluster begin
     first: int,
-    last: int,
-    centroids: np.ndarray,
-    totals: np.ndarray,
-    errors: np.ndarray,
+    last: int,  # exclusive
+    centroids: Float32[np.ndarray, "K D"],  # modified
+    totals: Float64[np.ndarray, " K"],  # receives the sums of the weights
+    errors: Float64[np.ndarray, " K"],  # receives the weighted sums of the distances
 ) -> None:
-    """Move the centroids ``first`` to ``last`` to the weighted means of their vectors; one without vectors stays.
-
-    Args:
-        table: ``(R, D)`` vectors.
-        rows: ``(N,)`` row of each vector.
-        weights: ``(N,)`` weights.
-        distances: ``(N,)`` squared distances to the centroids before.
-        members: ``(N,)`` vectors sorted by cluster.
-        edges: ``(K + 1,)`` where the members of each cluster begin.
-        first: first cluster.
-        last: the one after the last.
-        centroids: ``(K, D)``; modified.
-        totals: ``(K,)`` receives the sums of the weights.
-        errors: ``(K,)`` receives the weighted sums of the distances.
-    """
+    """Move the centroids ``first`` to ``last`` to the weighted means of their vectors; one without vectors stays."""
     dimensions = table.shape[1]
     total = np.empty(dimensions)
     for k in range(first, last):
@@ -94,18 +78,18 @@ def means(
     "void(float32[:, ::1], uint16[:, ::1], int64, int64, int64, uint16[:, ::1])",
     fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
 )
-def find_near(centroids: np.ndarray, near: np.ndarray, others: int, first: int, last: int, found: np.ndarray) -> None:
+def find_near(
+    centroids: Float32[np.ndarray, "K D"],
+    near: UInt16[np.ndarray, "K k"],
+    others: int,
+    first: int,
+    last: int,
+    found: UInt16[np.ndarray, "K k"],
+) -> None:
     """Find near centroids of the centroids ``first`` to ``last`` in the lists of them and of those near to them.
 
-    A neighbour's neighbour is probably a neighbour (NN-descent: Dong, Moses and Li, WWW 2011).
-
-    Args:
-        centroids: ``(K, D)``.
-        near: ``(K, k)`` near centroids of each so far, itself first, none twice.
-        others: number of near centroids whose lists are searched as well.
-        first: first centroid.
-        last: the one after the last.
-        found: ``(K, k)`` receives the near centroids, itself first, then by rising distance.
+    A neighbour's neighbour is probably a neighbour (NN-descent: Dong, Moses and Li, WWW 2011). The lists of ``others``
+    near ones are searched; ``found`` receives the centroid itself, then others by rising distance.
     """
     count = near.shape[1]
     seen = np.full(near.shape[0], -1, dtype=np.int32)
@@ -141,31 +125,18 @@ def find_near(centroids: np.ndarray, near: np.ndarray, others: int, first: int, 
     fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
 )
 def assign_near(
-    table: np.ndarray,
-    rows: np.ndarray,
-    members: np.ndarray,
-    edges: np.ndarray,
-    centroids: np.ndarray,
-    near: np.ndarray,
+    table: Float32[np.ndarray, "R D"],
+    rows: Int64[np.ndarray, " N"],  # row of each vector
+    members: Int32[np.ndarray, " N"],  # vectors sorted by cluster
+    edges: Int64[np.ndarray, " K+1"],  # where the members of each cluster begin
+    centroids: Float32[np.ndarray, "K D"],
+    near: UInt16[np.ndarray, "K k"],  # near centroids of each cluster; the first wins ties
     first: int,
-    last: int,
-    labels: np.ndarray,
-    distances: np.ndarray,
+    last: int,  # exclusive
+    labels: Int32[np.ndarray, " N"],  # receives the centroids
+    distances: Float32[np.ndarray, " N"],  # receives the squared distances
 ) -> None:
-    """Assign the vectors of the clusters ``first`` to ``last`` to the nearest of their cluster's near centroids.
-
-    Args:
-        table: ``(R, D)`` vectors.
-        rows: ``(N,)`` row of each vector.
-        members: ``(N,)`` vectors sorted by cluster.
-        edges: ``(K + 1,)`` where the members of each cluster begin.
-        centroids: ``(K, D)``.
-        near: ``(K, k)`` near centroids of each cluster; the first wins ties.
-        first: first cluster.
-        last: the one after the last.
-        labels: ``(N,)`` receives the centroids.
-        distances: ``(N,)`` receives the squared distances.
-    """
+    """Assign the vectors of the clusters ``first`` to ``last`` to the nearest of their cluster's near centroids."""
     dimensions = table.shape[1]
     thirds = dimensions - dimensions % 3
     count = near.shape[1]
@@ -217,26 +188,17 @@ def assign_near(
     fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
 )
 def assign_by_form(
-    vectors: np.ndarray,
-    members: np.ndarray,
-    edges: np.ndarray,
-    centroids: np.ndarray,
-    near: np.ndarray,
+    vectors: Float32[np.ndarray, "n P+D"],  # upper triangle of the form of each, row by row, and the form times it
+    members: Int32[np.ndarray, " n"],  # numbers of the vectors, sorted by cluster
+    edges: Int64[np.ndarray, " C+1"],  # where the vectors of each cluster begin
+    centroids: Float32[np.ndarray, "K D"],  # three values of each coefficient in a row
+    near: UInt16[np.ndarray, "K k"],  # near centroids of each; the first wins ties
     first: int,
-    labels: np.ndarray,
+    labels: Int32[np.ndarray, " N"],  # receives the centroids
 ) -> None:
     """Assign vectors of some clusters to that of their cluster's near centroids at which their own form is smallest.
 
     The form of a difference x - c is that of c less twice the product of c with the form times x, and a constant.
-
-    Args:
-        vectors: ``(n, P + D)`` upper triangle of the form of each vector, row by row, and the form times the vector.
-        members: ``(n,)`` numbers of the vectors, sorted by cluster.
-        edges: ``(C + 1,)`` where the vectors of each cluster begin.
-        centroids: ``(K, D)``, three values of each coefficient in a row.
-        near: ``(K, k)`` near centroids of each; the first wins ties.
-        first: number of the first cluster.
-        labels: ``(N,)`` receives the centroids.
     """
     dimensions = centroids.shape[1]
     coefficients = dimensions // 3
@@ -279,30 +241,17 @@ def assign_by_form(
             labels[members[i]] = near[first + cluster, best]
 
 
-# Compiled inner loops by which k-means merges clusters and gives their numbers to halves of others.
-
-
 @compiled("void(float32[:, ::1], float64[::1], uint16[:, ::1], int64, int64, int32[::1], float64[::1])")
 def merge_costs(
-    centroids: np.ndarray,
-    totals: np.ndarray,
-    near: np.ndarray,
+    centroids: Float32[np.ndarray, "K D"],
+    totals: Float64[np.ndarray, " K"],
+    near: UInt16[np.ndarray, "K k"],  # near centroids of each, itself first
     first: int,
-    last: int,
-    partners: np.ndarray,
-    costs: np.ndarray,
+    last: int,  # exclusive
+    partners: Int32[np.ndarray, " K"],  # receives the other cluster; itself where there is none
+    costs: Float64[np.ndarray, " K"],  # receives the growth of the squared error (Ward): 0 for clusters without vectors
 ) -> None:
-    """Find for the clusters ``first`` to ``last`` the near cluster with which they merge at the smallest cost.
-
-    Args:
-        centroids: ``(K, D)``, the means of the clusters.
-        totals: ``(K,)`` weights of the clusters.
-        near: ``(K, k)`` near centroids of each, itself first.
-        first: first cluster.
-        last: the one after the last.
-        partners: ``(K,)`` receives the other cluster; of clusters without vectors, and where there is none, themselves.
-        costs: ``(K,)`` receives the growth of the squared error (Ward): 0 for clusters without vectors.
-    """
+    """Find for the clusters ``first`` to ``last`` the near cluster with which they merge at the smallest cost."""
     for k in range(first, last):
         partners[k] = k
         costs[k] = 0.0
@@ -328,39 +277,22 @@ def merge_costs(
     "float64[::1], float64[::1], float64, int64, int64, boolean[::1], float64[::1])"
 )
 def split_gains(
-    table: np.ndarray,
-    rows: np.ndarray,
-    weights: np.ndarray,
-    distances: np.ndarray,
-    members: np.ndarray,
-    edges: np.ndarray,
-    centroids: np.ndarray,
-    totals: np.ndarray,
-    errors: np.ndarray,
-    least: float,
+    table: Float32[np.ndarray, "R D"],
+    rows: Int64[np.ndarray, " N"],  # row of each vector
+    weights: Float32[np.ndarray, " N"],
+    distances: Float32[np.ndarray, " N"],  # squared distance of each vector, by which the worst is found
+    members: Int32[np.ndarray, " N"],  # vectors sorted by cluster
+    edges: Int64[np.ndarray, " K+1"],  # where the members of each cluster begin
+    centroids: Float32[np.ndarray, "K D"],
+    totals: Float64[np.ndarray, " K"],
+    errors: Float64[np.ndarray, " K"],
+    least: float,  # error from which on a cluster is split
     first: int,
-    last: int,
-    second: np.ndarray,
-    gains: np.ndarray,
+    last: int,  # exclusive
+    second: Bool[np.ndarray, " N"],  # receives whether a vector belongs to the second half
+    gains: Float64[np.ndarray, " K"],  # receives by how much the squared error shrinks
 ) -> None:
-    """Split the clusters ``first`` to ``last`` in two, by 2-means that starts from the mean and the worst vector.
-
-    Args:
-        table: ``(R, D)`` vectors.
-        rows: ``(N,)`` row of each vector.
-        weights: ``(N,)`` weights.
-        distances: ``(N,)`` squared distance of each vector, by which the worst is found.
-        members: ``(N,)`` vectors sorted by cluster.
-        edges: ``(K + 1,)`` where the members of each cluster begin.
-        centroids: ``(K, D)``, the means of the clusters.
-        totals: ``(K,)`` weights of the clusters.
-        errors: ``(K,)`` errors of the clusters.
-        least: error from which on a cluster is split.
-        first: first cluster.
-        last: the one after the last.
-        second: ``(N,)`` receives whether a vector belongs to the second half.
-        gains: ``(K,)`` receives by how much the squared error shrinks; 0 for clusters that are not split.
-    """
+    """Split the clusters ``first`` to ``last`` in two, by 2-means that starts from the mean and the worst vector."""
     dimensions = table.shape[1]
     one = np.empty(dimensions)
     two = np.empty(dimensions)
@@ -411,33 +343,20 @@ def split_gains(
     "int32[::1], uint16[:, ::1])"
 )
 def relocate(
-    merged: np.ndarray,
-    split: np.ndarray,
-    partners: np.ndarray,
-    costs: np.ndarray,
-    gains: np.ndarray,
-    second: np.ndarray,
-    members: np.ndarray,
-    edges: np.ndarray,
-    labels: np.ndarray,
-    near: np.ndarray,
+    merged: Int32[np.ndarray, " _"],  # clusters by rising cost
+    split: Int32[np.ndarray, " _"],  # clusters by falling gain
+    partners: Int32[np.ndarray, " K"],  # cluster that takes the vectors of a merged one
+    costs: Float64[np.ndarray, " K"],  # growth of the error by merging
+    gains: Float64[np.ndarray, " K"],  # shrinkage of the error by splitting
+    second: Bool[np.ndarray, " N"],  # whether a vector belongs to the half that gets another number
+    members: Int32[np.ndarray, " N"],  # vectors sorted by cluster
+    edges: Int64[np.ndarray, " K+1"],  # where the members of each cluster begin
+    labels: Int32[np.ndarray, " N"],  # cluster of each vector; modified
+    near: UInt16[np.ndarray, "K k"],  # near centroids of each, itself first; modified
 ) -> None:
     """Merge clusters into their partners and give their numbers to halves of others, while that lowers the error.
 
     A cluster takes part once at most.
-
-    Args:
-        merged: clusters by rising cost.
-        split: clusters by falling gain.
-        partners: ``(K,)`` cluster that takes the vectors of a merged one.
-        costs: ``(K,)`` growth of the error by merging.
-        gains: ``(K,)`` shrinkage of the error by splitting.
-        second: ``(N,)`` whether a vector belongs to the half that gets another number.
-        members: ``(N,)`` vectors sorted by cluster.
-        edges: ``(K + 1,)`` where the members of each cluster begin.
-        labels: ``(N,)`` cluster of each vector; modified.
-        near: ``(K, k)`` near centroids of each, itself first; modified: of the cluster with a new place, of the one
-            that was split, and of those near to it.
     """
     count = near.shape[1]
     used = np.zeros(near.shape[0], dtype=np.bool_)

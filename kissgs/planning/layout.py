@@ -41,22 +41,7 @@ def plas(
     start_radius: int | None = None,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Int32[np.ndarray, " cells"]:
-    """Arrange ``S*S`` vectors on an S × S grid.
-
-    Args:
-        items: vectors in their initial arrangement, row-major; S is a multiple of 8. Squared distances are minimised,
-            so scale and weight the channels before.
-        pool: threads for the blocks; the result does not depend on their number.
-        seed: seed of all random choices.
-        decay: factor from one filter radius to the next; smaller is faster and slightly less smooth.
-        threshold: relative improvement of a pass below which a block counts as converged.
-        start_radius: first filter radius, cells; by default half the grid, which does not preserve the initial
-            arrangement. A small radius preserves a good one, such as a space-filling curve, and takes less time.
-        report: receives the fraction done, 0 to 1.
-
-    Returns:
-        For each cell, row-major, the index of its item.
-    """
+    """Arrange ``S*S`` vectors on an S × S grid."""
     side = round(len(items) ** 0.5)
     placed = np.arange(len(items), dtype=np.int32)
     rng = np.random.Generator(np.random.PCG64(seed))
@@ -142,15 +127,7 @@ def principal_axes(vectors: Float32[np.ndarray, "N D"], number: int) -> Float32[
 
 
 def axes_order(coordinates: Float32[np.ndarray, "cells axes"]) -> Int[np.ndarray, " cells"]:
-    """Arrange ``S*S`` vectors on an S × S grid.
-
-    Args:
-        coordinates: coordinates along their principal axes, largest variance first; S is a multiple of 8. Axes that are
-            missing do not move anything.
-
-    Returns:
-        For each cell, row-major, the index of its vector.
-    """
+    """Arrange ``S*S`` vectors on an S × S grid."""
     cells = len(coordinates)
     side = round(cells**0.5)
     order = np.arange(cells)[None]
@@ -178,19 +155,12 @@ CURVE_BITS = 48
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Cells of the grid and their Gaussians, row-major.
+    """Cells of the grid and their Gaussians, row-major."""
 
-    Attributes:
-        side: G, cells per axis.
-        cells: ``(G*G,)`` index in the scene of each cell's Gaussian; padding repeats a Gaussian.
-        mask: ``(G*G,)`` true for cells with a Gaussian, false for padding.
-        cell_to_gaussian: ``(G*G,)`` for each cell, the rank of its Gaussian among the cells with ``mask``.
-    """
-
-    side: int
-    cells: Int[np.ndarray, " cells"]
-    mask: Bool[np.ndarray, " cells"]
-    cell_to_gaussian: Int[np.ndarray, " cells"]
+    side: int  # G, cells per axis
+    cells: Int[np.ndarray, " cells"]  # index in the scene of each cell's Gaussian; padding repeats a Gaussian
+    mask: Bool[np.ndarray, " cells"]  # true for cells with a Gaussian, false for padding
+    cell_to_gaussian: Int[np.ndarray, " cells"]  # for each cell, the rank of its Gaussian among the cells with ``mask``
 
     def with_padding_last(self) -> Grid:
         """Move the last Gaussians into the padding before them, so that all padding is at the end."""
@@ -218,9 +188,6 @@ def layout_grid(
 
     With ``classes`` and the Hilbert order, the Gaussians of class 0 come first, then those of class 1 and so on, each
     class along its own curve. With ``groups``, all this is done for group 0, then for group 1 and so on.
-
-    Raises:
-        UnsupportedError: more Gaussians than one image can hold.
     """
     side = grid_side(len(kept))
     if len(kept) == 0:
@@ -277,11 +244,7 @@ def _standardized(values: np.ndarray) -> np.ndarray:
 
 
 def grid_side(count: int) -> int:
-    """Return the side of the square grid for ``count`` Gaussians: the smallest multiple of 8 that fits, at least 8.
-
-    Raises:
-        UnsupportedError: more Gaussians than one image can hold.
-    """
+    """Return the side of the square grid for ``count`` Gaussians: the smallest multiple of 8 that fits, at least 8."""
     side = isqrt(max(count, 1) - 1) + 1
     side = -(-side // 8) * 8
     if side > MAX_GRID_SIDE:
@@ -294,16 +257,7 @@ def grid_side(count: int) -> int:
 def hilbert_order(
     levels: UInt16[np.ndarray, "N 3"], classes: Integer[np.ndarray, " N"] | None = None, pool: Workers | None = None
 ) -> Int32[np.ndarray, " N"]:
-    """Return the order in which a 3D Hilbert curve visits the positions, the smallest class first.
-
-    Args:
-        levels: 16-bit positions.
-        classes: class of each Gaussian, below 2^16; None if all are in one.
-        pool: threads; None for the calling one.
-
-    Returns:
-        Indices of the Gaussians along the curve; Gaussians of equal position keep their order.
-    """
+    """Return the order in which a 3D Hilbert curve visits the positions, the smallest class first."""
     from kissgs.planning import kernels
 
     count = len(levels)

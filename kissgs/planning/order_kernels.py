@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
+from kissgs.core.array_types import Int32, UInt64
 from kissgs.core.numba_kernels import compiled
 
 
 @compiled("void(uint64[::1], int32[::1], uint64[::1], int32[::1], int64)")
 def sort_keys(
-    keys: np.ndarray, order: np.ndarray, other_keys: np.ndarray, other_order: np.ndarray, passes: int
+    keys: UInt64[np.ndarray, " N"],
+    order: Int32[np.ndarray, " N"],
+    other_keys: UInt64[np.ndarray, " N"],
+    other_order: Int32[np.ndarray, " N"],
+    passes: int,
 ) -> None:
-    """Sort ``keys`` stably by their lowest 12 · ``passes`` bits, by radix sort, and write the permutation to ``order``.
+    """Sort ``keys`` stably by their lowest 12 · ``passes`` bits, and write the permutation to ``order``, by radix sort.
 
-    Args:
-        keys: ``(N,)``; sorted.
-        order: ``(N,)``; written.
-        other_keys: ``(N,)`` scratch.
-        other_order: ``(N,)`` scratch.
-        passes: number of digits of 12 bits; even, so that the result ends in ``keys`` and ``order``.
+    ``passes`` is even, so that the result ends in ``keys`` and ``order``; the others are scratch.
     """
     count = keys.shape[0]
     counts = np.zeros((passes, 4096), np.int64)

@@ -1,9 +1,7 @@
-"""Order along the Hilbert curve, refined such that WebP predicts positions and base colours better.
+"""Order along the Hilbert curve, refined by the local search of the travelling-salesman problem (2-opt and Or-opt).
 
-WebP codes the difference of a pixel from the one on its left. Along a curve through space, that works for the high
-bytes of positions and for base colours; low bytes, opacities, scales, rotations and labels do not resemble those of
-neighbours. So the Gaussians of each class are reordered, by the local search of the travelling-salesman problem (2-opt
-and Or-opt), such that these differences take fewer bits.
+WebP codes the differences of a pixel from the one on its left, which then take fewer bits for what resembles that of
+neighbours: high bytes of positions and base colours.
 """
 
 from __future__ import annotations
@@ -80,13 +78,6 @@ def refined_order(
 
     Gaussians at the same position keep their order, because renderers blend them in it. The first and the last Gaussian
     of a run stay.
-
-    Args:
-        means: levels of positions, along a curve through space.
-        colors: levels of base colours.
-        runs: equal for Gaussians that follow one another anyway; only these change places.
-        pool: threads. The result does not depend on their number.
-        report: receives the fraction done, 0 to 1.
     """
     pixels, order = _pixels(means, colors), np.arange(len(means), dtype=np.int32)
     ends = np.concatenate([np.flatnonzero(np.diff(runs)) + 1, [len(runs)]]).tolist()

@@ -14,7 +14,7 @@ from kissgs.core.resources import Workers, blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.planning import table_fields
-from kissgs.planning.container_model import EVEN_LEVELS, ByteTables, ContainerModel
+from kissgs.planning.container_model import EVEN_LEVELS, ByteTables, ContainerModel, Planning
 from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import layout_grid
 from kissgs.planning.order_refinement import refine_order
@@ -29,7 +29,7 @@ from kissgs.planning.quantize import (
     quantize_means,
 )
 from kissgs.planning.rate_distortion import ColorRefit, plan_rate_distortion
-from kissgs.planning.rd_fields import largest_errors
+from kissgs.planning.rd_fields import OUTLIERS, largest_errors
 from kissgs.planning.rotation_forms import choose_forms
 from kissgs.planning.rows import Rows, selected
 from kissgs.planning.sh_codebook import FEW, fit_codebook, size_weights
@@ -37,44 +37,30 @@ from kissgs.settings import EncodeSettings
 
 # Uniform planning: the steps of the settings for all Gaussians, without rendering the scene.
 
-OUTLIERS = 1e-4
-"""Share of base colours, at either end of a channel, that may be clipped so that the step of the others stays small."""
-
 FINEST = 1e-4
 """Step of values that may take all levels of a table."""
 
 
 def plan_uniform(
-    splats: Splats,
-    kept: Int[np.ndarray, " M"],
-    settings: EncodeSettings,
-    container: ContainerModel,
-    pool: Workers,
-    progress: Progress,
-    groups: UInt16[np.ndarray, " N"] | None = None,
+    splats: Splats, kept: Int[np.ndarray, " M"], planning: Planning, groups: UInt16[np.ndarray, " N"] | None = None
 ) -> EncodingPlan:
     """Plan the Gaussians ``kept``, which may be none, for a container."""
-    progress("order", 0.0)
+    settings, container, pool = planning.settings, planning.container, planning.pool
     most = 16 if container.tables is None else 32
     bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance, pool, most=most)
-    grid = layout_grid(
-        splats.means, kept, min(bits, 16), settings, pool, lambda fraction: progress("order", fraction), None, groups
-    )
+    grid = layout_grid(splats.means, kept, min(bits, 16), settings, pool, planning.report("order"), None, groups)
     grid = grid.with_padding_last() if container.padding_last else grid
     # Padding repeats Gaussians of the scene; in a scene without any, padding is a neutral Gaussian.
     source, cells = (splats, grid.cells) if len(kept) else (_neutral(splats.sh_degree), grid.cells * 0)
     clips = settings.shared_step_size and container.tables is None
     sh0 = clip_outliers(source.sh0, step=settings.sh0_step, share=OUTLIERS) if clips else source.sh0
-    progress("forms", 0.0)
-    shapes, form_error = choose_forms(
-        source, cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction), container
-    )
+    shapes, form_error = choose_forms(source, cells, grid.side, planning)
     chosen = cells[grid.mask]
     weights = np.ones(len(chosen), np.float32)
     if source.sh_degree > 0:
         weights = size_weights(source, settings.sh_weight_power)[chosen]
     size = max(len(chosen) / settings.gaussians_per_codebook_entry, FEW)
-    codebook = fit_codebook(source, chosen, weights, size, settings, container, pool, progress)
+    codebook = fit_codebook(source, chosen, weights, size, planning)
     return_free_memory()
     if container.tables is not None:
         means, colors = source.means[cells], source.sh0[cells]
@@ -112,14 +98,6 @@ def _table_fields(
     """Return the levels by field, and the largest errors, for a container with tables.
 
     Without ``shared_step_size``, every table has as many values as it may, and rotations have all their levels.
-
-    Args:
-        means: position of each cell's Gaussian.
-        colors: its ``sh0``.
-        values: its opacity logit, log-scales and unit quaternion, in the stored form.
-        bits: precision of positions.
-        settings: settings of the encoder.
-        tables: tables of the container.
     """
     equal = np.ones(len(means))
     steps = (settings.opacity_step, settings.scale_step, settings.quat_step, settings.sh0_step)
@@ -127,8 +105,10 @@ def _table_fields(
         steps = (FINEST, FINEST, FINEST, FINEST)
     opacity, scale, rotation, color = (step * equal for step in steps)
     unit = log_extent(means) / MEANS_TOP
+    wanted = table_fields.stored_values(values, tables)
+    shapes = table_fields.rounded_shapes(wanted, equal, (opacity, scale, rotation), tables)
     fields = {
-        **table_fields.shape_fields(values, (opacity, scale, rotation), equal, tables),
+        **table_fields.finished_shapes(shapes, values[:, 0], tables),
         "means": table_fields.means_field(means, max(unit, 1e-30) * 2.0 ** (16 - bits)),
         "f_dc": table_fields.color_field(colors.astype(np.float64), color, equal),
     }
@@ -177,24 +157,8 @@ def plan_encoding(
 ) -> EncodingPlan:
     """Choose order, rotation forms, codebook and levels for a clean scene.
 
-    Args:
-        splats: the scene.
-        settings: settings of the encoder.
-        sensitivity: squared image error of changes of the scene, for rate-distortion planning. Without it, or if no
-            camera saw any Gaussian, planning is uniform, with the steps of the settings.
-        recolor: for rate-distortion planning: returns better ``sh0`` for the decoded Gaussians and their indices in
-            the scene.
-        container: what the container can hold.
-        keep_costs: whether the plan of rate-distortion planning has its costs, which fine-tuning needs.
-        groups: group of each Gaussian, below 16,384: those of a group follow one another in the container, the groups
-            in ascending order. Not with PLAS. None for one group.
-        threads: number of threads; 0 means one per processor.
-        progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook", "rounding" and
-            "reorder".
-
-    Raises:
-        InvalidSceneError: ``sensitivity`` does not fit the scene.
-        UnsupportedError: the scene is too large for one container; groups with PLAS.
+    Without sensitivity, or if no camera saw any Gaussian, planning is uniform, with the steps of the settings. With
+    ``groups``, the Gaussians of each follow one another in the container, the groups in ascending order.
     """
     if groups is not None and settings.order == "plas":
         raise UnsupportedError("a container with groups of Gaussians needs order=hilbert or order=refined")
@@ -205,21 +169,11 @@ def plan_encoding(
     load_kernels(progress)
     kept = visible_gaussians(splats, settings)
     with blas_workers(threads) as pool:
+        planning = Planning(settings, container, pool, progress)
         if sensitivity is not None and (sensitivity.color_weight[kept] > 0).any():
-            plan = plan_rate_distortion(
-                splats,
-                kept,
-                sensitivity,
-                recolor,
-                settings,
-                container,
-                pool,
-                progress,
-                keep_costs=keep_costs,
-                groups=groups,
-            )
+            plan = plan_rate_distortion(splats, kept, sensitivity, recolor, planning, keep_costs, groups)
         else:
-            plan = plan_uniform(splats, kept, settings, container, pool, progress, groups)
+            plan = plan_uniform(splats, kept, planning, groups)
         if settings.order == "refined":
             plan = refine_order(plan, groups, pool, progress)
         return replace(plan, coarse=_coarse(splats, plan))

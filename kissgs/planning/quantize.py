@@ -1,9 +1,4 @@
-"""Uniform quantisers, and the ranges that decoders need to invert them.
-
-A SOG-XT decoder does not know the number of levels. It maps the smallest level observed in an image to each channel's
-``low`` and the largest to its ``high``, linearly (docs/reference/format.md). So the ranges that are written must be
-those of the levels that occur in the image; :func:`observed_range` returns them.
-"""
+"""Levels and the values that they stand for; uniform quantisers, and the ranges that decoders need to invert them."""
 
 from __future__ import annotations
 
@@ -22,42 +17,57 @@ MEANS_TOP = 65_535
 """Top level of positions. It must occur, because some readers of meta.json divide by it, not by the observed one."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Quantized:
-    """Levels of one plane and the values they stand for: ``value = low + level / top * (high - low)``, per channel.
-
-    With a table, levels stand for its values instead, in all channels.
-
-    Attributes:
-        levels: ``(N, C)`` from 0 to ``top``.
-        low: ``(C,)`` value of level 0.
-        high: ``(C,)`` value of level ``top``.
-        top: the level of ``high``, whether it occurs or not.
-        level_stride: distance between the levels that a row uses, one for all rows, ``(N,)`` or ``(N, C)``: with
-            ``level_offset`` added, levels are multiples of it. Single levels may be exceptions.
-        level_offset: offset added to levels before they are multiples of ``level_stride``.
-        table: ascending value of each level, for all channels; None for even levels.
-    """
+    """Levels of one field, and the table of the values that they stand for, ascending in every column."""
 
     levels: UInt8[np.ndarray, "N C"] | UInt16[np.ndarray, "N C"]
-    low: Float32[np.ndarray, " C"]
-    high: Float32[np.ndarray, " C"]
-    top: int
+    table: Float64[np.ndarray, "values _"]  # a column for each channel, or one for all
+    # With level_offset added, the levels of a row are multiples of its level_stride. Single levels may be exceptions.
     level_stride: int | Integer[np.ndarray, " N"] | Integer[np.ndarray, "N C"] = 1
     level_offset: int = 0
-    table: Float32[np.ndarray, " table"] | None = None
+
+    @property
+    def top(self) -> int:
+        """Largest level, whether it occurs or not."""
+        return len(self.table) - 1
+
+    @property
+    def low(self) -> Float32[np.ndarray, " C"]:
+        """Value of level 0, per column of the table."""
+        return self.table[0].astype(np.float32)
+
+    @property
+    def high(self) -> Float32[np.ndarray, " C"]:
+        """Value of the largest level, per column of the table."""
+        return self.table[-1].astype(np.float32)
 
     def values(self) -> Float64[np.ndarray, "N C"]:
         """Return the values that the levels stand for."""
-        if self.table is not None:
-            return self.table.astype(np.float64)[self.levels]
-        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
-        return np.asarray(low + self.levels * ((high - low) / self.top))
+        shared = self.table.shape[1] == 1
+        return np.asarray(self.table[self.levels, 0 if shared else np.arange(self.levels.shape[1])])
 
     def take(self, rows: Int[np.ndarray, " M"] | Bool[np.ndarray, " N"] | slice) -> Quantized:
         """Return the rows ``rows``, in that order; those of a slice are not copied."""
         spacing = self.level_stride if isinstance(self.level_stride, int) else self.level_stride[rows]
         return replace(self, levels=self.levels[rows], level_stride=spacing)
+
+    def from_zero(self) -> Quantized:
+        """Return the same values with the levels that do not occur left out at both ends; ends are float32 numbers."""
+        first = int(self.levels.min(initial=self.top))
+        last = min(max(int(self.levels.max(initial=0)), first + 1), self.top)
+        table = even_table(self.table[first].astype(np.float32), self.table[last].astype(np.float32), last - first)
+        return Quantized((self.levels - first).astype(np.uint8), table, self.level_stride, self.level_offset + first)
+
+
+def even_table(
+    low: Float[np.ndarray, " C"], high: Float[np.ndarray, " C"], top: int
+) -> Float64[np.ndarray, "values C"]:
+    """Return evenly spaced values from ``low`` to ``high``, per channel."""
+    low, high = low.astype(np.float64), high.astype(np.float64)
+    table = low + np.arange(top + 1)[:, None] * ((high - low) / max(top, 1))
+    table[-1] = high  # exact, as decoders have it
+    return np.asarray(table)
 
 
 def quantize(
@@ -68,19 +78,10 @@ def quantize(
     max_top: int = 255,
     pool: Workers | None = None,
 ) -> Quantized:
-    """Round to uniform steps.
+    """Round to uniform steps of at most ``step``, unless ``max_top`` steps do not span the widest channel.
 
-    Args:
-        values: finite values.
-        step: largest allowed step, in the unit of the values. It is exceeded only if ``max_top`` steps do not span
-            the widest channel.
-        shared: one step for all channels (least error for a given entropy). If false, every channel spreads
-            ``max_top`` levels over its own range, and ``step`` has no effect.
-        max_top: largest level.
-        pool: threads; None for the calling one.
-
-    Returns:
-        Levels whose values are at most half a step away; a constant channel is exact.
+    One step for all channels has the least error for a given entropy. If it is not shared, every channel spreads
+    ``max_top`` levels over its own range.
     """
     low, high = _range(values, pool)
     extent = high.astype(np.float64) - low
@@ -95,7 +96,7 @@ def quantize(
         levels[rows] = _levels(values[rows].astype(np.float64), low, high, top)
 
     for_each_block(len(values), work, pool)
-    return Quantized(levels, low, high, top)
+    return Quantized(levels, even_table(low, high, top))
 
 
 def clip_outliers(values: Float[np.ndarray, "N C"], *, step: float, share: float) -> Float[np.ndarray, "N C"]:
@@ -122,18 +123,11 @@ def quantize_means(
 ) -> Quantized:
     """Quantise positions to 16-bit levels of their signed logarithm, with one range for all three axes.
 
-    Args:
-        means: finite positions, float32.
-        bits: precision, 8 to 16, of all Gaussians or of each. Below 16 the levels are multiples of a power of two (the
-            low bytes then compress); the outermost level stays 65535.
-        pool: threads; None for the calling one.
-
-    Returns:
-        Levels (uint16) with ``low`` and ``high`` in the signed-log domain, equal in all channels.
+    Below 16 ``bits``, of all or of each, levels are multiples of a power of two, so that low bytes compress; the
+    outermost level stays 65535.
     """
     if len(means) == 0:
-        zeros = np.zeros(3, np.float32)
-        return Quantized(np.empty((0, 3), np.uint16), zeros, zeros, MEANS_TOP, *_strides(bits))
+        return Quantized(np.empty((0, 3), np.uint16), np.zeros((MEANS_TOP + 1, 3)), *_strides(bits))
     smallest, largest = (end(values) for end, values in zip((np.min, np.max), row_range(means, pool), strict=True))
     ends = signed_log(np.array([smallest, largest])).astype(np.float32) + np.float32(0)
     low, high = np.repeat(ends[:1], 3), np.repeat(ends[1:], 3)
@@ -148,7 +142,7 @@ def quantize_means(
         levels[rows] = found
 
     for_each_block(len(means), work, pool)
-    return Quantized(levels, low, high, MEANS_TOP, *_strides(bits))
+    return Quantized(levels, even_table(low, high, MEANS_TOP), *_strides(bits))
 
 
 def _strides(bits: int | Int[np.ndarray, " N"]) -> tuple[int | Int[np.ndarray, " N"]]:
@@ -192,21 +186,18 @@ def log_extent(means: Float32[np.ndarray, "N 3"] | Rows, pool: Workers | None = 
 def observed_range(quantized: Quantized) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
     """Return the range to write: values of the smallest and the largest level that occur, over all channels.
 
-    An image of a single level decodes to ``low`` everywhere, so both ends are then that level's value.
+    A SOG-XT decoder does not know the number of levels: it maps the smallest level of an image to one end and the
+    largest to the other (docs/reference/format.md). An image of a single level decodes to the first everywhere.
     """
     if quantized.levels.size == 0:
         return quantized.low, quantized.low
     first, last = int(quantized.levels.min()), int(quantized.levels.max())
-    if (first, last) == (0, quantized.top):
-        return quantized.low, quantized.high
-    low, high = quantized.low.astype(np.float64), quantized.high.astype(np.float64)
-    per_level = (high - low) / quantized.top
-    return (low + first * per_level).astype(np.float32), (low + last * per_level).astype(np.float32)
+    return quantized.table[first].astype(np.float32), quantized.table[last].astype(np.float32)
 
 
 def half_steps(quantized: Quantized, stride: int = 1) -> list[float]:
     """Return half the distance of levels that are multiples of ``stride``, per channel."""
-    extent = quantized.high.astype(np.float64) - quantized.low
+    extent = quantized.table[-1] - quantized.table[0]
     return [float(step) for step in extent / quantized.top * stride / 2]
 
 

@@ -7,13 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Int, Int32, UInt16
-from kissgs.core.progress import Progress
 from kissgs.core.resources import Workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import SH_C0, Splats
 from kissgs.planning.clustering import ShMetric
-from kissgs.planning.container_model import ContainerModel
+from kissgs.planning.container_model import Planning
 from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import layout_grid
 from kissgs.planning.quantize import Quantized, means_bits
@@ -71,16 +70,7 @@ def choose_lambda(
     view_uncertainty: float,
     refits: int,
 ) -> tuple[float, float]:
-    """Return the lambda of the settings, and that of the default quality.
-
-    Args:
-        usual: mean squared error of the default quality (:func:`default_error`).
-        costs: costs of all Gaussians that a renderer draws.
-        sh_model: error of the view-dependent colour, by codebook size.
-        settings: settings of the encoder.
-        view_uncertainty: that of the sensitivity, from 0 to 1.
-        refits: number of iterations of the colour refit.
-    """
+    """Return the lambda of the settings, and that of the default quality."""
 
     def for_error(error: float, quality_offset_db: float) -> float:
         """Return the lambda at which the squared error is about ``quality_offset_db`` decibels below ``error``."""
@@ -106,12 +96,6 @@ def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_
 
     The paper's 100 levels for rotations, 256 for the rest and 65,536 for positions are spread from each channel's
     smallest to its largest value, so that a single outlier makes them coarse; the steps of ``fast`` are absolute.
-
-    Args:
-        costs: costs of all Gaussians of ``kept``, ``(M,)``.
-        splats: the scene.
-        kept: indices of the ``M`` Gaussians that a renderer draws.
-        sh_model: error of the view-dependent colour, by codebook size.
     """
     scene = {"opacities": splats.opacities[:, None], "scales": splats.scales, "sh0": splats.sh0, "means": splats.means}
     ends = {name: row_range(selected(values, kept)) for name, values in scene.items()}
@@ -216,16 +200,13 @@ def plan_rate_distortion(
     kept: Int[np.ndarray, " M"],
     sensitivity: Sensitivity,
     recolor: ColorRefit | None,
-    settings: EncodeSettings,
-    container: ContainerModel,
-    pool: Workers,
-    progress: Progress,
-    *,
-    keep_costs: bool = True,
-    groups: UInt16[np.ndarray, " N"] | None = None,
+    planning: Planning,
+    keep_costs: bool,
+    groups: UInt16[np.ndarray, " N"] | None,
 ) -> EncodingPlan:
     """Plan the Gaussians ``kept``, at least one of which a camera has seen, for a container."""
-    progress("rate_distortion", 0.0)
+    settings, container, pool = planning.settings, planning.container, planning.pool
+    planning.report("rate_distortion")
     scene = PlannedScene(len(splats), len(kept), splats.sh_degree, splats.origin, splats.antialiased)
     uncertainty = sensitivity.view_uncertainty
     costs = _costs_of(splats, kept, sensitivity, pool)
@@ -246,10 +227,8 @@ def plan_rate_distortion(
     del costs
     return_free_memory()
 
-    progress("order", 0.0)
-    grid = layout_grid(
-        splats.means, kept, 16, settings, pool, lambda fraction: progress("order", fraction), criterion.classes, groups
-    )
+    report = planning.report("order")
+    grid = layout_grid(splats.means, kept, 16, settings, pool, report, criterion.classes, groups)
     grid = grid.with_padding_last() if container.padding_last else grid
     order = grid.cells[grid.mask]
     rank = _ranks(order, kept, len(splats))
@@ -258,19 +237,16 @@ def plan_rate_distortion(
     del rank
     return_free_memory()
 
-    progress("forms", 0.0)
-    shapes, form_error = choose_forms(
-        splats, grid.cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction), container
-    )
+    shapes, form_error = choose_forms(splats, grid.cells, grid.side, planning)
     shapes = shapes.take(grid.mask)
     size = sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry, container.entry_bits)
-    codebook = _codebook(splats, order, sensitivity, size, settings, container, pool, progress)
+    codebook = _codebook(splats, order, sensitivity, size, planning)
     return_free_memory()
 
-    progress("rounding", 0.0)
+    planning.report("rounding")
     captured = sensitivity.captured.take(order)
     largest = largest_changes(sensitivity.coverage.take(order), captured, slack)
-    quantizer = RdFields(container, settings, criterion, largest, pool)
+    quantizer = RdFields(planning, criterion, largest)
     fields = quantizer.shapes(shapes, selected(sensitivity.shape_hessian, order))
     fields["means"] = quantizer.means(splats, order, np.rint(captured + np.log2(slack)).astype(np.int8))
     fields["f_dc"], clipped = quantizer.colors(
@@ -322,16 +298,13 @@ def _codebook(
     order: Int[np.ndarray, " M"],
     sensitivity: Sensitivity,
     size: int,
-    settings: EncodeSettings,
-    container: ContainerModel,
-    pool: Workers,
-    progress: Progress,
+    planning: Planning,
 ) -> Codebook:
     """Return the SH codebook of about ``size`` entries, fitted to what cameras see of each colour."""
     weights = sensitivity_weights(sensitivity, order, splats)
     metric = ShMetric.of(sensitivity, splats.sh_degree)
-    most = nearest_square(size) if container.tables is None else size
-    return fit_codebook(splats, order, weights, most, settings, container, pool, progress, metric=metric)
+    most = nearest_square(size) if planning.container.tables is None else size
+    return fit_codebook(splats, order, weights, most, planning, metric=metric)
 
 
 def _base_colors(

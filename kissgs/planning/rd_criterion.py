@@ -14,11 +14,6 @@ from kissgs.core.sensitivity import OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.planning.rows import Rows, for_each_block, sorted_order
 
-# Costs of errors of each Gaussian, its sensitivity class, and which Gaussians are pruned.
-#
-# Gaussians are ordered in classes of similar sensitivity, and each class has its own quantisation steps
-# (:mod:`kissgs.planning.rd_criterion`).
-
 FLOOR = 1e-3
 """Smallest sensitivity, in units of the median, so that Gaussians that no camera saw keep a bounded error."""
 
@@ -34,25 +29,15 @@ MAX_PRUNED = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Costs:
-    """Squared image error per squared unit of each attribute, ``(M,)`` each; means over channels.
+    """Squared image error per squared unit of each attribute, ``(M,)`` each; means over channels."""
 
-    Attributes:
-        opacity: for the opacity logit.
-        scale: for a log-scale.
-        rotation: for a rotation about one of the Gaussian's own axes, radians.
-        color: for a coefficient of ``sh0``.
-        position: for the signed logarithm of a coordinate.
-        removal: squared image error of removing the Gaussian.
-        coverage: from 0, unseen, to 1, seen from nearby.
-    """
-
-    opacity: Float64[np.ndarray, " M"]
-    scale: Float64[np.ndarray, " M"]
-    rotation: Float64[np.ndarray, " M"]
-    color: Float64[np.ndarray, " M"]
-    position: Float64[np.ndarray, " M"]
-    removal: Float64[np.ndarray, " M"]
-    coverage: Float64[np.ndarray, " M"]
+    opacity: Float64[np.ndarray, " M"]  # for the opacity logit
+    scale: Float64[np.ndarray, " M"]  # for a log-scale
+    rotation: Float64[np.ndarray, " M"]  # for a rotation about one of the Gaussian's own axes, radians
+    color: Float64[np.ndarray, " M"]  # for a coefficient of ``sh0``
+    position: Float64[np.ndarray, " M"]  # for the signed logarithm of a coordinate
+    removal: Float64[np.ndarray, " M"]  # squared image error of removing the Gaussian
+    coverage: Float64[np.ndarray, " M"]  # from 0, unseen, to 1, seen from nearby
 
     @classmethod
     def of(cls, sensitivity: Sensitivity, splats: Splats, pool: Workers | None = None) -> Costs:
@@ -124,11 +109,8 @@ class Costs:
     ) -> Bool[np.ndarray, " M"]:
         """Return which Gaussians' removal costs less than ``threshold_bits``; at most :data:`MAX_PRUNED` of all.
 
-        Args:
-            rd_lambda: squared error per bit.
-            threshold_bits: largest number of bits that a removal may cost.
-            default_lambda: lambda of the default quality. For Gaussians that no camera saw from nearby, only the excess
-                of ``rd_lambda`` over it counts, so that up to it all of them are kept. None treats all alike.
+        For Gaussians that no camera saw from nearby, only the excess over the lambda of the default quality counts, so
+        that up to it all of them are kept.
         """
         unseen = 0.0 if default_lambda is None else min(default_lambda, rd_lambda) * (self.coverage < SEEN)
         pruned = self.removal < threshold_bits * (rd_lambda - unseen)
@@ -196,19 +178,12 @@ def step(cost: float, rd_lambda: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RdCriterion:
-    """Costs, sensitivity classes and lambda, by which the levels of Gaussians are chosen.
-
-    Attributes:
-        costs: costs of the M Gaussians.
-        classes: ``(M,)`` sensitivity class of each, from 0; no class is empty.
-        rd_lambda: squared error per bit.
-        steps: optimal step of each class for the attributes of ``costs``; None to compute them.
-    """
+    """Costs, sensitivity classes and lambda, by which the levels of Gaussians are chosen."""
 
     costs: Costs
-    classes: Integer[np.ndarray, " M"]
+    classes: Integer[np.ndarray, " M"]  # sensitivity class of each, from 0; no class is empty
     rd_lambda: float
-    steps: Mapping[str, list[float]] | None = None
+    steps: Mapping[str, list[float]] | None = None  # optimal step of each class for the attributes of ``costs``
 
     def condensed(self) -> RdCriterion:
         """Return the steps and only the smallest costs, for what needs no more."""

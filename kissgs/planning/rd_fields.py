@@ -12,14 +12,13 @@ from kissgs.core.resources import Workers
 from kissgs.core.signed_log import signed_exp, signed_log
 from kissgs.core.splats import Splats
 from kissgs.planning import table_fields
-from kissgs.planning.container_model import ContainerModel
+from kissgs.planning.container_model import Planning
 from kissgs.planning.quantize import MEANS_TOP, Quantized, clip_outliers, log_extent, means_bits, quantize_means
 from kissgs.planning.rd_criterion import RdCriterion
-from kissgs.planning.rdo_quantize import quantize_by_class, rdo_quantize_shapes
+from kissgs.planning.rdo_quantize import quantize_by_class, rdo_quantize
 from kissgs.planning.rotation_forms import StoredShapes
 from kissgs.planning.rows import Rows, for_each_block, selected
 from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook
-from kissgs.settings import EncodeSettings
 
 OUTLIERS = 1e-4
 """Share of base colours, at either end of a channel, that may be clipped so that the step of the others stays small."""
@@ -27,74 +26,68 @@ OUTLIERS = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RdFields:
-    """Quantises the attributes of M Gaussians.
+    """Quantises the attributes of M Gaussians."""
 
-    Attributes:
-        container: what the container can hold.
-        settings: settings of the encoder.
-        criterion: costs, sensitivity classes and lambda.
-        largest: largest change of each attribute, see :func:`kissgs.planning.rdo_quantize.largest_changes`.
-        pool: threads.
-    """
-
-    container: ContainerModel
-    settings: EncodeSettings
+    planning: Planning
     criterion: RdCriterion
-    largest: Mapping[str, Rows]
-    pool: Workers
+    largest: Mapping[str, Rows]  # see largest_changes
 
     def shapes(self, values: StoredShapes, hessians: Rows) -> dict[str, Quantized]:
-        """Quantise opacity, log-scales and rotation.
-
-        Args:
-            values: the Gaussians in their stored form.
-            hessians: ``(M, 10)`` shape Hessians of :class:`kissgs.Sensitivity`.
-        """
-        criterion, largest, pool = self.criterion, self.largest, self.pool
-        if self.container.tables is not None:
-            wanted = hessians[:] if self.settings.rdo_quantization else None
-            bounds = {name: rows[:] for name, rows in largest.items()}
-            return table_fields.rd_shape_fields(
-                values[:], wanted, values.forms, criterion, bounds, self.container.tables, pool
+        """Quantise opacity, log-scales and rotation."""
+        criterion, largest, tables = self.criterion, self.largest, self.planning.container.tables
+        wanted: StoredShapes | Float64[np.ndarray, "M 8"] = values
+        if tables is None:
+            fields = {
+                field: quantize_by_class(
+                    rows, criterion.steps_of(name), criterion.classes, largest[field], self.planning.pool
+                )
+                for rows, name, field in (
+                    (values.opacities, "opacity", "opacities"),
+                    (values.scales, "scale", "scales"),
+                    (values.quats, "rotation", "quaternions"),
+                )
+            }
+        else:
+            logits = values.opacities[:][:, 0].astype(np.float64)
+            wanted = table_fields.stored_values(values[:], tables)
+            opacity, scale, rotation = (
+                table_fields.criterion_steps(name, criterion, largest[field][:])
+                for name, field in (("opacity", "opacities"), ("scale", "scales"), ("rotation", "quaternions"))
             )
-        opacities, scales, quats = (
-            quantize_by_class(rows, criterion.steps_of(name), criterion.classes, largest[field], pool)
-            for rows, name, field in (
-                (values.opacities, "opacity", "opacities"),
-                (values.scales, "scale", "scales"),
-                (values.quats, "rotation", "quaternions"),
+            fields = table_fields.rounded_shapes(wanted, criterion.costs.scale, (opacity, scale, rotation), tables)
+        if self.planning.settings.rdo_quantization:
+            fields = rdo_quantize(
+                wanted, fields, hessians, values.forms, criterion, largest, self.planning.pool, tables
             )
-        )
-        parts = opacities, scales, quats
-        if self.settings.rdo_quantization:
-            parts = rdo_quantize_shapes(values, parts, hessians, values.forms, criterion, largest, pool)
-        return dict(zip(("opacities", "scales", "quaternions"), parts, strict=True))
+            if tables is None:
+                fields = {name: field.from_zero() for name, field in fields.items()}
+        return fields if tables is None else table_fields.finished_shapes(fields, logits, tables)
 
     def means(self, splats: Splats, order: Int[np.ndarray, " M"], coarser: Int[np.ndarray, " M"]) -> Quantized:
         """Quantise the positions of the Gaussians ``order``, with the bits that lambda asks for in each class.
 
         A Gaussian has at most ``coarser`` bits less than :func:`means_bits` gives for ``means_tolerance``.
         """
-        means, criterion = selected(splats.means, order), self.criterion
-        usual = means_bits(splats, order, self.settings.means_tolerance, self.pool)
+        means, criterion, pool = selected(splats.means, order), self.criterion, self.planning.pool
+        usual = means_bits(splats, order, self.planning.settings.means_tolerance, pool)
         most = np.clip(16 - usual + coarser, 0, 8)
-        unit = max(log_extent(means, self.pool), 1e-30) / MEANS_TOP
+        unit = max(log_extent(means, pool), 1e-30) / MEANS_TOP
         steps = criterion.steps_of("position")
-        if self.container.tables is not None:
+        if self.planning.container.tables is not None:
             each = np.array(steps)[criterion.classes]
             return table_fields.means_field(means[:], np.minimum(each, unit * 2.0**most / np.sqrt(2)))
         coarse = np.array([min(max(np.floor(np.log2(step / unit) + 0.5), 0), 8) for step in steps]).astype(np.int8)
-        return quantize_means(means, bits=16 - np.minimum(coarse[criterion.classes], most), pool=self.pool)
+        return quantize_means(means, bits=16 - np.minimum(coarse[criterion.classes], most), pool=pool)
 
     def colors(self, base: Float32[np.ndarray, "M 3"]) -> tuple[Quantized, int]:
         """Quantise base colours; return them and the number of clipped outliers."""
         criterion, coarsest = self.criterion, self.largest["f_dc"]
-        if self.container.tables is not None:
+        if self.planning.container.tables is not None:
             steps = table_fields.criterion_steps("color", criterion, coarsest[:])
             return table_fields.color_field(base.astype(np.float64), steps, criterion.costs.color), 0
         optimal = criterion.steps_of("color")
         clipped = clip_outliers(base, step=min(optimal), share=OUTLIERS)
-        levels = quantize_by_class(clipped, optimal, criterion.classes, coarsest, self.pool)
+        levels = quantize_by_class(clipped, optimal, criterion.classes, coarsest, self.planning.pool)
         return levels, 0 if clipped is base else int((clipped != base).any(axis=1).sum())
 
 
@@ -134,15 +127,7 @@ def largest_errors(
     colors: Float32[np.ndarray, "M 3"] | Rows,
     pool: Workers | None = None,
 ) -> dict[str, list[float]]:
-    """Return the largest error per field and channel, in the unit of the field (positions: of the signed logarithm).
-
-    Args:
-        fields: levels of the Gaussians, in order.
-        values: opacity logit, log-scales and quaternion, in the stored form of each Gaussian.
-        means: positions.
-        colors: ``sh0``.
-        pool: threads; None for the calling one.
-    """
+    """Return the largest error per field and channel, in the unit of the field (positions: of the signed logarithm)."""
 
     def largest(rows: slice) -> dict[str, np.ndarray]:
         wanted, some = values[rows], {name: field.take(rows) for name, field in fields.items()}

@@ -1,13 +1,12 @@
 """RDO quantisation: levels of the smallest squared image error plus lambda · bits.
 
-Rounding to the nearest level treats a Gaussian that fills the image and one behind a wall alike. Here every sensitivity
-class has its own step, a whole multiple of the plane's; and within a class, frequent levels are preferred where the
-error is small, so that the entropy code needs fewer bits.
+Every sensitivity class has its own step, and within a class, frequent levels are preferred where the error is small.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from math import ceil
 
@@ -15,10 +14,13 @@ import numpy as np
 
 from kissgs.core.array_types import Float, Float32, Float64, Int, Integer, UInt8
 from kissgs.core.resources import Workers
-from kissgs.planning.quantize import Quantized
+from kissgs.planning.container_model import ByteTables
+from kissgs.planning.quantize import Quantized, even_table
 from kissgs.planning.rd_criterion import RdCriterion
 from kissgs.planning.rotation_forms import PERMUTATIONS
 from kissgs.planning.rows import Computed, Rows, for_each_block, row_range
+from kissgs.planning.smallest_three import KEPT
+from kissgs.planning.value_table import SIZE, refit_table
 
 UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
 VIRTUAL = {"opacities": 0.4, "scales": 0.13, "growth": 0.12, "quaternions": 0.04, "f_dc": 0.2}
@@ -42,11 +44,6 @@ def largest_changes(
 
     Optimal steps grow as the root of lambda. These bounds grow more slowly: they protect views in which a change is
     more visible than in the measured ones, where pruning or coarser colours would be the smaller loss.
-
-    Args:
-        coverage: from 0 to 1, see :class:`kissgs.Sensitivity`.
-        captured: from 0 to ``coverage``, see :class:`kissgs.Sensitivity`.
-        slack: ratio of the optimal steps to those of the default quality, from 1.
     """
 
     def change(name: str, rows: slice) -> Float64[np.ndarray, " n"]:
@@ -61,11 +58,14 @@ def largest_changes(
 UNUSED_COUNT = 0.05
 """Count that an unused level has in the estimate of its bits."""
 
-ROUNDS, SWEEPS = 3, 1
-"""Number of iterations of counting levels and choosing by the counts, and of passes over the levels in each."""
+ROUNDS = 3
+"""Number of iterations of counting levels and choosing by the counts."""
 
 CHUNK = 1 << 14
 """Gaussians per task."""
+
+SHAPE_FIELDS = ("opacities", "scales", "quaternions")
+"""Fields whose levels are chosen jointly."""
 
 
 def quantize_by_class(
@@ -75,17 +75,9 @@ def quantize_by_class(
     coarsest: Float64[np.ndarray, " M"] | Rows,
     pool: Workers | None = None,
 ) -> Quantized:
-    """Round to the nearest of the levels that each sensitivity class uses.
+    """Round to the nearest of the levels that each sensitivity class uses: multiples of one step for all channels.
 
-    Args:
-        values: finite.
-        optimal: best step of each sensitivity class.
-        classes: class of each Gaussian.
-        coarsest: largest step, per Gaussian.
-        pool: threads; None for the calling one.
-
-    Returns:
-        Levels from 0 to at most 255, with one step for all channels, of which each class uses multiples.
+    ``optimal`` is the best step of each class; no step is above ``coarsest`` of the Gaussian.
     """
     smallest, largest = row_range(values, pool)
     low32 = smallest.astype(np.float32) + np.float32(0)
@@ -111,89 +103,93 @@ def quantize_by_class(
 
     for_each_block(count, round_to_levels, pool)
     high = np.where(extent > 0, low + top * finest, low).astype(np.float32)
-    return Quantized(levels, low32, high, top, stride)
+    return Quantized(levels, even_table(low32, high, top), stride)
 
 
-def rdo_quantize_shapes(
+def rdo_quantize(
     values: Float64[np.ndarray, "M 8"] | Rows,
-    parts: tuple[Quantized, Quantized, Quantized],
-    shapes: Float32[np.ndarray, "M 10"] | Rows,
+    parts: dict[str, Quantized],
+    hessians: Float32[np.ndarray, "M 10"] | Rows,
     forms: UInt8[np.ndarray, " M"],
     criterion: RdCriterion,
     largest: Mapping[str, Float64[np.ndarray, " M"] | Rows],
     pool: Workers,
-) -> tuple[Quantized, Quantized, Quantized]:
+    tables: ByteTables | None = None,
+) -> dict[str, Quantized]:
     """Choose the levels of opacities, scales and quaternions jointly by squared error plus lambda · bits.
 
-    Args:
-        values: opacity logit, log-scales and quaternion, in the stored form of each Gaussian.
-        parts: the rounded values: opacities, scales, quaternions.
-        shapes: shape Hessians of :class:`kissgs.Sensitivity`.
-        forms: form of each Gaussian, see :mod:`kissgs.planning.rotation_forms`.
-        criterion: sensitivity classes, lambda, and costs, whose smallest values are added to the Hessians' diagonals.
-        largest: largest change of each attribute, see :func:`largest_changes`.
-        pool: threads.
+    With ``tables``, the values of the scales' table move to the mean of what they stand for.
     """
     from kissgs.planning import rdo_kernels
 
     costs, classes = criterion.costs, criterion.classes
-    levels = np.concatenate([part.levels for part in parts], axis=1)
-    low = np.concatenate([part.low for part in parts]).astype(np.float64)
-    high = np.concatenate([part.high for part in parts]).astype(np.float64)
-    top = np.concatenate([np.full(part.levels.shape[1], part.top) for part in parts])
-    steps = (high - low) / top
-    top[steps <= 0] = 0  # a constant channel
-    steps[steps <= 0] = 1.0
+    levels = np.concatenate([parts[name].levels for name in SHAPE_FIELDS], axis=1)
+    omitted = parts["omitted"].levels[:, 0] if "omitted" in parts else None
     floor = np.array([float(cost.min(initial=np.inf)) for cost in (costs.opacity, costs.scale, costs.rotation)])
 
     for _ in range(ROUNDS):
         rate_table = criterion.rd_lambda * level_bits(levels, classes, pool)
+        values_of_levels, ends = _values_of_levels([parts[name] for name in SHAPE_FIELDS])
+        if tables is not None:
+            ends[0] = tables.first_drawn, tables.last_drawn
 
-        def choose(rows: slice, rate_table: Float64[np.ndarray, "classes 8 256"] = rate_table) -> None:
+        def choose(
+            rows: slice,
+            rate_table: Float64[np.ndarray, "classes C 256"] = rate_table,
+            values_of_levels: Float64[np.ndarray, "C 256"] = values_of_levels,
+            ends: Int[np.ndarray, "C 2"] = ends,
+        ) -> None:
             chosen = levels[rows].astype(np.int64)
+            missing = np.full(len(chosen), -1) if omitted is None else omitted[rows].astype(np.int64)
             rdo_kernels.choose_levels(
                 values[rows],
-                shapes[rows],
+                np.tile(np.arange(4), (len(chosen), 1)) if omitted is None else KEPT[missing],
+                missing,
+                hessians[rows],
                 forms[rows],
                 PERMUTATIONS,
                 classes[rows].astype(np.int64),
-                low,
-                steps,
-                top,
+                values_of_levels,
+                ends,
                 rate_table,
-                _bounds(largest, rows),
+                _bounds(largest, rows, levels.shape[1]),
                 floor,
-                SWEEPS,
                 chosen,
             )
             levels[rows] = chosen
 
         for_each_block(len(levels), choose, pool, block=CHUNK)
-    ends = np.cumsum([0] + [part.levels.shape[1] for part in parts])
-    chosen = [_from_zero(levels[:, a:b], part) for part, a, b in zip(parts, ends, ends[1:], strict=False)]
-    return chosen[0], chosen[1], chosen[2]
+        if tables is not None:
+            bounds = largest["scales"][:], largest["growth"][:]
+            table = parts["scales"].table[:, 0].astype(np.float32)
+            moved = refit_table(table, levels[:, 1:4], values[:][:, 1:4], costs.scale, bounds)
+            parts = {**parts, "scales": replace(parts["scales"], table=moved.astype(np.float64)[:, None])}
+    chosen = np.split(levels, [1, 4], axis=1)
+    found = {name: replace(parts[name], levels=own) for name, own in zip(SHAPE_FIELDS, chosen, strict=True)}
+    return {**parts, **found}
 
 
-def _bounds(largest: Mapping[str, Float64[np.ndarray, " M"] | Rows], rows: slice) -> Float64[np.ndarray, "n 2 8"]:
-    """Return the largest distance of a level below and above each of the eight values."""
-    bounds = np.empty((len(range(rows.stop)[rows]), 2, 8))
+def _values_of_levels(fields: list[Quantized]) -> tuple[Float64[np.ndarray, "C 256"], Int[np.ndarray, "C 2"]]:
+    """Return the values of the levels of every channel, and the first and last level to use: one if it is constant."""
+    values, ends = [], []
+    for field in fields:
+        for column in range(field.levels.shape[1]):
+            table = field.table[:, column % field.table.shape[1]]
+            values.append(np.pad(table, (0, SIZE - len(table)), mode="edge"))
+            ends.append((0, field.top if table[-1] > table[0] else 0))
+    return np.stack(values), np.array(ends)
+
+
+def _bounds(
+    largest: Mapping[str, Float64[np.ndarray, " M"] | Rows], rows: slice, columns: int
+) -> Float64[np.ndarray, "n 2 columns"]:
+    """Return the largest distance of a level below and above each value."""
+    bounds = np.empty((len(range(rows.stop)[rows]), 2, columns))
     bounds[:, :, 0] = largest["opacities"][rows][:, None]
     bounds[:, 0, 1:4] = largest["scales"][rows][:, None]
     bounds[:, 1, 1:4] = largest["growth"][rows][:, None]
     bounds[:, :, 4:] = largest["quaternions"][rows][:, None, None]
     return bounds
-
-
-def _from_zero(levels: UInt8[np.ndarray, "M C"], part: Quantized) -> Quantized:
-    """Shift the levels so that the smallest is 0."""
-    first = int(levels.min(initial=255))
-    last = max(int(levels.max(initial=0)), first + 1)
-    low, high = part.low.astype(np.float64), part.high.astype(np.float64)
-    each = (high - low) / part.top
-    start, end = ((low + level * each).astype(np.float32) for level in (first, last))
-    return Quantized(
-        (levels - first).astype(np.uint8), start, end, last - first, part.level_stride, part.level_offset + first
-    )
 
 
 def level_bits(

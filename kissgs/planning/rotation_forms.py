@@ -1,12 +1,7 @@
 """Choice among the 48 equivalent (rotation, scales) forms of a Gaussian, which all have the same covariance.
 
 The axes of an ellipsoid can be ordered in 6 and directed in 4 right-handed ways, and q and -q are one rotation:
-6 × 4 × 2 = 48. The 24 quaternions below are the rotations of the cube, which are closed under multiplication. PRAS is
-the paper's name (section on permutation-rotation sorting) for choosing among them.
-
-* :func:`canonical_forms`, of kissgs: the form nearest to the identity. All rotations are then within 63° of it: at
-  length 1, w is at least 0.85 and x, y, z use 40 % of their range.
-* :func:`pras_forms`, of the paper: the form most similar to its neighbours on the grid.
+6 × 4 × 2 = 48. PRAS is the paper's name (section on permutation-rotation sorting) for choosing among them.
 """
 
 from __future__ import annotations
@@ -19,10 +14,9 @@ import numpy as np
 from kissgs.core.array_types import Bool, Float32, Float64, Int, UInt8
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.planning.container_model import ContainerModel
+from kissgs.planning.container_model import Planning
 from kissgs.planning.layout import box_blur
 from kissgs.planning.rows import Computed, for_each_block, selected
-from kissgs.settings import EncodeSettings
 
 _A, _H = 0.5**0.5, 0.5
 ROTATIONS: Float64[np.ndarray, "24 4"] = np.array(
@@ -36,7 +30,7 @@ ROTATIONS: Float64[np.ndarray, "24 4"] = np.array(
     ],
     dtype=np.float64,
 )
-"""Quaternion g of each form, w x y z: the new rotation is the Hamilton product q g."""
+"""Quaternion g of each form, w x y z, the rotations of the cube: the new rotation is the Hamilton product q g."""
 
 PERMUTATIONS = np.repeat([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)], 4, axis=0).astype(np.int64)
 """Scale order of each form, ``(24, 3)``: the new scales are the old ones at these indices."""
@@ -46,19 +40,12 @@ CHUNK = 1 << 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredShapes:
-    """Opacity logits, log-scales and rotations of Gaussians in their stored form, computed a block at a time.
-
-    Attributes:
-        splats: the scene.
-        index: ``(M,)`` the Gaussians.
-        forms: ``(M,)`` form of each.
-        w_is_one: whether quaternions are scaled such that w is 1, which must not be 0; else they have length 1.
-    """
+    """Opacity logits, log-scales and rotations of Gaussians in their stored form, computed a block at a time."""
 
     splats: Splats
     index: Int[np.ndarray, " M"]
     forms: UInt8[np.ndarray, " M"]
-    w_is_one: bool = False
+    w_is_one: bool = False  # whether quaternions are scaled such that w, not 0, is 1; else they have length 1
 
     def __len__(self) -> int:
         return len(self.index)
@@ -99,22 +86,14 @@ class StoredShapes:
 
 
 def choose_forms(
-    splats: Splats,
-    cells: Int[np.ndarray, " cells"],
-    side: int,
-    settings: EncodeSettings,
-    pool: Workers,
-    report: Callable[[float], None],
-    container: ContainerModel,
+    splats: Splats, cells: Int[np.ndarray, " cells"], side: int, planning: Planning
 ) -> tuple[StoredShapes, float]:
     """Choose the form of rotation and log-scales of the Gaussian in each of ``cells``, as the settings say.
 
     Where the container stores whole quaternions, which decoders normalise, those of canonical forms have w = 1: x, y
     and z hold the whole rotation, and w takes no bits.
-
-    Returns:
-        The Gaussians in these forms, and the largest relative change of a covariance, by rounding only.
     """
+    settings, pool, report = planning.settings, planning.pool, planning.report("forms")
     if settings.rotation_form == "canonical":
         forms = np.empty(len(cells), np.uint8)
 
@@ -125,7 +104,7 @@ def choose_forms(
     else:
         quats, scales = unit_quats(splats, cells), splats.scales.take(cells, axis=0)
         forms = pras_forms(quats, scales, side, pool, decay=settings.plas_radius_decay, report=report)
-    w_is_one = container.tables is None and settings.rotation_form == "canonical"
+    w_is_one = planning.container.tables is None and settings.rotation_form == "canonical"
     shapes = StoredShapes(splats, cells, forms, w_is_one)
 
     def error(rows: slice) -> float:
@@ -157,7 +136,10 @@ def apply_forms(
 
 
 def canonical_forms(quats: Float64[np.ndarray, "N 4"]) -> UInt8[np.ndarray, " N"]:
-    """Return the form of largest w, which has the smallest rotation angle; among equals, the first of the table."""
+    """Return the form of largest w, which has the smallest rotation angle; among equals, the first of the table.
+
+    All rotations are then within 63° of the identity: w is at least 0.85 and x, y, z use 40 % of their range.
+    """
     from kissgs.planning import form_kernels
 
     forms = np.empty(len(quats), np.uint8)
@@ -176,16 +158,8 @@ def pras_forms(
 ) -> UInt8[np.ndarray, " N"]:
     """Choose forms that make neighbours on the grid similar: the closest to 8-bit proxies, blurred less and less.
 
-    Args:
-        quats: unit quaternions, row-major on the grid of ``side`` × ``side`` cells.
-        scales: log-scales. One proxy range serves all three axes, so that permuting them changes no proxy.
-        side: cells per axis.
-        pool: threads for the rows; the result does not depend on their number.
-        decay: factor from one blur radius to the next.
-        report: receives the fraction done, 0 to 1.
-
-    Returns:
-        The chosen forms of the input, not of an intermediate form, so that rounding errors do not add up.
+    One proxy range serves the scales of all three axes, so that permuting them changes no proxy. All forms are those of
+    the input, not of an intermediate form, so that rounding errors do not add up.
     """
     from kissgs.planning import kernels
 

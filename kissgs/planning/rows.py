@@ -30,12 +30,7 @@ class Rows(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Computed:
-    """Rows that a function computes.
-
-    Attributes:
-        count: number of rows.
-        of: returns the rows of a slice of them.
-    """
+    """Rows that a function computes."""
 
     count: int
     of: Callable[[slice], np.ndarray]
@@ -61,12 +56,7 @@ def for_each_block(
 
 
 def row_range(values: Rows, pool: Workers | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smallest and the largest value of each column, in the dtype of the values; there is at least one row.
-
-    Args:
-        values: finite.
-        pool: threads; None for the calling one.
-    """
+    """Return the smallest and the largest value of each column, of at least one row."""
 
     def ends(rows: slice) -> tuple[np.ndarray, np.ndarray]:
         columns = values[rows].T  # NumPy is slow at the ends of short rows

@@ -9,19 +9,16 @@ from functools import partial
 import numpy as np
 
 from kissgs.core.array_types import Float32, Int
-from kissgs.core.progress import Progress
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, SH_REST_COUNTS, Splats
 from kissgs.planning import kmeans
 from kissgs.planning.clustering import ShMetric
-from kissgs.planning.container_model import ContainerModel
+from kissgs.planning.container_model import Planning
 from kissgs.planning.layout import axes_order, plas, principal_axes
 from kissgs.planning.quantize import Quantized, half_steps, quantize
 from kissgs.planning.value_table import fit_table, nearest_levels, table_field
 from kissgs.settings import EncodeSettings
-
-# The SH codebook: its entries and their order in the codebook's image.
 
 COEFFICIENTS = SH_REST_COUNTS[-1]
 MIN_SIDE = 8
@@ -46,20 +43,12 @@ PAPER_TOP = 99
 
 @dataclass(frozen=True, slots=True)
 class Codebook:
-    """Codebook of S × S entries, and the entry of each Gaussian.
-
-    Attributes:
-        side: S.
-        centroids: ``(S*S, 45)`` levels, channel-major (15 of red, 15 of green, 15 of blue), entries row-major; at most
-            S × S rows where the container's entries are a list.
-        labels: ``(M,)`` entry of each Gaussian; a scene without Gaussians has one label, for padding.
-        errors: ``(45,)`` largest error of the entries by rounding, per channel.
-    """
+    """Codebook of S × S entries, and the entry of each Gaussian."""
 
     side: int
-    centroids: Quantized
-    labels: Int[np.ndarray, " M"]
-    errors: list[float]
+    centroids: Quantized  # 15 of red, 15 of green, 15 of blue; entries are row-major, or a list
+    labels: Int[np.ndarray, " M"]  # entry of each Gaussian; a scene without Gaussians has one label, for padding
+    errors: list[float]  # largest error of the entries by rounding, per channel
 
 
 def fit_codebook(
@@ -67,67 +56,45 @@ def fit_codebook(
     chosen: Int[np.ndarray, " M"],
     weights: Float32[np.ndarray, " M"],
     size: float,
-    settings: EncodeSettings,
-    container: ContainerModel,
-    pool: Workers,
-    progress: Progress,
+    planning: Planning,
     *,
     metric: ShMetric | None = None,
 ) -> Codebook:
     """Build the codebook for the Gaussians ``chosen``.
 
     Bands that are missing, or zero in all Gaussians, take almost no bytes: their tiles are constant.
-
-    Args:
-        splats: the scene.
-        chosen: indices of the Gaussians.
-        weights: weight of each Gaussian's squared shN error.
-        size: largest number of entries. In SOG-XT the image's side is a multiple of 8 and unused entries repeat
-            others; in SOG any number will do.
-        settings: settings of the encoder.
-        container: what the container can hold.
-        pool: threads.
-        progress: receives "codebook" and "sort codebook" events.
-        metric: forms of the errors; by default every coefficient counts alike.
     """
+    settings, pool, is_list = planning.settings, planning.pool, planning.container.tables is not None
     dimensions = splats.shN.shape[1] * 3
     if dimensions == 0 or len(chosen) == 0:
         nothing = quantize(np.zeros((MIN_SIDE**2, 3 * COEFFICIENTS)), step=1)
         return Codebook(MIN_SIDE, nothing, np.zeros(max(len(chosen), 1), dtype=np.int32), half_steps(nothing))
-    progress("codebook", 0.0)
     most = min(size, settings.sh_codebook_size)
     clusters = kmeans.fit(
         splats.shN.reshape(len(splats), dimensions),
         chosen,
         weights,
-        codebook_side(most) ** 2 if container.tables is None else max(round(most), 1),
+        max(round(most), 1) if is_list else codebook_side(most) ** 2,
         pool,
-        kmeans.KMeansOptions(
-            seed=settings.seed,
-            iterations=settings.sh_kmeans_iterations,
-            neighbors=settings.sh_neighbors,
-            tolerance=settings.sh_tolerance,
-            lattice=settings.sh_step if settings.shared_step_size else 0.0,
-            from_zero=container.tables is not None,
-        ),
+        _kmeans_options(settings, settings.sh_step if settings.shared_step_size else 0.0, from_zero=is_list),
         metric=metric,
-        report=lambda fraction: progress("codebook", fraction),
+        report=planning.report("codebook"),
     )
     # The smallest square that holds the entries; unused places repeat some of them.
     side = next(s for s in range(MIN_SIDE, MAX_CODEBOOK_SIDE + 1, 8) if s * s >= len(clusters.centroids))
-    progress("sort codebook", 0.0)
-    if container.tables is not None:  # in a list, similar neighbours save less than small labels of frequent entries
+    report = planning.report("sort codebook")
+    if is_list:  # in a list, similar neighbours save less than small labels of frequent entries
         entries = clusters.centroids
         placed = np.argsort(-np.bincount(clusters.labels), kind="stable")
     else:
         entries = clusters.centroids[np.arange(side * side) % len(clusters.centroids)]
-        placed = _sort(entries, settings, pool, lambda fraction: progress("sort codebook", fraction))
+        placed = _sort(entries, settings, pool, report)
     position = np.empty(len(placed), dtype=np.int32)
     position[placed] = np.arange(len(placed), dtype=np.int32)
     full = np.zeros((len(placed), 3, COEFFICIENTS), dtype=np.float32)
     full[:, :, : dimensions // 3] = entries[placed].reshape(len(placed), -1, 3).transpose(0, 2, 1)
     rows = full.reshape(len(placed), 3 * COEFFICIENTS)
-    if container.tables is not None:
+    if is_list:
         used = rows.reshape(-1, COEFFICIENTS)[:, : dimensions // 3]
         worth = np.bincount(clusters.labels, weights, minlength=len(placed))[placed]
         table = fit_table(used.ravel(), np.repeat(worth, dimensions), max(clusters.step, 1e-4), with_zero=True)
@@ -139,6 +106,17 @@ def fit_codebook(
     else:
         levels = quantize(rows, step=1, shared=False, max_top=PAPER_TOP)
     return Codebook(side, levels, position[clusters.labels], half_steps(levels))
+
+
+def _kmeans_options(settings: EncodeSettings, lattice: float, *, from_zero: bool = False) -> kmeans.KMeansOptions:
+    return kmeans.KMeansOptions(
+        seed=settings.seed,
+        iterations=settings.sh_kmeans_iterations,
+        neighbors=settings.sh_neighbors,
+        tolerance=settings.sh_tolerance,
+        lattice=lattice,
+        from_zero=from_zero,
+    )
 
 
 def nearest_square(size: float) -> int:
@@ -223,17 +201,11 @@ SH_MEAN_SQUARE = 0.0796
 
 @dataclass(frozen=True, slots=True)
 class CodebookErrorModel:
-    """Error of a scene's shN by codebook size, extrapolated from a small codebook.
-
-    Attributes:
-        entries: number of entries of that codebook.
-        weighted: its squared image error, weighted by sensitivity.
-        unweighted: squared image error of a codebook of that size with equal weights.
-    """
+    """Error of a scene's shN by codebook size, extrapolated from a small codebook."""
 
     entries: int = 1
-    weighted: float = 0.0
-    unweighted: float = 0.0
+    weighted: float = 0.0  # its squared image error, weighted by sensitivity
+    unweighted: float = 0.0  # squared image error of a codebook of that size with equal weights
 
     def error(self, entries: float) -> float:
         """Return the squared image error of a codebook with that number of entries."""
@@ -273,13 +245,7 @@ def codebook_error_model(
         sensitivity_weights(sensitivity, some, splats),
         entries,
         pool,
-        kmeans.KMeansOptions(
-            seed=settings.seed,
-            iterations=settings.sh_kmeans_iterations,
-            neighbors=settings.sh_neighbors,
-            tolerance=settings.sh_tolerance,
-            lattice=0.0,
-        ),
+        _kmeans_options(settings, 0.0),
         metric=metric,
     )
     lost, most = vectors[some] - clusters.centroids[clusters.labels], MAX_DISPLAYED_ERROR / SH_MEAN_SQUARE

@@ -1,8 +1,4 @@
-"""Rotations as three components of a quaternion, a byte each; the fourth follows from the length 1 and is not negative.
-
-Level b stands for (b / 255 - 1/2) sqrt(2), so 0 lies between the levels 127 and 128. In the canonical form, w is always
-the largest component: where it can be left out, it is, and the plane that says which one is missing is constant.
-"""
+"""Rotations as three components of a quaternion, a byte each; the fourth, not negative, follows from the length 1."""
 
 from __future__ import annotations
 
@@ -11,7 +7,7 @@ import numpy as np
 from kissgs.core.array_types import Float, Float64, Int, UInt8
 
 TABLE = (np.arange(256) / 255 - 0.5) * np.sqrt(2)
-"""Value of each level."""
+"""Value of each level; 0 lies between the levels 127 and 128."""
 
 STEP = float(TABLE[1] - TABLE[0])
 
@@ -20,7 +16,7 @@ KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def omitted_components(quats: Float64[np.ndarray, "N 4"]) -> UInt8[np.ndarray, " N"]:
-    """Return the component to leave out: w where it is at least 1/sqrt(2), else the largest."""
+    """Return the component to leave out: w where it is at least 1/sqrt(2), as in canonical forms, else the largest."""
     largest = np.abs(quats).argmax(axis=1)
     return np.where(np.abs(quats[:, 0]) >= np.sqrt(0.5), 0, largest).astype(np.uint8)
 
@@ -52,11 +48,6 @@ def lattice_levels(small: Float64[np.ndarray, "N 3"], stride: int | Int[np.ndarr
 def fits(levels: Int[np.ndarray, "N 3"]) -> np.ndarray:
     """Whether the squares of three components add up to at most 1, so that a fourth exists."""
     return np.asarray(np.square(TABLE[levels]).sum(axis=1) <= 1)
-
-
-def quaternions(levels: UInt8[np.ndarray, "N 3"], omitted: UInt8[np.ndarray, " N"]) -> Float64[np.ndarray, "N 4"]:
-    """Return the quaternions that a decoder makes of the levels."""
-    return whole(TABLE[levels], omitted)
 
 
 def whole(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from kissgs.core.array_types import Int32, UInt8
 from kissgs.core.numba_kernels import compiled
 
 
@@ -18,15 +19,17 @@ def _bits_between(pixels: np.ndarray, bits: np.ndarray, a: int, b: int) -> int:
 
 
 @compiled("void(uint8[:, ::1], int32[:, ::1], int32[:, ::1], int64, int32[:, ::1])")
-def near_pixels(pixels: np.ndarray, bits: np.ndarray, curves: np.ndarray, reach: int, near: np.ndarray) -> None:
+def near_pixels(
+    pixels: UInt8[np.ndarray, "N C"],
+    bits: Int32[np.ndarray, "C 256"],
+    curves: Int32[np.ndarray, "K N"],
+    reach: int,
+    near: Int32[np.ndarray, "N k"],
+) -> None:
     """Find the pixels that take the fewest bits beside each pixel, among those that are near it on some curves.
 
-    Args:
-        pixels: ``(N, C)``.
-        bits: ``(C, 256)`` bits of each difference, modulo 256.
-        curves: ``(K, N)`` permutations.
-        reach: number of places on a curve, in both directions.
-        near: ``(N, k)`` result, the fewest bits first; filled up with the pixel itself.
+    ``bits`` are those of each difference modulo 256, ``curves`` permutations, and ``reach`` places on a curve in both
+    directions. ``near`` has the fewest bits first, and is filled up with the pixel itself.
     """
     count, most = near.shape
     best = np.empty((count, most), np.int64)
@@ -148,15 +151,16 @@ def _rotate(order: np.ndarray, places: np.ndarray, first: int, middle: int, end:
 
 
 @compiled("void(uint8[:, ::1], int32[:, ::1], int32[:, ::1], int64, int32[::1])")
-def improve(pixels: np.ndarray, bits: np.ndarray, near: np.ndarray, passes: int, order: np.ndarray) -> None:
+def improve(
+    pixels: UInt8[np.ndarray, "N C"],
+    bits: Int32[np.ndarray, "C 256"],
+    near: Int32[np.ndarray, "N k"],
+    passes: int,
+    order: Int32[np.ndarray, " N"],
+) -> None:
     """Reorder pixels such that each takes fewer bits beside the one before it; the first and the last one stay.
 
-    Args:
-        pixels: ``(N, C)``.
-        bits: ``(C, 256)`` bits of each difference, modulo 256; equal for a difference and its negative.
-        near: ``(N, k)`` pixels that each pixel may be joined to, the fewest bits first.
-        passes: largest number of passes over the pixels.
-        order: ``(N,)`` permutation; modified.
+    ``bits`` are equal for a difference and its negative.
     """
     places = np.empty(len(order), np.int32)
     for place in range(len(order)):

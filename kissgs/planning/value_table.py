@@ -1,8 +1,4 @@
-"""Tables of at most 256 values that all channels of an attribute share: where the values lie, and the nearest levels.
-
-A table holds the occupied points of an even lattice, so that outliers cost no step of the others. If more than 256
-points are occupied, the neighbours whose union adds the least weighted squared error are joined until 256 remain.
-"""
+"""Tables of at most 256 values that all channels of an attribute share, and the nearest levels."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import heapq
 
 import numpy as np
 
-from kissgs.core.array_types import Float, Float32, Float64, Int, UInt8
+from kissgs.core.array_types import Float, Float32, Float64, Integer, UInt8
 from kissgs.planning.quantize import Quantized
 
 SIZE = 256
@@ -29,13 +25,10 @@ MAX_POINTS = 1 << 14
 def fit_table(
     values: Float[np.ndarray, " V"], weights: Float64[np.ndarray, " V"], step: float, *, with_zero: bool = False
 ) -> Float32[np.ndarray, " levels"]:
-    """Return ascending values of a table for ``values``.
+    """Return ascending values of a table for at least one value: the occupied points of a lattice of this ``step``.
 
-    Args:
-        values: finite, at least one.
-        weights: weight of each value's squared error, not negative.
-        step: distance of the lattice points, above 0.
-        with_zero: whether 0 must be a value of the table.
+    So outliers cost no step of the others. If more than 256 points are occupied, the neighbours whose union adds the
+    least weighted squared error are joined.
     """
     wide = np.asarray(values, np.float64)
     span = float(np.ptp(wide))
@@ -100,10 +93,7 @@ def nearest_levels(table: Float[np.ndarray, " levels"], values: Float[np.ndarray
 
 def table_field(table: Float32[np.ndarray, " levels"], levels: UInt8[np.ndarray, "N C"]) -> Quantized:
     """Return levels that stand for the values of a table, which are rounded to the digits that are stored."""
-    short = short_values(table)
-    channels = levels.shape[1]
-    low, high = (np.full(channels, end, np.float32) for end in (short[0], short[-1]))
-    return Quantized(levels, low, high, max(len(short) - 1, 1), table=short)
+    return Quantized(levels, short_values(table).astype(np.float64)[:, None])
 
 
 def short_values(table: Float32[np.ndarray, " levels"]) -> Float32[np.ndarray, " levels"]:
@@ -113,20 +103,12 @@ def short_values(table: Float32[np.ndarray, " levels"]) -> Float32[np.ndarray, "
 
 def refit_table(
     table: Float32[np.ndarray, " levels"],
-    levels: Int[np.ndarray, "N C"],
+    levels: Integer[np.ndarray, "N C"],
     values: Float64[np.ndarray, "N C"],
     weights: Float64[np.ndarray, " N"],
     largest: tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]],
 ) -> Float32[np.ndarray, " levels"]:
-    """Move each value of a table to the weighted mean of what it stands for, as far as the largest errors permit.
-
-    Args:
-        table: ascending values.
-        levels: level of each value.
-        values: the values that were quantised.
-        weights: weight of each row's squared error.
-        largest: largest decrease and increase of each row's values.
-    """
+    """Move each value of a table to the weighted mean of what it stands for, within the largest changes down and up."""
     size, rows = len(table), np.broadcast_to(weights[:, None], levels.shape).ravel()
     index, flat = levels.ravel(), values.ravel()
     mass = np.bincount(index, rows, minlength=size)
@@ -140,7 +122,7 @@ def refit_table(
 
 
 def without_unused(
-    table: Float32[np.ndarray, " levels"], levels: Int[np.ndarray, "N C"] | UInt8[np.ndarray, "N C"]
+    table: Float32[np.ndarray, " levels"], levels: Integer[np.ndarray, "N C"]
 ) -> tuple[Float32[np.ndarray, " used"], UInt8[np.ndarray, "N C"]]:
     """Return the table without the values that no level uses, and the levels in it."""
     used, index = np.unique(levels, return_inverse=True)

@@ -16,21 +16,16 @@ from typing import Any
 from kissgs.core.errors import InvalidSceneError, KissgsError, UnsupportedError
 from kissgs.core.origin import WORLD
 from kissgs.core.progress import Progress, silent
-from kissgs.io.containers import CONTAINERS, Source, ending_of, open_source
+from kissgs.formats import CONTAINERS, FORMATS, ending_of
+from kissgs.io.containers import META_NAME, Source, open_source
 from kissgs.io.files import reason_of
 from kissgs.io.ply import write_ply
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.io.streamed import StreamedFormat
 from kissgs.pipeline.pipeline import compress
-from kissgs.pipeline.scene_files import (
-    DEFAULT_READ_OPTIONS,
-    STREAMED_FORMATS,
-    ReadOptions,
-    open_scene,
-    recognise,
-    scene_root,
-)
+from kissgs.pipeline.scene_files import open_scene, recognise, scene_root
 from kissgs.sog import streamed as streamed_sog
-from kissgs.sog.metadata import META_NAME, read_layout
+from kissgs.sog.metadata import read_layout
 from kissgs.sogxt import streamed as streamed_sogxt
 from kissgs.sogxt.container import zip_bytes
 
@@ -40,26 +35,18 @@ PAGE_GAUSSIANS = 1_000_000
 
 @dataclass(frozen=True)
 class StreamedFolder:
-    """A streamed scene whose files are read when the page asks for them.
+    """A streamed scene whose files are read when the page asks for them."""
 
-    Attributes:
-        name: name of the folder.
-        manifest: name of the manifest in it.
-        files: all files of the scene by their paths from the folder, the manifest included, and no others.
-        missing: files that the scene should have, but that are not in the folder.
-        unusable: files that are there, but that are no files, or links that lead out of the folder or nowhere.
-    """
-
-    name: str
+    name: str  # of the folder
     manifest: str
-    files: dict[str, Path]
+    files: dict[str, Path]  # by their paths from the folder, the manifest included
     missing: tuple[str, ...]
-    unusable: tuple[str, ...]
+    unusable: tuple[str, ...]  # no files, or links that lead out of the folder or nowhere
 
 
 def is_streamed(source: Path | bytes) -> bool:
     """Whether a scene is a streamed one, in a folder or a zip."""
-    return recognise(source) in STREAMED_FORMATS
+    return FORMATS[recognise(source)].manifest is not None
 
 
 def is_streamed_folder(source: Path) -> bool:
@@ -68,17 +55,7 @@ def is_streamed_folder(source: Path) -> bool:
 
 
 def streamed_folder(source: Path) -> StreamedFolder:
-    """Return the files of a streamed scene.
-
-    Files that the scene lacks or that cannot be reached, and links that lead out of the folder, are left out: the page
-    names them, and shows the rest.
-
-    Args:
-        source: the folder, or its manifest.
-
-    Raises:
-        KissgsError: the manifest is damaged, or names files that are not below its folder.
-    """
+    """Return the files of a streamed scene; the page names those that cannot be reached, and shows the rest."""
     folder, kind = scene_root(source), _format(source)
     with kind.open(folder) as opened:
         tree = kind.read_manifest(opened)
@@ -120,20 +97,11 @@ def _container_files(files: Source, name: str) -> list[str]:
         layout = read_layout(files, name)
     except KissgsError:
         return [name]
-    images = [*layout.files.values(), *([] if layout.rest is None else [layout.rest.centroids, layout.rest.labels])]
-    return [name, *(f"{parent}/{image}" if parent else image for image in images)]
+    return [name, *(f"{parent}/{image}" if parent else image for image in layout.images)]
 
 
 def fitting_level(source: Path | bytes, max_gaussians: int | None = None) -> tuple[int, int]:
-    """Return the finest level that fits into a page of one file, or else the coarsest, and the number of levels.
-
-    Args:
-        source: the folder of a streamed scene, its manifest, or a zip of it.
-        max_gaussians: largest number of Gaussians of a level with the environment, if below ``PAGE_GAUSSIANS``.
-
-    Raises:
-        KissgsError: the manifest or the environment is missing or damaged.
-    """
+    """Return the finest level that fits into a page of one file, or else the coarsest, and the number of levels."""
     kind = _format(source)
     with kind.open(scene_root(source) if isinstance(source, Path) else source) as files:
         tree = kind.read_manifest(files)
@@ -157,11 +125,7 @@ _IMPORT_MAP = re.compile(r'<script type="importmap">(.*?)</script>', re.DOTALL)
 
 
 def page_files() -> dict[str, Path]:
-    """Return the files of the page by their paths from it, such as ``vendor/three/build/three.module.min.js``.
-
-    Raises:
-        UnsupportedError: the page, or Spark or three.js, which draw the scene, are not installed.
-    """
+    """Return the files of the page by their paths from it, such as ``vendor/three/build/three.module.min.js``."""
     folder = ROOT / "web_decoder"
     if not (folder / PAGE).is_file():
         raise UnsupportedError(
@@ -180,11 +144,7 @@ def _candidates(folder: Path) -> list[Path]:
 
 
 def fetch_viewer() -> None:
-    """Download Spark and three.js, at the versions and hashes that this version of kissgs names, if they are missing.
-
-    Raises:
-        UnsupportedError: they cannot be downloaded; the script's own message stands before.
-    """
+    """Download Spark and three.js if they are missing, at the versions and hashes that this version of kissgs names."""
     done = subprocess.run([sys.executable, ROOT / "scripts" / "vendor"], stdout=sys.stderr, check=False)
     if done.returncode:
         raise UnsupportedError("Spark and three.js could not be downloaded; the reason is above")
@@ -215,35 +175,18 @@ _FILE_ENDINGS = (".webp", ".json", ".yaml", ".yml")
 
 @dataclass(frozen=True)
 class PageScene:
-    """A file for the page, which recognises its format by the ending of its name.
+    """A file for the page, which recognises its format by the ending of its name."""
 
-    Attributes:
-        name: file name, ending in ``.zip``, ``.sog`` or ``.ply``.
-        data: content of the file.
-        converted: whether the scene came in another format.
-        notes: what reading the scene left out or changed, one phrase each.
-    """
-
-    name: str
+    name: str  # ends in .zip, .sog or .ply
     data: bytes
-    converted: bool
-    notes: tuple[str, ...] = ()
+    converted: bool  # from another format
+    notes: tuple[str, ...] = ()  # what reading the scene left out or changed
 
 
 def page_scene(
     source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, *, threads: int = 0, progress: Progress = silent
 ) -> PageScene:
-    """Return a scene for the page: a SOG-XT or SOG container unchanged, any other format as a ``.ply`` of equal values.
-
-    Args:
-        source: path of a scene of any format, or the bytes of its file.
-        reading: options for reading it.
-        threads: number of threads; 0 means one per processor.
-        progress: receives events.
-
-    Raises:
-        KissgsError: the scene cannot be read.
-    """
+    """Return a scene for the page: a SOG-XT or SOG container unchanged, any other as a ``.ply`` of equal values."""
     splats, cleaned, _ = open_scene(source, reading, threads, progress)
     notes = (*splats.notes, *cleaned.notes)
     container = _as_container(source, reading)
@@ -257,10 +200,7 @@ def page_scene(
 def page_container(
     source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, *, threads: int = 0, progress: Progress = silent
 ) -> PageScene:
-    """Return a scene as a container: SOG-XT or SOG unchanged, any other format compressed by the preset ``balanced``.
-
-    The parameters and errors are those of :func:`page_scene`.
-    """
+    """Return a scene as a container: SOG-XT or SOG unchanged, any other compressed by the preset ``balanced``."""
     container = _as_container(source, reading)
     if container is not None:  # whoever gets the page cannot mend a damaged one
         splats, cleaned, _ = open_scene(source, reading, threads, progress)

@@ -41,14 +41,7 @@ class PageServer(ThreadingHTTPServer):
     """Server of the page at ``/``, of its files and of the scene, and of nothing else.
 
     Only requests whose ``Host`` is this machine by number or as ``localhost`` are answered, so that a web site whose
-    name resolves to 127.0.0.1 cannot read the scene.
-
-    Args:
-        scene: the scene, held in memory; or a streamed one, whose files are read as the page asks for them.
-        port: TCP port; 0 for a free one.
-
-    Raises:
-        UnsupportedError: the page is not installed, or the port cannot be used.
+    name resolves to 127.0.0.1 cannot read the scene. Port 0 is a free one.
     """
 
     daemon_threads = True

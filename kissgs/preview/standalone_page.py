@@ -31,11 +31,7 @@ _POLICY = (
 
 
 def standalone_page(scene: PageScene) -> bytes:
-    """Return the page with a container inside: UTF-8, equal bytes for equal input.
-
-    Raises:
-        UnsupportedError: the page, Spark or three.js are not installed.
-    """
+    """Return the page with a container inside: UTF-8, equal bytes for equal input."""
     files = page_files()
     page = read_page(files)
     style, start = _text(files[_STYLE]), _text(files[_START])
@@ -63,12 +59,7 @@ def standalone_page(scene: PageScene) -> bytes:
 
 
 class _Modules:
-    """Modules of the page in the order of their imports; ``linked`` holds names and texts.
-
-    Args:
-        files: files of the page.
-        imports: import map of the page.
-    """
+    """Modules of the page in the order of their imports; ``linked`` holds names and texts."""
 
     def __init__(self, files: dict[str, Path], imports: dict[str, str]) -> None:
         self._files = files

@@ -126,16 +126,9 @@ def look_at(
     width: int,
     height: int,
 ) -> Camera:
-    """Return a camera with ``target`` in the middle of its image.
+    """Return a camera with ``target`` in the middle of its image; ``fov`` in radians, along the longer side.
 
-    Args:
-        position: ``(3,)`` centre of projection, world units.
-        target: ``(3,)`` point in the middle of the image, world units.
-        up: ``(3,)`` direction that points up in the image, of any length. The roll is arbitrary if it is zero or along
-            the line of sight.
-        fov: angle of view along the longer side, radians.
-        width: of the image, pixels.
-        height: of the image, pixels.
+    ``up``, of any length, points up in the image; the roll is arbitrary if it is zero or along the line of sight.
     """
     forward = target - position
     forward = forward / max(float(np.linalg.norm(forward)), 1e-30)

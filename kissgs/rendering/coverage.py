@@ -10,14 +10,11 @@ from kissgs.core.array_types import Float32
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import BLOCK
 from kissgs.core.splats import Splats
-from kissgs.rendering.constants import DILATION, NEAR
+from kissgs.rendering.constants import DILATION
 from kissgs.rendering.cpu.tiles import each_part, even
 
 if TYPE_CHECKING:
     from kissgs.rendering.cpu.frame import Frame
-
-
-# Local scale: the distance between Gaussians around each one, from which its surroundings fill an image.
 
 LEAF = 512
 """Largest number of Gaussians in a leaf of the tree, among which neighbours are searched."""
@@ -39,22 +36,15 @@ def local_scale(splats: Splats, *, threads: int = 0) -> Float32[np.ndarray, " N"
     Distances are measured within the leaves of a k-d tree of equal counts, which adapts to parts of any size. For an
     object of fewer Gaussians, the distance is extrapolated as if its surface continued. The result is at least the
     Gaussian's own size.
-
-    Args:
-        splats: a finite scene.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
     """
-    from kissgs.rendering.cpu.neighbours import leaf_scales, split_into_leaves
+    from kissgs.rendering.cpu.neighbours import leaf_scales, leaves_of
 
-    count = len(splats)
-    columns = np.ascontiguousarray(splats.means.T)
-    order, edges = np.arange(count, dtype=np.int32), np.empty(4 * count // LEAF + 2, np.int64)
-    leaves = split_into_leaves(columns, LEAF, order, edges)
-    found = np.empty(count, np.float32)
+    means, found = np.array(splats.means, order="C"), np.empty(len(splats), np.float32)
+    order, edges = leaves_of(means, LEAF)
     with Workers(threads) as pool:
         each_part(
-            lambda first, last: leaf_scales(columns, order, edges, first, last, SAMPLED, NEIGHBOURS, GAP, found),
-            even(leaves, pool),
+            lambda first, last: leaf_scales(means, order, edges, first, last, SAMPLED, NEIGHBOURS, GAP, found),
+            even(len(edges) - 1, pool),
             pool,
         )
     sizes = np.exp(np.median(splats.scales, axis=1))
@@ -77,11 +67,7 @@ is viewed from up to :data:`MAX_APPROACH` times nearer."""
 
 
 class Coverage:
-    """The best coverage of each Gaussian over the images added so far.
-
-    Args:
-        splats: a finite scene.
-    """
+    """The best coverage of each Gaussian over the images added so far."""
 
     def __init__(self, splats: Splats) -> None:
         self._splats = splats
@@ -106,32 +92,11 @@ class Coverage:
     def add(self, frame: Frame, seen: Float32[np.ndarray, " N"], pool: Workers, finer: float = 1.0) -> None:
         """Update the coverage by one rendered image.
 
-        Args:
-            frame: the image.
-            seen: sum over pixels of (alpha T)², T being the transmittance in front of the Gaussian, by row of the
-                frame's footprints.
-            pool: threads.
-            finer: ratio of the resolution of the image that this one is a thumbnail of to its own.
+        ``seen``: sum over pixels of (alpha T)² by row of the frame's footprints; ``finer``: ratio of the resolution of
+        the image that this one is a thumbnail of to its own.
         """
         from kissgs.rendering.cpu.coverage import raise_coverage
 
-        splats, camera = frame.splats, frame.camera
-        limits = np.array([NEAR, VISIBLE, RESOLVED / finer, camera.dilation / DILATION, splats.antialiased])
-
-        def part(rows: tuple[int, int]) -> None:
-            raise_coverage(
-                splats.means,
-                splats.scales,
-                splats.opacities,
-                self._scale,
-                frame.footprints.visible,
-                *rows,
-                seen,
-                camera.position,
-                float(np.sqrt(camera.K[0, 0] * camera.K[1, 1])),
-                camera.width * camera.height,
-                limits,
-                self.share,
-            )
-
-        pool.map(part, frame.footprints.parts)
+        limits = np.array([VISIBLE, RESOLVED / finer, frame.camera.dilation / DILATION])
+        scene = frame.gaussians, frame.projection, self._scale, frame.footprints.visible
+        pool.map(lambda rows: raise_coverage(*scene, *rows, seen, limits, self.share), frame.parts)

@@ -18,12 +18,10 @@ from kissgs.rendering.cpu.frame import Frame, draw
 from kissgs.rendering.metrics import differences_and_ssim
 from kissgs.rendering.tensors import Parameters
 
-# The differentiable rasteriser for torch, on the device of the parameters.
-
 try:
     import torch
     from torch import Tensor
-    from torch.autograd.function import once_differentiable
+    from torch.autograd.function import BackwardCFunction, FunctionCtx, once_differentiable
 except ModuleNotFoundError as error:
     raise UnsupportedError("gradients need torch, which is not installed: pip install 'kissgs[train]'") from error
 
@@ -44,37 +42,13 @@ def rasterize(
     """Render images of a scene, with gradients by all of its parameters.
 
     On the CPU by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``), both with the image model of
-    :mod:`kissgs.rendering.constants`.
-
-    Args:
-        parameters: stored parameters of a scene, float32 and finite, all on one device; from
-            :func:`kissgs.rendering.tensors.tensors_of`, for example:
-
-            - means: ``(N, 3)`` world units.
-            - quats: ``(N, 4)`` w, x, y, z of any length; a length below 1e-12 means no rotation, and gradient 0.
-            - scales: ``(N, 3)`` natural logarithms of standard deviations.
-            - opacities: ``(N,)`` logits.
-            - sh0: ``(N, 3)`` constant SH coefficients.
-            - shN: ``(N, K, 3)`` other SH coefficients, K one of 0, 3, 8, 15.
-        viewmats: ``(C, 4, 4)`` world to camera; x right, y down, z forward. No gradient.
-        Ks: ``(C, 3, 3)`` intrinsics in pixels. No gradient.
-        width: of the images, pixels.
-        height: of the images, pixels.
-        backgrounds: ``(C, 3)`` RGB; black by default. No gradient.
-        dilation: variance added to both axes of a footprint, pixels².
-        antialiased: whether opacities are compensated for the dilation (:attr:`kissgs.Splats.antialiased`).
-        threads: number of CPU threads; 0 means one per processor. The result does not depend on it.
-        receive: on the CPU, called in the backward pass with the gradients of each image, in place of autograd: most
-            Gaussians have none, and arrays for all of them take longer to fill than to compute.
+    :mod:`kissgs.rendering.constants`. Parameters are float32 and finite, on one device, as from
+    :func:`kissgs.rendering.tensors.tensors_of`; cameras ``(C, 4, 4)`` and ``(C, 3, 3)``, and backgrounds ``(C, 3)``,
+    have no gradient. ``receive`` is called in the backward pass on the CPU with the gradients of each image, in place
+    of autograd: most Gaussians have none, and arrays for all of them take longer to fill than to compute.
 
     Returns:
         Images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``.
-
-    Raises:
-        UnsupportedError: cameras or backgrounds require a gradient; a parameter is not float32 or is on another device;
-            the images would take too much memory; gsplat is not installed.
-        InvalidSceneError: the shapes of the parameters do not fit together.
-        InvalidViewsError: no camera; another number of backgrounds than of cameras; not a rigid pose, or not a pinhole.
     """
     tensors, device = [parameters[name] for name in ATTRIBUTES], parameters["means"].device
     if backgrounds is None:
@@ -148,17 +122,6 @@ def _stack(images: list[np.ndarray]) -> Tensor:
     return torch.from_numpy(images[0][None] if len(images) == 1 else np.stack(images))
 
 
-# The loss of training: mean absolute and squared difference and SSIM between a rendering and its target image.
-
-try:
-    import torch
-    from torch.autograd.function import BackwardCFunction, FunctionCtx, once_differentiable
-except ModuleNotFoundError as error:
-    raise UnsupportedError(
-        "the training loss needs torch, which is not installed: pip install 'kissgs[train]'"
-    ) from error
-
-
 def photometric_loss(
     image: Float[torch.Tensor, "..."],
     target: Float[torch.Tensor, "..."],
@@ -167,24 +130,14 @@ def photometric_loss(
     mse_weight: float = 0.0,
     threads: int = 0,
 ) -> Float[torch.Tensor, ""]:
-    """Return (1 - w) · mean |d| + w · (1 - SSIM) + m · mean d², for the difference d = image - target.
+    """Return (1 - w) · mean |d| + w · (1 - SSIM) + m · mean d², for d = image - target and weights ``ssim_weight``, w,
+    and ``mse_weight``, m.
 
     Where |d| is above 1, 2 |d| - 1 takes the place of d², so that a diverged pixel does not outweigh all others.
     SSIM is that of :func:`kissgs.rendering.metrics.ssim`. With m = 0 it is the loss of Kerbl et al., "3D Gaussian
     Splatting for Real-Time Radiance Field Rendering", ACM Transactions on Graphics 42 (2023), equation 7. On the CPU in
-    float32 the gradient is computed together with the value; elsewhere by autograd.
-
-    Args:
-        image: ``(H, W, 3)`` or ``(C, H, W, 3)``, any values: renderings are not clamped. Values beyond ±1e9 are
-            clamped; NaN gives NaN.
-        target: of the same shape, dtype and device; gets no gradient.
-        ssim_weight: w, from 0 to 1.
-        mse_weight: m, 0 or more.
-        threads: number of CPU threads; 0 means one per processor. The result does not depend on it.
-
-    Raises:
-        InvalidViewsError: the tensors are not images of the same size.
-        ValueError: the target requires a gradient.
+    float32 the gradient is computed together with the value; elsewhere by autograd. Images are ``(H, W, 3)`` or
+    ``(C, H, W, 3)``, not clamped, except at ±1e9.
     """
     if image.shape != target.shape or image.ndim not in (3, 4) or image.shape[-1] != 3 or image.numel() == 0:
         raise InvalidViewsError(

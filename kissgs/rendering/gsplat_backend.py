@@ -39,11 +39,7 @@ def rasterize_on_cuda(
     dilation: float,
     antialiased: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Render as :func:`kissgs.rendering.differentiable.rasterize`, for tensors on CUDA.
-
-    Raises:
-        UnsupportedError: gsplat is not installed.
-    """
+    """Render as :func:`kissgs.rendering.differentiable.rasterize`, for tensors on CUDA."""
     import torch
 
     try:
@@ -77,24 +73,8 @@ def rasterize_on_cuda(
     return images, alphas[..., 0]
 
 
-def alpha_max() -> float:
-    """Return the largest alpha of the installed gsplat: 0.999 in releases up to 1.5.3, which do not export it.
-
-    With 0.999, images differ from those of the CPU by a few hundredths where opaque Gaussians overlap.
-    """
-    try:
-        from gsplat.cuda import _constants
-    except ImportError:
-        return 0.999
-    return float(_constants.MAX_ALPHA)
-
-
 def need_cuda() -> None:
-    """Check that CUDA can be used, before a long computation.
-
-    Raises:
-        UnsupportedError: torch or gsplat is not installed, or torch finds no CUDA device.
-    """
+    """Check that CUDA can be used, before a long computation."""
     try:
         import torch
     except ImportError as error:
@@ -106,11 +86,7 @@ def need_cuda() -> None:
 
 
 def image_renderer(splats: Splats) -> ImageRenderer:
-    """Return a renderer of a scene, which is copied to the GPU once.
-
-    Raises:
-        UnsupportedError: torch or gsplat is not installed, or torch finds no CUDA device.
-    """
+    """Return a renderer of a scene, which is copied to the GPU once."""
     need_cuda()
     import torch
 

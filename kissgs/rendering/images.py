@@ -16,8 +16,6 @@ from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import BLACK, Colour, Device, render
 
-# Rendered images with 8 bits per channel, as PNG, WebP or animated WebP.
-
 LOSSLESS = 100
 """Value of ``quality`` that means lossless WebP."""
 
@@ -37,19 +35,7 @@ def render_all(
     device: Device = "cpu",
     progress: Progress = silent,
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
-    """Render an image for each camera, with 8 bits per channel; a repeated camera object gives the same array.
-
-    Args:
-        splats: a finite scene (:func:`kissgs.clean`).
-        cameras: cameras, of any sizes.
-        background: RGB from 0 to 1.
-        threads: number of CPU threads; 0 means one per processor.
-        device: "cpu" or "cuda", which needs the extra ``kissgs[cuda]``.
-        progress: receives the stage "render".
-
-    Raises:
-        UnsupportedError: the images would take more than :data:`MAX_PIXEL_BYTES`, or CUDA cannot be used.
-    """
+    """Render an image for each camera, with 8 bits per channel; a repeated camera object gives the same array."""
     if 3 * sum(camera.width * camera.height for camera in cameras) > MAX_PIXEL_BYTES:
         raise UnsupportedError(
             f"{len(cameras)} images of this size would take too much memory, more than {MAX_PIXEL_BYTES >> 30} GiB; "
@@ -90,13 +76,7 @@ def png(pixels: UInt8[np.ndarray, "H W 3"]) -> bytes:
 def animated_webp(frames: Sequence[UInt8[np.ndarray, "H W 3"]], *, fps: float, quality: int) -> bytes:
     """Return the frames as an animated WebP file that repeats for ever, or a single frame as a still one.
 
-    Args:
-        frames: one or more, all of one size.
-        fps: frames per second; durations are whole milliseconds such that the total duration is right.
-        quality: 0 to 100; :data:`LOSSLESS`, 100, means lossless.
-
-    Raises:
-        UnsupportedError: a side is longer than :data:`MAX_WEBP_SIDE`.
+    Durations are whole milliseconds such that the total duration is right. ``quality``: 0 to :data:`LOSSLESS`.
     """
     height, width = frames[0].shape[:2]
     if max(width, height) > MAX_WEBP_SIDE:
@@ -138,13 +118,7 @@ def contact_sheet(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Return the images on a contact sheet, in rows from left to right, each in the middle of its cell.
 
-    Args:
-        images: one or more. Cells have the size of the largest.
-        labels: one for each image, or none.
-        columns: number of images per row; by default such that the contact sheet is about 3 to 2.
-
-    Raises:
-        UnsupportedError: the contact sheet would have more than :data:`MAX_PIXELS`.
+    Cells have the size of the largest image. By default there are so many ``columns`` that the sheet is about 3 to 2.
     """
     width, height = max(p.shape[1] for p in images), max(p.shape[0] for p in images)
     font = ImageFont.load_default(size=max(11, min(width // 20, 28)))

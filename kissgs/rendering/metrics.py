@@ -14,8 +14,6 @@ from kissgs.core.array_types import Float32, Float64, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.resources import Workers
 
-# Image metrics as in the 3DGS literature: PSNR, SSIM and MS-SSIM.
-#
 # Images are ``(H, W, 3)``, floats in [0, 1] or uint8. Values outside [0, 1] are not clamped here; clamp renderings
 # first. A NaN in either image makes the result NaN, so that no average hides a failed rendering.
 
@@ -33,11 +31,7 @@ TILE_ROWS = 128
 
 
 def psnr(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
-    """Return the peak signal-to-noise ratio, -10 log10 of the mean squared difference, decibels; ∞ for equal images.
-
-    Raises:
-        InvalidViewsError: the arrays are not two images of the same size.
-    """
+    """Return the peak signal-to-noise ratio, -10 log10 of the mean squared difference, decibels; ∞ for equal images."""
     a, b = image_pair(image, reference)
     with np.errstate(invalid="ignore"):  # the difference of infinities is NaN, and so is the result
         error = float(np.mean(np.square(a.astype(np.float64) - b)))
@@ -51,9 +45,6 @@ def ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."])
     padding with zeros (so that images may have any size), C1 = 0.01², C2 = 0.03². Values beyond ±1e9 are clamped. Wang
     et al., "Image Quality Assessment: From Error Visibility to Structural Similarity", IEEE Transactions
     on Image Processing 13 (2004).
-
-    Raises:
-        InvalidViewsError: the arrays are not two images of the same size.
     """
     a, b = image_pair(image, reference)
     with Workers(1) as pool:
@@ -74,9 +65,6 @@ def ms_ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "...
     at the coarsest scale zeros beyond the border would reach a large share of the windows. A shorter side below 176
     pixels has less than :data:`WINDOW` pixels at the last scale: only the scales that hold a window are used, and their
     exponents are divided by their sum. Below 11 pixels, the result is :func:`ssim`, at least 0.
-
-    Raises:
-        InvalidViewsError: the arrays are not two images of the same size.
     """
     a, b = (np.clip(pixels, -1e9, 1e9) for pixels in image_pair(image, reference))
     scales = min((min(a.shape[:2]) // WINDOW).bit_length(), len(SCALE_WEIGHTS))
@@ -116,11 +104,7 @@ def _halved(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "h w 3"]
 def image_pair(
     image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]
 ) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 3"]]:
-    """Return both images as contiguous float32, uint8 divided by 255.
-
-    Raises:
-        InvalidViewsError: the arrays are not two images of the same size.
-    """
+    """Return both images as contiguous float32, uint8 divided by 255."""
     if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise InvalidViewsError(
             f"images to compare must have one shape, (height, width, 3), not {image.shape} and {reference.shape}"
@@ -146,15 +130,7 @@ def differences_and_ssim(
 ) -> Float64[np.ndarray, "3"]:
     """Return sums over all pixels and channels, and compute the gradient of their weighted sum in the same pass.
 
-    Args:
-        images: images of any values; contiguous, as are the following.
-        targets: images to compare with.
-        pool: threads that process the tiles; the result does not depend on their number.
-        gradient: receives the gradient of the weighted sum by ``images``, if given.
-        weights: weights of the three sums.
-
-    Returns:
-        With d = image - target: Σ |d|, Σ d² (for |d| above 1, 2 |d| - 1 in its place) and Σ SSIM.
+    With d = image - target, the sums are Σ |d|, Σ d² (for |d| above 1, 2 |d| - 1 in its place) and Σ SSIM.
     """
     from kissgs.rendering import ssim_kernels
 
@@ -198,11 +174,7 @@ class Flip:
     """
 
     def __init__(self) -> None:
-        """Load the package.
-
-        Raises:
-            UnsupportedError: the package is not installed.
-        """
+        """Load the package."""
         try:
             self._package = importlib.import_module("flip_evaluator")
         except ModuleNotFoundError as error:
@@ -214,9 +186,6 @@ class Flip:
         """Return the mean over all pixels of two sRGB images ``(H, W, 3)``, floats or uint8; NaN if either has a NaN.
 
         Values are clamped to [0, 1].
-
-        Raises:
-            InvalidViewsError: the arrays are not two images of the same size.
         """
         first, second = (np.clip(pixels, 0, 1) for pixels in image_pair(image, reference))
         if np.isnan(first).any() or np.isnan(second).any():  # the package takes NaN for a value
@@ -241,11 +210,7 @@ class Lpips:
     """
 
     def __init__(self, device: str = "cpu") -> None:
-        """Load the network, whose weights (528 MB) torchvision downloads on first use.
-
-        Raises:
-            UnsupportedError: the packages are not installed, or the weights cannot be loaded.
-        """
+        """Load the network, whose weights (528 MB) torchvision downloads on first use."""
         try:
             package = importlib.import_module("lpips")
         except ModuleNotFoundError as error:
@@ -265,12 +230,7 @@ class Lpips:
         self._device = device
 
     def __call__(self, image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
-        """Return the distance of two images ``(H, W, 3)``, floats in [0, 1] or uint8; NaN if either has a NaN.
-
-        Raises:
-            InvalidViewsError: the arrays are not two images of the same size.
-            UnsupportedError: a side is below :data:`MIN_SIDE`.
-        """
+        """Return the distance of two images ``(H, W, 3)``, floats in [0, 1] or uint8; NaN if either has a NaN."""
         import torch
 
         pair = image_pair(image, reference)

@@ -68,17 +68,6 @@ def removal_scores(
 
     The score of GaussianPOP, section 3, exact except for Gaussians behind the end of a pixel's list. A sum over images,
     pixels and RGB in [0, 1]; 0 for a Gaussian that no camera sees.
-
-    Args:
-        splats: a finite scene.
-        cameras: cameras of the images.
-        background: RGB from 0 to 1.
-        threads: number of threads; 0 means one per processor. The scores do not depend on it.
-        progress: receives the stage "score".
-
-    Raises:
-        InvalidViewsError: the background is not three finite numbers.
-        UnsupportedError: an image would take too much memory.
     """
     from kissgs.rendering.cpu.frame import draw
     from kissgs.rendering.cpu.frame import removal_scores as frame_scores

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -110,16 +110,21 @@ def measure_sensitivity(
             even(len(splats), pool),
             pool,
         )
-    _bound(found.position_hessian, (0, 1, 2))
-    _bound(found.shape_hessian, OPACITY + SCALES + ROTATION)
-    np.nan_to_num(found.color_weight, copy=False, nan=LARGEST, posinf=LARGEST)
-    for harmonics in (found.mean_harmonics, found.higher_harmonics):
-        np.nan_to_num(harmonics, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        colors = found.color_weight[:, None]
-        np.divide(harmonics, colors, out=harmonics, where=colors > 0)
+    _finish(found)
     return_free_memory()
     progress("sensitivity", 1.0)
     return found.with_prior(splats, coverage.close_up, coverage.share, view_uncertainty)
+
+
+def _finish(sums: Sensitivity) -> None:
+    """Bound what overflows, and turn the sums of harmonics into means."""
+    _bound(sums.position_hessian, (0, 1, 2))
+    _bound(sums.shape_hessian, OPACITY + SCALES + ROTATION)
+    np.nan_to_num(sums.color_weight, copy=False, nan=LARGEST, posinf=LARGEST)
+    for harmonics in (sums.mean_harmonics, sums.higher_harmonics):
+        np.nan_to_num(harmonics, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        colors = sums.color_weight[:, None]
+        np.divide(harmonics, colors, out=harmonics, where=colors > 0)
 
 
 def _bound(hessians: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> None:
@@ -169,21 +174,8 @@ def refit_colors(
 ) -> Float32[np.ndarray, "M 3"]:
     """Return base colours of ``decoded`` with which its renderings are nearest to those of ``original``.
 
-    Args:
-        decoded: the scene that a decoder will get, finite, with initial base colours.
-        original: the uncompressed scene, finite.
-        cameras: cameras and weights of the images to compare.
-        color_weight: ``(M,)`` :attr:`kissgs.Sensitivity.color_weight` of ``decoded``.
-        prior: ``(M,)`` :attr:`kissgs.Sensitivity.prior` of ``decoded``, which attracts to the initial colours.
-        steps: number of steps of conjugate gradients; each takes one rendering and one gradient per camera.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        progress: receives the stage "refit".
-
-    Returns:
-        ``(M, 3)`` coefficients like ``sh0``, at most :data:`MAX_CHANGE` from the initial ones.
-
-    Raises:
-        UnsupportedError: an image would take too much memory.
+    They are like ``sh0``, at most :data:`MAX_CHANGE` from the initial ones, to which ``prior`` attracts them. Each of
+    the ``steps`` of conjugate gradients takes one rendering and one gradient per camera.
     """
     if steps == 0 or not (color_weight > 0).any():
         return decoded.sh0
@@ -204,24 +196,23 @@ def refit_colors(
     return np.clip(sh0, decoded.sh0 - MAX_CHANGE, decoded.sh0 + MAX_CHANGE).astype(np.float32)
 
 
+@dataclass(slots=True, kw_only=True)
 class _LeastSquares:
     """The squared image error as a function of the base colours, plus the attraction to the initial ones."""
 
-    def __init__(
-        self,
-        *,
-        decoded: Splats,
-        original: Splats,
-        cameras: WeightedCameras,
-        attraction: Float64[np.ndarray, "M 1"],
-        pool: Workers,
-        progress: Progress,
-        total_passes: int,
-    ) -> None:
-        self.decoded, self.original, self.cameras, self.attraction = decoded, original, cameras, attraction
-        self.pool, self.progress, self.passes, self.total_passes = pool, progress, 0, total_passes
-        pixels = sum(camera.width * camera.height for camera in cameras.cameras)
-        self.targets = [self._target(camera) for camera in cameras.cameras] if pixels <= MAX_CACHED_PIXELS else []
+    decoded: Splats
+    original: Splats
+    cameras: WeightedCameras
+    attraction: Float64[np.ndarray, "M 1"]
+    pool: Workers
+    progress: Progress
+    total_passes: int
+    passes: int = 0
+    targets: list[Float32[np.ndarray, "H W 3"]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if sum(camera.width * camera.height for camera in self.cameras.cameras) <= MAX_CACHED_PIXELS:
+            self.targets = [self._target(camera) for camera in self.cameras.cameras]
 
     def _target(self, camera: Camera) -> Float32[np.ndarray, "H W 3"]:
         from kissgs.rendering.cpu.frame import draw

@@ -192,18 +192,9 @@ def ssim_tile(
 ) -> None:
     """Compute sums over one tile, and the gradient of l1 Σ|d| + l2 Σ h(d) / 2 + ssim Σ SSIM / 2.
 
-    d is image - target; h(d) is d² up to |d| = 1, and 2 |d| - 1 beyond.
-
-    Args:
-        image: ``(H, 3 W)``, interleaved channels of any values.
-        target: ``(H, 3 W)``, interleaved channels of any values.
-        tile: top, bottom, left, right, ends exclusive; columns count channels, at most 480. Pixels around the tile are
-            read too, as far as the gradient depends on them.
-        l1: weight of Σ|d|.
-        l2: weight of Σ h(d) / 2.
-        ssim: weight of Σ SSIM / 2.
-        gradient: out, ``(H, 3 W)``, only the tile; ``(0, 0)`` for the sums only.
-        sums: ``(3,)``; Σ|d|, Σ h(d) and Σ SSIM over the tile are added.
+    d is image - target, whose channels are interleaved; h(d) is d² up to |d| = 1, and 2 |d| - 1 beyond. ``tile`` is
+    top, bottom, left and right, ends exclusive; columns count channels, at most 480. ``gradient`` is ``(0, 0)`` for the
+    sums only, to which Σ|d|, Σ h(d) and Σ SSIM are added.
     """
     height, width = image.shape
     top, bottom, left, right = tile
@@ -242,14 +233,9 @@ def ssim_tile(
 
 @compiled("void(float32[:, ::1], float32[:, ::1], int64[::1], float64[:, ::1])")
 def similarity_tile(image: np.ndarray, target: np.ndarray, tile: np.ndarray, sums: np.ndarray) -> None:
-    """Add the sums of SSIM and of its factor structure over one tile, for each channel.
+    """Add the sums of SSIM and of its factor structure over one tile, for each channel, to ``(2, 3)``.
 
-    Args:
-        image: ``(H, 3 W)``, interleaved channels of any values.
-        target: ``(H, 3 W)``, interleaved channels of any values.
-        tile: top, bottom, left, right, ends exclusive; columns count channels, at most 480. The tile lies at least five
-            pixels inside the image, so that all windows do.
-        sums: ``(2, 3)``; Σ SSIM and Σ structure are added.
+    The tile, as for :func:`ssim_tile`, lies at least five pixels inside the image, so that all windows do.
     """
     top, bottom, left, right = tile
     ring = np.zeros(22 * 1152, dtype=np.float32)

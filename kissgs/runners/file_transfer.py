@@ -53,11 +53,7 @@ def changed(folder: Path, before: Times, *, complete: bool) -> Iterator[dict[str
 
 
 def receive(folder: Path, event: dict[str, Any]) -> None:
-    """Write a block of an incomplete file, and give that its name once it is complete and on the disk.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a block of an incomplete file, and give that its name once it is complete and on the disk."""
     path = folder / event["file"]
     part = path.with_name(f".{path.name}.part")
     if path.parent != folder and folder.is_dir():

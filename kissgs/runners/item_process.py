@@ -1,8 +1,6 @@
-"""Process of one work item, ``python -m kissgs.runners.item_process``.
+"""Process of one work item, ``python -m kissgs.runners.item_process``: a task from standard input, events to output.
 
-It reads its task, a JSON object, from the first line of standard input, and writes one line of JSON to standard output
-per event. When standard input closes, because whoever started it has ended, or when that process dies, it ends at once:
-no work goes on that nobody waits for.
+Both are lines of JSON. When standard input closes, or whoever started it dies, it ends at once.
 """
 
 from __future__ import annotations
@@ -26,8 +24,7 @@ from kissgs.core.errors import KissgsError
 EVENT_SECONDS = 0.25
 """Minimum seconds between progress events of a stage."""
 
-PR_SET_PDEATHSIG = 1
-"""Option of Linux' ``prctl``: the signal that a process gets when its parent dies."""
+PR_SET_PDEATHSIG = 1  # of Linux' prctl: the signal that a process gets when its parent dies
 
 Send = Callable[[dict[str, Any]], None]
 

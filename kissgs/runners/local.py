@@ -1,86 +1,54 @@
-"""``LocalRunner``: work items as processes on this machine, as many at a time as their requests allow."""
+"""``LocalRunner``: work items as processes on this machine, which start at once: the caller limits their number."""
 
 from __future__ import annotations
 
-import os
 import secrets
 import threading
-from concurrent.futures import Future
-from dataclasses import dataclass
+from concurrent.futures import Future, wait
 
 from kissgs.core.progress import Progress, silent
-from kissgs.runners.contract import (
-    INTERNAL,
-    NodeResources,
-    Outcome,
-    Resources,
-    RunHandle,
-    RunnerStats,
-    WorkItem,
-    log,
-    refusal_of,
-    report,
-)
+from kissgs.runners.contract import INTERNAL, Outcome, Resources, RunHandle, WorkItem, log, report
 from kissgs.runners.process import ItemProcess
 
 
-@dataclass(slots=True)
-class _Submitted:
-    item: WorkItem
-    progress: Progress
-    outcome: Future[Outcome]
-    process: ItemProcess
-    started: bool = False
-
-
 class LocalRunner:
-    """Runner on this machine, see :class:`kissgs.runners.Runner`.
+    """Runner on this machine, see :class:`kissgs.runners.Runner`."""
 
-    Args:
-        total: resources that its items share; by default the processors of this process and the machine's memory.
-    """
-
-    def __init__(self, total: Resources | None = None) -> None:
-        self._node = NodeResources("", total if total is not None else _of_this_machine())
-        self._items: dict[str, _Submitted] = {}
-        self._changed = threading.Condition()
+    def __init__(self) -> None:
+        self._items: dict[str, tuple[ItemProcess, Future[Outcome]]] = {}
         self._closed = False
+        self._lock = threading.Lock()
+
+    @property
+    def nodes(self) -> tuple[Resources, ...]:
+        """See :class:`kissgs.runners.Runner`."""
+        return ()
 
     def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
         """See :class:`kissgs.runners.Runner`."""
-        item_id = secrets.token_hex(8)
-        submitted = _Submitted(item, progress, Future(), ItemProcess(item))
-        with self._changed:
+        item_id, process, outcome = secrets.token_hex(8), ItemProcess(item), Future[Outcome]()
+        with self._lock:
             if self._closed:
                 raise RuntimeError("the runner is closed")
-            self._items[item_id] = submitted
-            self._start_those_that_fit()
-        return RunHandle(item_id, submitted.outcome)
+            self._items[item_id] = process, outcome
+
+        def run() -> None:
+            outcome.set_result(_run(process, progress))
+            with self._lock:
+                del self._items[item_id]
+
+        threading.Thread(target=run, daemon=True).start()
+        return RunHandle(item_id, outcome)
 
     def cancel(self, item_id: str) -> None:
         """See :class:`kissgs.runners.Runner`."""
-        with self._changed:
-            submitted = self._items.get(item_id)
-            if submitted is None:
-                return
-            if submitted.started:
-                submitted.process.kill()
-                return
-            del self._items[item_id]
-            self._start_those_that_fit()  # it may have kept those behind it waiting
-        submitted.outcome.set_result(Outcome("cancelled", starts=0))
-        with self._changed:
-            self._changed.notify_all()
+        with self._lock:
+            if item_id in self._items:
+                self._items[item_id][0].kill()
 
     def refusal(self, resources: Resources) -> str | None:
         """See :class:`kissgs.runners.Runner`."""
-        return refusal_of(resources, [self._node])
-
-    def stats(self) -> RunnerStats:
-        """See :class:`kissgs.runners.Runner`."""
-        with self._changed:
-            running = sum(submitted.started for submitted in self._items.values())
-            return RunnerStats(len(self._items) - running, running, (self._node,))
+        return None
 
     def health_problem(self) -> str | None:
         """See :class:`kissgs.runners.Runner`."""
@@ -88,56 +56,24 @@ class LocalRunner:
 
     def close(self) -> None:
         """See :class:`kissgs.runners.Runner`."""
-        with self._changed:
+        with self._lock:
             self._closed = True
-            ids = list(self._items)
-        for item_id in reversed(ids):  # the first ones last, so that none starts in their place
-            self.cancel(item_id)
-        with self._changed:
-            self._changed.wait_for(lambda: not self._items)
-
-    def _start_those_that_fit(self) -> None:
-        """Start waiting items in order, until one does not fit beside those that run."""
-        if self._closed:
-            return
-        running = [submitted.item.resources for submitted in self._items.values() if submitted.started]
-        total = self._node.total
-        free = Resources(
-            total.cpus - sum(used.cpus for used in running),
-            total.memory - sum(used.memory for used in running),
-            total.gpus - sum(used.gpus for used in running),
-        )
-        for item_id, submitted in self._items.items():
-            if submitted.started:
-                continue
-            wanted = submitted.item.resources
-            if not wanted.fits(free):
-                return
-            free = Resources(free.cpus - wanted.cpus, free.memory - wanted.memory, free.gpus - wanted.gpus)
-            submitted.started = True
-            threading.Thread(target=self._run, args=(item_id, submitted), daemon=True).start()
-
-    def _run(self, item_id: str, submitted: _Submitted) -> None:
-        outcome = Outcome("cancelled")
-        try:
-            for event in submitted.process.events():
-                if isinstance(event, Outcome):
-                    outcome = event
-                else:
-                    report(submitted.progress, *event)
-        except Exception as error:  # noqa: BLE001  a bug, of which whoever waits must hear
-            log.exception("an item could not be followed", exc_info=error)
-            outcome = Outcome("error", code=INTERNAL, message="the work could not be followed; please report it")
-        finally:
-            with self._changed:
-                del self._items[item_id]
-                self._start_those_that_fit()
-            submitted.outcome.set_result(outcome)
-            with self._changed:
-                self._changed.notify_all()
+            items = list(self._items.values())
+        for process, _ in items:
+            process.kill()
+        wait([outcome for _, outcome in items])
 
 
-def _of_this_machine() -> Resources:
-    """Return the processors that this process may use and the memory of the machine; GPUs are for Ray to count."""
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return Resources(processors, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"), 0)
+def _run(process: ItemProcess, progress: Progress) -> Outcome:
+    """Report the events of a process and return its outcome."""
+    outcome = Outcome("cancelled")
+    try:
+        for event in process.events():
+            if isinstance(event, Outcome):
+                outcome = event
+            else:
+                report(progress, *event)
+    except Exception as error:  # noqa: BLE001  a bug, of which whoever waits must hear
+        log.exception("an item could not be followed", exc_info=error)
+        return Outcome("error", code=INTERNAL, message="the work could not be followed; please report it")
+    return outcome

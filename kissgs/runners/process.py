@@ -1,14 +1,14 @@
 """``ItemProcess``: start of an item's process, its progress events, its limits and its outcome.
 
-Both runners run every item in a process of its own, on Ray below the task that occupies the item's resources: only a
-process can be ended at any moment, be limited in its memory, and crash without ending anything else. Ray's own worker
-processes run many tasks, have no hard limit of memory, and take as long to start.
+Only a process of its own can be ended at any moment, be limited in its memory, and crash alone. Ray's worker processes,
+below which it runs on a cluster, run many tasks and have no hard limit of memory.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import re
 import signal
@@ -17,9 +17,10 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 from kissgs.runners.contract import (
     CRASHED,
@@ -42,18 +43,14 @@ NEAR_LIMIT = 0.8
 """Share of the memory limit above which a crash without such a message is attributed to the limit."""
 
 SAMPLE_SECONDS = 0.1
-"""Seconds between samples of a process's memory."""
+"""Seconds between looks at a process's time and memory."""
 
 LOG_BYTES = 4000
 """Bytes of the end of standard error that are kept."""
 
 
-class ProgressEvent(NamedTuple):
-    """A progress event, see :class:`kissgs.Progress`."""
-
-    stage: str
-    fraction: float
-    note: str
+ProgressEvent = tuple[str, float, str]
+"""Stage, completed fraction and note, see :class:`kissgs.Progress`."""
 
 
 class ItemProcess:
@@ -77,11 +74,6 @@ class ItemProcess:
         if self._process is not None and not self._ended.is_set():
             os.killpg(self._process.pid, signal.SIGKILL)
 
-    def _time_out(self) -> None:
-        with self._lock:
-            self._timed_out = True
-            self._kill()
-
     def events(self) -> Iterator[ProgressEvent | Outcome]:
         """Run the item: yield its progress, and its outcome last, once the process has ended."""
         if self._killed:
@@ -101,12 +93,7 @@ class ItemProcess:
 
     def _follow(self, process: subprocess.Popen[bytes]) -> Generator[ProgressEvent, None, tuple[int, Outcome | None]]:
         """Yield the progress of the process; return its status and its own outcome, None if it has sent none."""
-        timer = threading.Timer(self._item.seconds or threading.TIMEOUT_MAX, self._time_out)
-        timer.daemon = True
-        sampler = threading.Thread(target=self._sample_memory, args=(process.pid,), daemon=True)
-        sampler.start()
-        if self._item.seconds is not None:
-            timer.start()
+        threading.Thread(target=self._watch, args=(process.pid,), daemon=True).start()
         final: Outcome | None = None
         try:
             for event in _events_of(process):
@@ -115,7 +102,6 @@ class ItemProcess:
                 else:
                     yield event
         finally:  # also if the caller asks for no more events
-            timer.cancel()
             status = self._finish(process, wait=final is not None)
         return status, final
 
@@ -171,14 +157,17 @@ class ItemProcess:
                 pipe.close()
         return status
 
-    def _sample_memory(self, pid: int) -> None:
-        """Track the peak of the memory that the limit counts (``VmData``), unknown once the process has ended."""
+    def _watch(self, pid: int) -> None:
+        """Kill the process at its time limit, and track the peak of the memory that the limit counts (``VmData``)."""
+        end = time.monotonic() + (math.inf if self._item.seconds is None else self._item.seconds)
         while not self._ended.wait(SAMPLE_SECONDS):
-            try:
+            if time.monotonic() > end:
+                with self._lock:
+                    self._timed_out = True
+                    self._kill()
+            with contextlib.suppress(OSError):  # the process has ended, or this is not Linux
                 pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[5])
-            except OSError:  # the process has ended, or this is not Linux
-                return
-            self._peak_data = max(self._peak_data, pages * os.sysconf("SC_PAGE_SIZE"))
+                self._peak_data = max(self._peak_data, pages * os.sysconf("SC_PAGE_SIZE"))
 
     def _explain(self, final: Outcome | None, status: int, errors: IO[bytes]) -> Outcome:
         if final is not None and final.code != MEMORY_LIMIT:
@@ -206,7 +195,7 @@ def _events_of(process: subprocess.Popen[bytes]) -> Iterator[ProgressEvent | Out
     assert process.stdout is not None  # noqa: S101
     for event in json_lines(process.stdout):
         if "stage" in event:
-            yield ProgressEvent(event["stage"], event["fraction"], event["note"])
+            yield event["stage"], event["fraction"], event["note"]
         elif "done" in event:
             yield Outcome("done", event["done"])
         elif "error" in event:

@@ -21,12 +21,7 @@ class NoCluster(Exception):
 
 
 def connect(address: str) -> None:
-    """Connect this process to a cluster.
-
-    Raises:
-        NoCluster: there is none, and ``address`` is "auto".
-        RunnerError: the cluster cannot be reached.
-    """
+    """Connect this process to a cluster."""
     given = address if address != "auto" else os.environ.get("RAY_ADDRESS", "")
     if "://" in given:
         raise RunnerError(
@@ -45,11 +40,7 @@ def connect(address: str) -> None:
 
 
 def start_here(folder: str) -> None:
-    """Start a cluster on this machine, with its files in ``folder``, which ends with this process.
-
-    Raises:
-        RunnerError: Ray cannot be started.
-    """
+    """Start a cluster on this machine, with its files in ``folder``, which ends with this process."""
     try:
         ray.init(
             address="local",

@@ -1,13 +1,7 @@
-"""Driver process of :class:`kissgs.runners.ray_runner.RayRunner`: ``python -m kissgs.runners.ray_driver``.
+"""Driver process of :class:`kissgs.runners.ray_runner.RayRunner`: ``python -m kissgs.runners.ray_driver ADDRESS``.
 
-Its argument is the address. It reads JSON lines from standard input, items to submit and to cancel, and writes JSON
-lines to standard output: the nodes whenever they change, and the events of each item. When standard input closes, it
-ends all items and exits.
-
-Every start of an item is one Ray task, a streaming generator whose values are the item's events; they are small and
-come with the reply. If the node does not see the item's folder, blocks of files go there and come back through Ray's
-object store (:mod:`kissgs.runners.file_transfer`). Retries are ours and not Ray's, because Ray continues such a
-generator behind the values that have been consumed, which only suits generators that yield the same values again.
+Lines of JSON: items to submit and to cancel come from standard input, nodes and events of items go to standard output.
+When standard input closes, it ends all items and exits.
 """
 
 from __future__ import annotations
@@ -22,11 +16,9 @@ import shutil
 import signal
 import sys
 import tempfile
-import threading
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -97,27 +89,16 @@ def _begin_again() -> NoReturn:
 
 
 def _nodes() -> list[dict[str, Any]]:
-    """Return address and resources of the nodes that can run items."""
+    """Return the resources of the nodes that can run items."""
     return [
-        {
-            "address": node["NodeManagerAddress"],
-            "total": {
-                "cpus": found["CPU"],
-                "memory": int(found.get("memory", 0)),
-                "gpus": found.get("GPU", 0.0),
-            },
-        }
+        {"cpus": found["CPU"], "memory": int(found.get("memory", 0)), "gpus": found.get("GPU", 0.0)}
         for node in ray.nodes()
         if node["Alive"] and (found := node["Resources"]).get("CPU", 0) > 0
     ]
 
 
 class Driver:
-    """All items of this process, each an asyncio task that follows its Ray task.
-
-    Args:
-        send: sends an event to the process that started this one.
-    """
+    """All items of this process, each an asyncio task that follows its Ray task."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -125,12 +106,13 @@ class Driver:
         self._generators: dict[str, Any] = {}
         self._cancelled = set[str]()
         self._sends_files = False  # until a node has not seen a folder
+        self._function = ray.remote(run_on_node)  # once, because each call stores one more in the cluster
 
     async def run(self) -> None:
         """Handle messages from standard input until that closes; then cancel all items."""
-        messages = _Messages()
         watching = asyncio.create_task(self._watch_nodes())
-        while (message := await messages.get()) is not None:
+        while line := await asyncio.to_thread(sys.stdin.readline):
+            message = json.loads(line)
             if "submit" in message:
                 item_id = message["submit"]
                 self._tasks[item_id] = asyncio.create_task(self._run(item_id, WorkItem.from_dict(message["item"])))
@@ -175,33 +157,45 @@ class Driver:
 
     async def _start_until_kept(self, item_id: str, item: WorkItem) -> Outcome:
         """Start an item, and again as long as its node is lost and retries are left."""
-        task, outcome = _remote_task(item), Outcome("cancelled", starts=0)
+        outcome = Outcome("cancelled")
         for start in range(1, item.retries + 2):
-            if item_id not in self._cancelled:
-                outcome = await self._start(task, item_id, item, start)
+            outcome = await self._start(item_id, item, start)
             if outcome.kind != "lost":
                 return outcome
-            if item_id in self._cancelled:
-                return Outcome("cancelled", starts=outcome.starts)
-            self._send({"id": item_id, "started": False})
+            if item_id in self._cancelled:  # and its task killed, because it did not end
+                return Outcome("cancelled")
             await asyncio.sleep(RETRY_SECONDS)
         return outcome
 
-    async def _start(self, task: Any, item_id: str, item: WorkItem, start: int) -> Outcome:  # noqa: ANN401
+    async def _start(self, item_id: str, item: WorkItem, start: int) -> Outcome:
         """Start an item, a second time with its files if the node does not see its folder; return the outcome."""
         for with_files in (self._sends_files, True):
             try:
                 files = await asyncio.to_thread(_stored_files, item) if with_files and item.files else None
             except OSError as error:
-                return _unusable_files(error, start)
-            if item_id in self._cancelled:  # meanwhile
+                return _unusable_files(error)
+            if item_id in self._cancelled:
                 break
-            self._generators[item_id] = task.remote(item.as_dict(), __version__, files)
+            self._generators[item_id] = self._task(item).remote(asdict(item), __version__, files)
             outcome = await self._follow(item_id, item, start)
             if outcome is not None:
                 return outcome
             self._sends_files = True
-        return Outcome("cancelled", starts=start)
+        return Outcome("cancelled")
+
+    def _task(self, item: WorkItem) -> Any:  # noqa: ANN401  Ray's decorated functions have no useful type
+        """Return the Ray task that runs an item, with its requests."""
+        wanted = item.resources
+        return self._function.options(
+            num_cpus=wanted.cpus if wanted.cpus <= 1 else math.ceil(wanted.cpus),
+            num_gpus=wanted.gpus if wanted.gpus <= 1 else math.ceil(wanted.gpus),
+            memory=wanted.memory or None,
+            num_returns="streaming",
+            _generator_backpressure_num_objects=EVENTS_AHEAD,
+            max_retries=0,
+            scheduling_strategy="SPREAD",
+            name=item.function,
+        )
 
     async def _follow(self, item_id: str, item: WorkItem, start: int) -> Outcome | None:
         """Forward the events of one start of an item; return its outcome, None if the node needs the item's files."""
@@ -215,43 +209,23 @@ class Driver:
                     await asyncio.to_thread(file_transfer.receive, Path(item.folder or ""), event)
                     continue
                 if "outcome" in event:
-                    return Outcome(**{**event["outcome"], "node": node, "starts": start})
+                    return Outcome(**{**event["outcome"], "node": node})
                 if "node" in event:
                     node = event["node"]
-                    self._send({"id": item_id, "started": True})
                 else:
                     self._send({"id": item_id, "progress": event["progress"]})
         except TaskCancelledError:
-            return Outcome("cancelled", node=node, starts=start)
+            return Outcome("cancelled", node=node)
         except RayTaskError as error:  # raised by the task itself, outside the item's process
             message = f"a node of the cluster cannot run kissgs: {first_line(error.cause or error)}"
-            text = str(error)[-4000:]
-            return Outcome("error", code=NODE_UNUSABLE, message=message, log=text, node=node, starts=start)
+            return Outcome("error", code=NODE_UNUSABLE, message=message, log=str(error)[-4000:], node=node)
         except RayError as error:
             message = f"the node {node or 'of the work'} was lost {start} times: {first_line(error)}"
-            return Outcome("lost", code=LOST, message=message, node=node, starts=start)
+            return Outcome("lost", code=LOST, message=message, node=node)
         except OSError as error:  # of a file that has come back
             ray.cancel(self._generators[item_id])
-            return _unusable_files(error, start)
-        return Outcome("lost", code=LOST, message="the work ended without an outcome", node=node, starts=start)
-
-
-class _Messages:
-    """Messages from standard input, read by a thread."""
-
-    def __init__(self) -> None:
-        self._queue: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
-        self._loop = asyncio.get_running_loop()
-        threading.Thread(target=self._read, daemon=True).start()
-
-    async def get(self) -> dict[str, Any] | None:
-        """Return the next message; None at the end."""
-        return await self._queue.get()
-
-    def _read(self) -> None:
-        for line in sys.stdin:
-            self._loop.call_soon_threadsafe(self._queue.put_nowait, json.loads(line))
-        self._loop.call_soon_threadsafe(self._queue.put_nowait, None)
+            return _unusable_files(error)
+        return Outcome("lost", code=LOST, message="the work ended without an outcome", node=node)
 
 
 def _stored_files(item: WorkItem) -> dict[str, list[Any]]:
@@ -260,91 +234,65 @@ def _stored_files(item: WorkItem) -> dict[str, list[Any]]:
     return {name: [ray.put(block) for block in file_transfer.blocks_of(folder / name)] for name in item.files}
 
 
-def _unusable_files(error: OSError, start: int) -> Outcome:
+def _unusable_files(error: OSError) -> Outcome:
     reason = (error.strerror or str(error)).lower()
     message = f"the files of the work cannot be read or written: {reason}"
-    return Outcome("error", code=OutputError.code, message=message, starts=start)
+    return Outcome("error", code=OutputError.code, message=message)
 
 
-@cache
-def _exported_function() -> Any:  # noqa: ANN401
-    """Return the function for nodes as Ray's; each call of ``ray.remote`` would store one more in the cluster."""
-    return ray.remote(function_for_nodes())
+def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]] | None) -> Iterator[dict[str, Any]]:
+    """Run an item in a process on a node, and yield its events; ``files`` are references to blocks of its files.
 
+    ``version`` is that of kissgs where it was submitted. Ray sends the code of functions of the main module: this one
+    imports what it uses, once the node has turned out to have that version.
+    """
+    import contextlib
+    import time
+    from dataclasses import asdict, replace
+    from pathlib import Path
 
-def _remote_task(item: WorkItem) -> Any:  # noqa: ANN401  Ray's decorated functions have no useful type
-    """Return the Ray task that runs an item, with its requests."""
-    wanted = item.resources
-    return _exported_function().options(
-        num_cpus=wanted.cpus if wanted.cpus <= 1 else math.ceil(wanted.cpus),
-        num_gpus=wanted.gpus if wanted.gpus <= 1 else math.ceil(wanted.gpus),
-        memory=wanted.memory or None,
-        num_returns="streaming",
-        _generator_backpressure_num_objects=EVENTS_AHEAD,
-        max_retries=0,
-        scheduling_strategy="SPREAD",
-        name=item.function,
-    )
+    import ray
 
+    from kissgs._version import __version__
+    from kissgs.runners import file_transfer
+    from kissgs.runners.contract import Outcome, WorkItem
+    from kissgs.runners.process import ItemProcess
+    from kissgs.runners.temporary_folder import temporary_folder
 
-def function_for_nodes() -> Callable[[dict[str, Any], str, dict[str, list[Any]] | None], Iterator[dict[str, Any]]]:
-    """Return the function that nodes run, as a local one: Ray sends its code, and not its name as of a global one."""
-    unusable = NODE_UNUSABLE  # an older version of kissgs on the node does not have it
-
-    def run(values: dict[str, Any], version: str, files: dict[str, list[Any]] | None) -> Iterator[dict[str, Any]]:
-        """Run an item in a process and yield its events.
-
-        ``version`` is that of kissgs where it was submitted; ``files`` are references to the blocks of its files.
-        """
-        import contextlib
-        import time
-        from dataclasses import asdict, replace
-        from pathlib import Path
-
-        import ray
-
-        from kissgs._version import __version__
-        from kissgs.runners import file_transfer
-        from kissgs.runners.contract import Outcome, WorkItem
-        from kissgs.runners.process import ItemProcess
-        from kissgs.runners.temporary_folder import temporary_folder
-
-        node = ray.util.get_node_ip_address()
-        if __version__ != version:
-            message = f"the node {node} has kissgs {__version__}, and this machine {version}; install one version"
-            yield {"outcome": asdict(Outcome("error", code=unusable, message=message))}
-            return
-        item, before, folder = WorkItem.from_dict(values), None, Path()
-        with contextlib.ExitStack() as stack:
-            if item.files and not file_transfer.is_seen(item.folder):
-                if files is None:
-                    yield {"unseen": True}
-                    return
-                folder = stack.enter_context(temporary_folder())
-                for name, blocks in files.items():
-                    with (folder / name).open("wb") as file:
-                        for block in blocks:
-                            file.write(ray.get(block))
-                item, before = replace(item, folder=str(folder)), file_transfer.times_of(folder)
-            yield {"node": node}
-            process, looked, outcome = ItemProcess(item), time.monotonic(), None
-            try:
-                for event in process.events():
-                    if isinstance(event, Outcome):
-                        outcome = event
-                        break
-                    yield {"progress": list(event)}
-                    if before is not None and time.monotonic() - looked > file_transfer.CHECKPOINT_SECONDS:
-                        yield from file_transfer.changed(folder, before, complete=False)
-                        looked = time.monotonic()
-            finally:
-                process.kill()
-            if before is not None and outcome is not None:
-                yield from file_transfer.changed(folder, before, complete=outcome.kind == "done")
-            if outcome is not None:
-                yield {"outcome": asdict(outcome)}
-
-    return run
+    node = ray.util.get_node_ip_address()
+    if __version__ != version:
+        message = f"the node {node} has kissgs {__version__}, and this machine {version}; install one version"
+        yield {"outcome": asdict(Outcome("error", code=NODE_UNUSABLE, message=message))}
+        return
+    item, before, folder = WorkItem.from_dict(values), None, Path()
+    with contextlib.ExitStack() as stack:
+        if item.files and not file_transfer.is_seen(item.folder):
+            if files is None:
+                yield {"unseen": True}
+                return
+            folder = stack.enter_context(temporary_folder())
+            for name, blocks in files.items():
+                with (folder / name).open("wb") as file:
+                    for block in blocks:
+                        file.write(ray.get(block))
+            item, before = replace(item, folder=str(folder)), file_transfer.times_of(folder)
+        yield {"node": node}
+        process, looked, outcome = ItemProcess(item), time.monotonic(), None
+        try:
+            for event in process.events():
+                if isinstance(event, Outcome):
+                    outcome = event
+                    break
+                yield {"progress": list(event)}
+                if before is not None and time.monotonic() - looked > file_transfer.CHECKPOINT_SECONDS:
+                    yield from file_transfer.changed(folder, before, complete=False)
+                    looked = time.monotonic()
+        finally:
+            process.kill()
+        if before is not None and outcome is not None:
+            yield from file_transfer.changed(folder, before, complete=outcome.kind == "done")
+        if outcome is not None:
+            yield {"outcome": asdict(outcome)}
 
 
 if __name__ == "__main__":

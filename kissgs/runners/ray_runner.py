@@ -1,8 +1,7 @@
-"""``RayRunner``: work items on the nodes of a Ray cluster, through a driver process.
+"""``RayRunner``: work items on the nodes of a Ray cluster, through a driver process, which alone uses Ray.
 
-Ray itself is only used in :mod:`kissgs.runners.ray_driver`, which runs as a separate process: Ray ends the process that
-uses it when the cluster's head is gone for a minute, replaces its signal handlers, and prints to its standard output.
-Here, the loss of that process is one more outcome, and :meth:`RayRunner.health_problem` connects again.
+Ray ends the process that uses it when the cluster's head is gone for a minute, replaces its signal handlers, and prints
+to its standard output. Here, the loss of that process is one more outcome.
 """
 
 from __future__ import annotations
@@ -16,25 +15,14 @@ import sys
 import tempfile
 import threading
 import time
-from concurrent.futures import Future
-from dataclasses import dataclass
+from concurrent.futures import Future, wait
+from dataclasses import asdict
 from importlib.util import find_spec
 from typing import IO, Any
 
 from kissgs.core.errors import RunnerError
 from kissgs.core.progress import Progress, silent
-from kissgs.runners.contract import (
-    UNREACHABLE,
-    NodeResources,
-    Outcome,
-    Resources,
-    RunHandle,
-    RunnerStats,
-    WorkItem,
-    log,
-    refusal_of,
-    report,
-)
+from kissgs.runners.contract import UNREACHABLE, Outcome, Resources, RunHandle, WorkItem, log, refusal_of, report
 from kissgs.runners.process import child_environment, json_lines
 
 CONNECT_SECONDS = 60.0
@@ -49,29 +37,19 @@ CLOSE_SECONDS = 20.0
 NOT_INSTALLED = "Ray is not installed; install it on every machine with: pip install 'kissgs[ray]'"
 
 
-@dataclass(slots=True)
-class _Submitted:
-    progress: Progress
-    outcome: Future[Outcome]
-    started: bool = False
-
-
 class RayRunner:
     """Runner on a Ray cluster, see :class:`kissgs.runners.Runner`.
 
-    Args:
-        address: see :func:`kissgs.runners.open_runner`.
-
-    Raises:
-        RunnerError: Ray is not installed or the cluster cannot be reached.
+    ``address`` is HOST:PORT, or "auto" for that of ``RAY_ADDRESS`` or of a cluster on this machine, and if there is
+    none, for a new one on this machine until the runner is closed. Raises RunnerError if it cannot be reached.
     """
 
     def __init__(self, address: str = "auto") -> None:
         if find_spec("ray") is None:
             raise RunnerError(NOT_INSTALLED)
         self._address = address
-        self._items: dict[str, _Submitted] = {}
-        self._nodes: tuple[NodeResources, ...] = ()
+        self._items: dict[str, tuple[Progress, Future[Outcome]]] = {}
+        self._nodes: tuple[Resources, ...] = ()
         self._lock = threading.Lock()
         self._problem: str | None = "the connection to the Ray cluster is being made"
         self._last_attempt = 0.0
@@ -84,20 +62,24 @@ class RayRunner:
             self.close()
             raise RunnerError(problem or f"the Ray cluster does not answer within {CONNECT_SECONDS:g} s")
 
+    @property
+    def nodes(self) -> tuple[Resources, ...]:
+        """See :class:`kissgs.runners.Runner`."""
+        return self._nodes
+
     def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
         """See :class:`kissgs.runners.Runner`."""
-        item_id = secrets.token_hex(8)
-        submitted = _Submitted(progress, Future())
+        item_id, outcome = secrets.token_hex(8), Future[Outcome]()
         with self._lock:
             if self._closed:
                 raise RuntimeError("the runner is closed")
             problem = self._problem
             if problem is None:
-                self._items[item_id] = submitted
-                self._send({"submit": item_id, "item": item.as_dict()})
+                self._items[item_id] = progress, outcome
+                self._send({"submit": item_id, "item": asdict(item)})
         if problem is not None:
-            submitted.outcome.set_result(Outcome("lost", code=UNREACHABLE, message=problem, starts=0))
-        return RunHandle(item_id, submitted.outcome)
+            outcome.set_result(Outcome("lost", code=UNREACHABLE, message=problem))
+        return RunHandle(item_id, outcome)
 
     def cancel(self, item_id: str) -> None:
         """See :class:`kissgs.runners.Runner`."""
@@ -108,12 +90,6 @@ class RayRunner:
     def refusal(self, resources: Resources) -> str | None:
         """See :class:`kissgs.runners.Runner`."""
         return self._problem or refusal_of(resources, self._nodes)
-
-    def stats(self) -> RunnerStats:
-        """See :class:`kissgs.runners.Runner`."""
-        with self._lock:
-            running = sum(submitted.started for submitted in self._items.values())
-            return RunnerStats(len(self._items) - running, running, self._nodes)
 
     def health_problem(self) -> str | None:
         """See :class:`kissgs.runners.Runner`."""
@@ -131,15 +107,13 @@ class RayRunner:
         """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             self._closed = True
-            driver, outcomes = self._driver, [submitted.outcome for submitted in self._items.values()]
+            driver, outcomes = self._driver, [outcome for _, outcome in self._items.values()]
             for item_id in self._items:
                 self._send({"cancel": item_id})
         if driver is None or driver.stdin is None:
             return
         end = time.monotonic() + CLOSE_SECONDS
-        for outcome in outcomes:
-            with contextlib.suppress(TimeoutError):
-                outcome.result(max(0.0, end - time.monotonic()))
+        wait(outcomes, CLOSE_SECONDS)
         with contextlib.suppress(OSError):
             driver.stdin.close()
         try:
@@ -182,9 +156,7 @@ class RayRunner:
             if "failed" in event:
                 failure = event["failed"]
             elif "nodes" in event:
-                self._nodes = tuple(
-                    NodeResources(node["address"], Resources(**node["total"])) for node in event["nodes"]
-                )
+                self._nodes = tuple(Resources(**node) for node in event["nodes"])
                 self._problem = None
                 self._connected.set()
             else:
@@ -201,18 +173,16 @@ class RayRunner:
             with contextlib.suppress(OSError):
                 if pipe is not None:
                     pipe.close()
-        for submitted in items.values():
-            submitted.outcome.set_result(Outcome("lost", code=UNREACHABLE, message=failure))
+        for _, outcome in items.values():
+            outcome.set_result(Outcome("lost", code=UNREACHABLE, message=failure))
         self._connected.set()
 
     def _handle(self, event: dict[str, Any]) -> None:
         item_id = event["id"]
-        submitted = self._items[item_id]
+        progress, outcome = self._items[item_id]
         if "progress" in event:
-            report(submitted.progress, *event["progress"])
-        elif "started" in event:
-            submitted.started = event["started"]
+            report(progress, *event["progress"])
         else:
             with self._lock:
                 del self._items[item_id]
-            submitted.outcome.set_result(Outcome(**event["outcome"]))
+            outcome.set_result(Outcome(**event["outcome"]))

@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ByteSize, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ByteSize, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from kissgs.core.splats import MAX_GRID_SIDE
+from kissgs.settings.stage import Count, Pixels, Seed, Share, StageSettings, of_preset
 
 Step = Annotated[float, Field(ge=1e-4, le=10)]
+Bits = Annotated[float, Field(ge=0, le=200)]
 
 SIZE = re.compile(r"(\d+|\d{1,3}(?:,\d{3})+|\d*\.\d+)\s*([kmgt]i?)?b?", re.IGNORECASE)
 
@@ -28,240 +30,101 @@ def _normalize_size(size: object) -> object:
 Size = Annotated[ByteSize, BeforeValidator(_normalize_size)]
 
 
-class EncodeSettings(BaseModel):
+class EncodeSettings(StageSettings):
     """Settings of the encoder. A decoder needs none of them."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    rate_distortion: bool = Field(
-        True,
-        description="Render the scene and choose by rate-distortion cost, squared image error plus lambda times bits. "
-        "Steps, codebook size and precision then follow from quality_offset_db, and settings of uniform steps are "
-        "refused.",
-    )
+    rate_distortion: bool = of_preset(True, "Choose by squared image error plus lambda times bits, not uniform steps.")
     quality_offset_db: Annotated[float, Field(ge=-30, le=30)] = Field(
-        0.0,
-        description="With rate_distortion: PSNR to aim at, decibels above the estimated quality of preset paper or "
-        "fast on the same scene, whichever is better.",
+        0.0, description="PSNR to aim at, decibels above that of preset paper or fast, whichever is better here."
     )
-    rd_lambda: float | None = Field(
+    rd_lambda: Annotated[float, Field(gt=0, lt=1)] | None = Field(
+        None, description="Lambda, squared image error per bit; auto: from quality_offset_db."
+    )
+    psnr: Annotated[float, Field(gt=0, le=200)] | None = Field(
         None,
-        gt=0,
-        lt=1,
-        description="With rate_distortion: lambda, squared image error per bit, instead of quality_offset_db; auto: "
-        "from quality_offset_db.",
+        description="Search for the smallest container with at least this PSNR to renderings of the scene, decibels; a "
+        "view counts for at most 60.",
     )
-    psnr: float | None = Field(
+    target_size: Annotated[Size, Field(ge=1)] | None = Field(
         None,
-        gt=0,
-        le=200,
-        description="With rate_distortion: search for the smallest container with at least this PSNR to renderings of "
-        "the scene, decibels, at held-out views or, without a capture, at random cameras other than those of "
-        "'evaluate'. A view counts for at most 60 dB. Takes a few encodings.",
+        description="Search for the best container of at most this size, bytes, such as 800kB or 2.5MB; with a limit "
+        "of quality, for the smallest container of that quality, which then must not be larger.",
     )
-    target_size: Size | None = Field(
+    max_psnr_drop: Annotated[float, Field(gt=0, le=20)] | None = Field(
         None,
-        ge=1,
-        description="With rate_distortion: search for the best container of at most this size, bytes, such as 800kB "
-        "or 2.5MB; the result is usually within 3 % below it. Takes a few encodings. With psnr, max_psnr_drop or "
-        "max_ssim_drop, the smallest container of that quality, which then must have at most this size.",
+        description="Search for the smallest container that loses at most this PSNR to held-out photographs, decibels; "
+        "without a capture at poses from which they might have been taken, as if the scene had 30 dB to them.",
     )
-    max_psnr_drop: float | None = Field(
+    max_ssim_drop: Annotated[float, Field(gt=0, le=1)] | None = Field(
         None,
-        gt=0,
-        le=20,
-        description="With rate_distortion: search for the smallest container whose renderings of the held-out views "
-        "lose at most this PSNR, decibels. Takes a few encodings. Without a capture, the loss is estimated at random "
-        "poses from which photographs might have been taken, as if the original scene had 30 dB to photographs.",
+        description="Search for the smallest container that loses at most this SSIM to held-out photographs; without a "
+        "capture to renderings of the scene, at poses from which they might have been taken.",
     )
-    max_ssim_drop: float | None = Field(
+    max_encodes: Annotated[int, Field(ge=1, le=100)] = Field(
+        10, description="With a goal: largest number of containers made of one scene, beside fine-tuned ones."
+    )
+    prune_threshold_bits: Bits = of_preset(18.0, "Prune what is worth fewer bits, times 1 - view_uncertainty.")
+    step_classes: Annotated[int, Field(ge=1, le=32)] = of_preset(3, "Classes of sensitivity, each with its own steps.")
+    rdo_quantization: bool = of_preset(True, "Prefer frequent levels (RDO quantisation); False: the nearest level.")
+    color_refit_iterations: Annotated[int, Field(ge=0, le=20)] = of_preset(
+        3, "With a capture: iterations of the fit of base colours to its training images."
+    )
+    sensitivity_views: Count | None = of_preset(
         None,
-        gt=0,
-        le=1,
-        description="With rate_distortion: search for the smallest container whose renderings of the held-out views "
-        "lose at most this SSIM to the photographs; without a capture, SSIM to renderings of the scene is at least 1 "
-        "minus this, at random poses from which photographs might have been taken. Takes a few encodings.",
+        "Renderings for the sensitivity; with a capture, its cameras at most, and two thirds as many virtual ones.",
     )
-    max_encodes: int = Field(
-        10,
-        ge=1,
-        le=100,
-        description="With a goal: largest number of containers that are made of one scene. With fine-tuning, up to as "
-        "many fine-tuned ones, at most three, are added, and one at the finest or coarsest lambda if several missed "
-        "the goal.",
+    sensitivity_view_size: Pixels = of_preset(480, "Largest longer side of these renderings, or so many samples of it.")
+    view_uncertainty: Share | None = of_preset(
+        None, "Weight of the prior of an unobstructed camera nearby; auto: 0.1 with a capture, 0.55 without."
     )
-    prune_threshold_bits: float = Field(
-        18.0,
-        ge=0,
-        le=200,
-        description="With rate_distortion: prune Gaussians whose removal costs less than this many bits are worth; the "
-        "threshold is multiplied by 1 - view_uncertainty. A Gaussian takes about 60 bits; beyond 30, the combined "
-        "holes become visible. At the default quality, Gaussians that no camera saw from nearby are kept.",
+    order: Literal["hilbert", "refined", "plas"] = of_preset(
+        "refined", "Grid order: Hilbert curve, this refined for WebP's prediction, or PLAS (the paper)."
     )
-    step_classes: int = Field(
-        3,
-        ge=1,
-        le=32,
-        description="With rate_distortion: number of sensitivity classes, each with its own quantisation step. More "
-        "classes fit steps better, but make positions cost more.",
+    plas_start_radius: Annotated[int, Field(ge=1)] | None = of_preset(
+        None, "With order=plas: sort from the Hilbert curve within so many cells; auto: from a random order."
     )
-    rdo_quantization: bool = Field(
-        True, description="With rate_distortion: prefer frequent levels (RDO quantisation). False: the nearest level."
+    rotation_form: Literal["canonical", "pras"] = of_preset(
+        "canonical", "Stored form of rotations: nearest to the identity, or most like the neighbours' (PRAS)."
     )
-    color_refit_iterations: int = Field(
-        3,
-        ge=0,
-        le=20,
-        description="With rate_distortion and a capture: iterations of the fit of base colours to its training images, "
-        "which compensates other losses.",
+    shared_step_size: bool = of_preset(True, "One step for all channels; False: all levels over each one's range.")
+    means_bits: Annotated[int, Field(ge=8, le=16)] | None = of_preset(
+        None, "Bits per coordinate of positions; auto: from means_tolerance."
     )
-    sensitivity_views: int | None = Field(
-        None,
-        ge=1,
-        le=1000,
-        description="With rate_distortion: number of renderings that sensitivity is measured in; with a capture, the "
-        "largest number of its cameras, to which two thirds as many virtual cameras are added. auto: 48 for up to "
-        "150,000 Gaussians, fewer for more, such as 30 for a million.",
+    means_tolerance: Annotated[float, Field(gt=0, le=1)] = of_preset(
+        0.04, "Largest position error of the median Gaussian, as a share of its size."
     )
-    sensitivity_view_size: int = Field(
-        480,
-        ge=16,
-        le=4096,
-        description="Largest longer side of these renderings, pixels; of larger images of a capture, so many samples.",
+    opacity_step: Step = of_preset(0.15, "Quantisation step of opacity logits; the largest error is half of it.")
+    scale_step: Step = of_preset(0.11, "Quantisation step of log-scales: 0.11 is an error of at most 5.5 %.")
+    quat_step: Annotated[float, Field(ge=1e-4, le=0.5)] = of_preset(
+        0.023, "Quantisation step of quaternion components: 0.02 is a mean error of 1 degree."
     )
-    view_uncertainty: float | None = Field(
-        None,
-        ge=0,
-        le=1,
-        description="With rate_distortion: how strongly sensitivity is shrunk towards the prior of an unobstructed "
-        "camera nearby, 0 (only the renderings count) to 1; more for Gaussians that no camera saw from nearby. Larger "
-        "values, up to 0.55, bound rounding more tightly. auto: 0.1 with a capture, 0.55 without.",
+    sh0_step: Step = of_preset(0.055, "Quantisation step of the base colour: 0.055 is an error of at most 2 of 255.")
+    gaussians_per_codebook_entry: Annotated[float, Field(ge=1, le=4096)] = of_preset(
+        7.0, "Gaussians per codebook entry; with rate_distortion the smallest number, beyond 8,192 entries."
     )
-    order: Literal["hilbert", "refined", "plas"] = Field(
-        "refined",
-        description="Order of the Gaussians in the grid: along a 3D Hilbert curve (hilbert: fast), this refined by a "
-        "local search such that WebP predicts positions and base colours better (refined: smallest), or PLAS (the "
-        "paper).",
+    sh_codebook_size: Annotated[int, Field(ge=64, le=65_536)] = of_preset(65_536, "Largest number of codebook entries.")
+    sh_tolerance: Share = of_preset(0.001, "Invisible RMS error of SH coefficients, below which no codebook grows.")
+    sh_step: Annotated[float, Field(ge=0.01, le=4)] = of_preset(1.15, "Step of entries, in units of their RMS error.")
+    sh_weight_power: Share = of_preset(0.35, "Exponent of the weights, opacity x projected area; 0: all equal.")
+    sh_kmeans_iterations: Annotated[int, Field(ge=1, le=50)] = of_preset(6, "Iterations of codebook refinement.")
+    sh_neighbors: Annotated[int, Field(ge=8, le=512)] = of_preset(96, "Nearest entries that an iteration compares.")
+    codebook_order: Literal["axes", "refined", "plas"] = of_preset(
+        "refined", "Order of entries: blocks along their axes, these refined by PLAS, or PLAS over all dimensions."
     )
-    plas_start_radius: int | None = Field(
-        None,
-        ge=1,
-        description="With order=plas: start from the Hilbert curve and sort within this radius, cells; auto: start "
-        "from a random order, as the paper does.",
+    plas_radius_decay: Annotated[float, Field(ge=0.5, le=0.99)] = of_preset(
+        0.8, "Factor from one filter radius of PLAS and PRAS to the next: 0.95 is slow and smoothest."
     )
-    rotation_form: Literal["canonical", "pras"] = Field(
-        "canonical",
-        description="Which of the 48 equivalent rotation forms is stored: the one nearest to the identity (canonical: "
-        "fast, smallest) or the one most like its neighbours (pras: the paper). The covariance is equal in all.",
+    prune_invisible: bool = of_preset(True, "Prune opacities of 1/255 and less, which no renderer draws.")
+    webp_quality: Annotated[int, Field(ge=0, le=100)] = of_preset(75, "libwebp's effort; always lossless.")
+    webp_method: Annotated[int, Field(ge=0, le=6)] = of_preset(4, "libwebp's method, 0 (fast) to 6 (small).")
+    codebook_max_effort: bool = of_preset(True, "Use libwebp's highest effort for the codebook image.")
+    high_effort_pixels: Annotated[int, Field(ge=0, le=MAX_GRID_SIDE**2)] = of_preset(
+        30_000, "Images of up to so many pixels get at least quality 100 and method 5, if it pays for their attribute."
     )
-    shared_step_size: bool = Field(
-        True,
-        description="One step for all channels of an attribute, as the *_step settings give it. False: each channel "
-        "spreads all levels over its own range (the paper), and the *_step settings are ignored.",
-    )
-    means_bits: int | None = Field(
-        None,
-        ge=8,
-        le=16,
-        description="Precision of positions, bits per coordinate; auto: from means_tolerance. One more bit costs 0.37 "
-        "bytes per Gaussian.",
-    )
-    means_tolerance: float = Field(
-        0.04,
-        gt=0,
-        le=1,
-        description="Largest position error of the median Gaussian, as a share of its size; used unless means_bits is "
-        "set.",
-    )
-    opacity_step: Step = Field(
-        0.15, description="Quantisation step of opacity logits; the largest error is half of it."
-    )
-    scale_step: Step = Field(0.11, description="Quantisation step of log-scales: 0.11 is an error of at most 5.5 %.")
-    quat_step: Annotated[float, Field(ge=1e-4, le=0.5)] = Field(
-        0.023, description="Quantisation step of quaternion components: 0.02 is a mean rotation error of 1 degree."
-    )
-    sh0_step: Step = Field(
-        0.055, description="Quantisation step of sh0, the base colour: 0.055 is an error of at most 2 of 255."
-    )
-    gaussians_per_codebook_entry: float = Field(
-        7.0,
-        ge=1,
-        le=4096,
-        description="Gaussians per codebook entry: fewer entries mean fewer bytes and less accurate view-dependent "
-        "colour. With rate_distortion: the smallest number, for codebooks of more than 8,192 entries.",
-    )
-    sh_codebook_size: int = Field(65_536, ge=64, le=65_536, description="Largest number of codebook entries.")
-    sh_tolerance: float = Field(
-        0.001,
-        ge=0,
-        le=1,
-        description="Invisible root mean square error of SH coefficients: the codebook does not grow to get below it.",
-    )
-    sh_step: Annotated[float, Field(ge=0.01, le=4)] = Field(
-        1.15, description="Quantisation step of the codebook entries, in units of the codebook's RMS error."
-    )
-    sh_weight_power: float = Field(
-        0.35,
-        ge=0,
-        le=1,
-        description="Exponent of the codebook's weights, (opacity x projected area) to this power: 0 weights all "
-        "Gaussians equally, 1 neglects small and faint ones.",
-    )
-    sh_kmeans_iterations: int = Field(
-        6, ge=1, le=50, description="Iterations of codebook refinement: more are slower and slightly better."
-    )
-    sh_neighbors: int = Field(
-        96,
-        ge=8,
-        le=512,
-        description="Codebook entries, the nearest to a Gaussian's present one, that an iteration compares: more are "
-        "slower and better.",
-    )
-    codebook_order: Literal["axes", "refined", "plas"] = Field(
-        "refined",
-        description="Order of the entries in the codebook's image: blocks along their principal axes (axes: fast), "
-        "these refined by PLAS within a short radius (refined: smaller), or PLAS from afar over all dimensions (plas: "
-        "the paper). A .sog has its entries by frequency.",
-    )
-    plas_radius_decay: float = Field(
-        0.8,
-        ge=0.5,
-        le=0.99,
-        description="Factor from one filter radius of PLAS and PRAS to the next: 0.95 is slow and smoothest.",
-    )
-    prune_invisible: bool = Field(
-        True,
-        description="Prune Gaussians of opacity 1/255 and less, which no renderer draws. Their number is reported.",
-    )
-    webp_quality: int = Field(
-        75,
-        ge=0,
-        le=100,
-        description="libwebp's effort, 0 to 100; always lossless. Up to 75, images of half a megapixel or more take "
-        "less.",
-    )
-    webp_method: int = Field(
-        4,
-        ge=0,
-        le=6,
-        description="libwebp's method, 0 (fast) to 6 (small); always lossless. Up to 4, images of half a megapixel or "
-        "more take 2 at most.",
-    )
-    codebook_max_effort: bool = Field(
-        True, description="Use libwebp's highest effort for the codebook image: saves 8 % of it in some seconds."
-    )
-    high_effort_pixels: int = Field(
-        30_000,
-        ge=0,
-        le=MAX_GRID_SIDE**2,
-        description="Images of opacities, scales, rotations and base colours with up to this many pixels get at least "
-        "quality 100 and method 5: 1 to 3 % fewer bytes, for 40 CPU seconds per million Gaussians.",
-    )
-    seed: int = Field(
+    seed: Seed = Field(
         0,
-        ge=0,
-        lt=2**31,
-        description="Seed of all random choices. Equal input, settings, seed and kind of processor give equal bytes.",
+        description="Seed of all random choices, those of training included. Equal input, settings, seed and kind of "
+        "processor give equal bytes.",
     )
 
     @property
@@ -271,7 +134,8 @@ class EncodeSettings(BaseModel):
 
     @model_validator(mode="after")
     def _no_uniform_settings(self) -> Self:
-        unused = [name for name in UNIFORM_ONLY if self.rate_distortion and getattr(self, name) != _default(name)]
+        defaults = {name: type(self).model_fields[name].default for name in UNIFORM_ONLY}
+        unused = [name for name, default in defaults.items() if self.rate_distortion and getattr(self, name) != default]
         if unused:
             raise ValueError(
                 f"{unused[0]} has no effect with rate_distortion: set quality_offset_db or rd_lambda instead, or "
@@ -285,9 +149,7 @@ class EncodeSettings(BaseModel):
         if len(goals) > 1 and goals[0] == "rd_lambda":
             raise ValueError(f"{goals[0]} and {goals[1]} cannot both be met; give one")
         if goals and not self.rate_distortion:
-            raise ValueError(
-                f"{goals[0]} needs rate_distortion: choose preset balanced or small, or set rate_distortion=true"
-            )
+            raise ValueError(f"{goals[0]} needs rate_distortion: choose preset balanced or small")
         return self
 
 
@@ -298,8 +160,3 @@ UNIFORM_ONLY = (
     "sh_weight_power",
 )
 """Settings of uniform planning; with rate_distortion, lambda and sensitivity decide instead."""
-
-
-def _default(name: str) -> object:
-    """Return the default of a setting of the encoder."""
-    return EncodeSettings.model_fields[name].default

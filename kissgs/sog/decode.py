@@ -32,21 +32,7 @@ def decode(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Splats:
-    """Decode a container of version 1 or 2.
-
-    Args:
-        source: a folder, a zip file, the bytes of a zip, or files in memory.
-        max_gaussians: largest number of Gaussians; more are refused before memory is allocated.
-        threads: number of threads; 0 means one per processor.
-        progress: receives "decode" events.
-
-    Returns:
-        The Gaussians in the order of the file.
-
-    Raises:
-        InvalidContainerError: a part of the container is missing, damaged or invalid.
-        UnsupportedError: another version or kind of Gaussians, or more Gaussians than ``max_gaussians``.
-    """
+    """Decode a container of version 1 or 2."""
     with open_source(source) as files, Workers(threads) as pool:
         layout = read_layout(files)
         refuse_more_than(max_gaussians, layout.count, "the container")

@@ -14,6 +14,7 @@ from kissgs.core.origin import recorded
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
+from kissgs.io.containers import META_NAME
 from kissgs.io.conventions import OPACITY_OF_BYTE
 from kissgs.io.planes import compress_images
 from kissgs.planning.container_model import ByteTables, ContainerModel
@@ -21,7 +22,7 @@ from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.quantize import Quantized
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.settings import EncodeSettings
-from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, META_NAME
+from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG
 
 # Description of SOG 2 for the planner: its tables, and no mask for padding.
 
@@ -54,17 +55,7 @@ def write_files(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Encoded:
-    """Make the files of a plan.
-
-    Args:
-        plan: plan of :func:`~kissgs.planning.planner.plan_encoding` for :data:`kissgs.sog.encode.SOG`.
-        settings: settings of the plan.
-        threads: number of threads; 0 means one per processor. The bytes do not depend on it.
-        progress: receives "images".
-
-    Raises:
-        UnsupportedError: the scene has no Gaussian to store.
-    """
+    """Make the files of a plan."""
     if not plan.grid.mask.any():
         raise UnsupportedError("a SOG file cannot hold a scene without visible Gaussians; write SOG-XT (.zip) instead")
 
@@ -139,5 +130,5 @@ def metadata(plan: EncodingPlan, sh_degree: int) -> bytes:
 
 def _table(field: Quantized) -> list[float]:
     """Return 256 ascending values; the last is repeated."""
-    values = [0.0] if field.table is None else [float(str(value)) for value in field.table]
+    values = [float(str(value)) for value in field.table[:, 0].astype(np.float32)]
     return values + values[-1:] * (256 - len(values))

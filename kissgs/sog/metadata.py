@@ -12,14 +12,17 @@ from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.origin import WORLD, Origin, read_origin
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.io.containers import Source, is_file_name
+from kissgs.io.containers import (
+    MAX_METADATA_BYTES,
+    MAX_SIGNED_LOG,
+    META_NAME,
+    Source,
+    is_antialiased,
+    is_file_name,
+    stated_text,
+)
 from kissgs.io.conventions import OPACITY_OF_BYTE
-from kissgs.io.files import listed, parse_json
-
-META_NAME = "meta.json"
-
-MAX_METADATA_BYTES = 1 << 20
-"""Largest size of ``meta.json``, bytes; four codebooks in full digits take 15 kB."""
+from kissgs.io.files import listed, parse_json, whole_number
 
 ENTRIES_PER_ROW = 64
 """Entries of the SH codebook in a row of its image."""
@@ -29,9 +32,6 @@ FIRST_TAG = 252
 
 MAX_SH_ENTRIES = 1 << 16
 """Largest number of entries of the SH codebook: labels have two bytes."""
-
-_MAX_SIGNED_LOG = 88.7
-"""Largest signed logarithm of a position: exp of more exceeds float32."""
 
 _LEVELS = 256
 
@@ -43,18 +43,12 @@ _KNOWN = {"version", "count", "asset", "model", "means", "scales", "quats", "sh0
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """View-dependent colour: a codebook of ``entries`` entries, and its values in ``table``.
-
-    Attributes:
-        entries: number of entries; None: as many as the image has (version 1).
-        coefficients: 3, 8 or 15.
-        table: ``(256,)``, value of each level; NaN where the file gives none.
-        centroids: file of the entries.
-        labels: file of each Gaussian's entry.
-    """
+    """View-dependent colour: the codebook, and the files of its entries and of each Gaussian's entry."""
 
     entries: int | None
+    """Number of entries; None: as many as the image has (version 1)."""
     coefficients: int
+    """3, 8 or 15."""
     table: Float32[np.ndarray, " 256"]
     centroids: str
     labels: str
@@ -64,21 +58,7 @@ class Rest:
 class SogLayout:
     """Contents of ``meta.json``. Tables have one row per channel; NaN stands for a level without a value.
 
-    Attributes:
-        version: 1 or 2.
-        count: number of Gaussians.
-        sh_degree: 0 to 3.
-        low: smallest signed logarithm of the positions, per axis.
-        high: largest signed logarithm of the positions, per axis.
-        scales: ``(3, 256)``, natural logarithms of standard deviations.
-        sh0: ``(3, 256)``, constant SH coefficients.
-        opacities: ``(256,)``, opacity logits.
-        files: names of the images ``means_low``, ``means_high``, ``scales``, ``quats``, ``sh0``.
-        rest: the view-dependent colour; None at degree 0.
-        model: variant of the renderer that the scene was made for, such as "antialiased"; None if not stated.
-        generator: program that wrote the file; None if not stated.
-        unknown: keys of the file that are not read.
-        origin: see :class:`kissgs.Splats`.
+    The ends of the positions' range are signed logarithms; scales, colours and opacities are as in :class:`Splats`.
     """
 
     version: int
@@ -89,11 +69,14 @@ class SogLayout:
     sh0: Float32[np.ndarray, "3 256"]
     opacities: Float32[np.ndarray, " 256"]
     files: dict[str, str]
+    """Names of the images ``means_low``, ``means_high``, ``scales``, ``quats``, ``sh0``."""
     rest: Rest | None
     model: str | None
+    """Variant of the renderer that the scene was made for, such as "antialiased"."""
     generator: str | None
     origin: Origin
     unknown: tuple[str, ...]
+    """Keys of the file that are not read."""
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -101,9 +84,14 @@ class SogLayout:
         return (f"left out: {listed(self.unknown)}",) if self.unknown else ()
 
     @property
+    def images(self) -> list[str]:
+        """Names of the images."""
+        return [*self.files.values(), *([self.rest.centroids, self.rest.labels] if self.rest else [])]
+
+    @property
     def antialiased(self) -> bool:
         """Whether the scene was trained with antialiasing."""
-        return self.model is not None and self.model.lower() == "antialiased"
+        return is_antialiased(self.model)
 
     @property
     def sh_degree(self) -> int:
@@ -112,12 +100,7 @@ class SogLayout:
 
 
 def read_layout(source: Source, name: str = META_NAME) -> SogLayout:
-    """Read and check the metadata of a container.
-
-    Raises:
-        InvalidContainerError: the metadata is missing, damaged or invalid.
-        UnsupportedError: another version, or another kind of Gaussians.
-    """
+    """Read and check the metadata of a container."""
     document = parse_json(source.read(name, MAX_METADATA_BYTES), name)
     if not isinstance(document, dict):
         raise InvalidContainerError(f"{name} is not the metadata of a SOG container: it is no JSON object")
@@ -136,7 +119,7 @@ class _MetadataError(Exception):
 
 def _read_v2(document: dict[str, Any]) -> SogLayout:
     asset = document.get("asset")
-    model = _text(document.get("model")) or (_text(asset.get("model")) if isinstance(asset, dict) else None)
+    model = stated_text(document.get("model")) or (stated_text(asset.get("model")) if isinstance(asset, dict) else None)
     if model is None and document.get("antialias") is True:  # as the format's specification spells it
         model = "antialiased"
     if model and model.lower() not in _MODELS:
@@ -155,7 +138,7 @@ def _read_v2(document: dict[str, Any]) -> SogLayout:
         files=_files(document),
         rest=None if rest is None else _rest_v2(document, rest),
         model=model,
-        generator=_text(asset.get("generator")) if isinstance(asset, dict) else None,
+        generator=stated_text(asset.get("generator")) if isinstance(asset, dict) else None,
         origin=read_origin(document, META_NAME),
         unknown=_unknown(document),
     )
@@ -230,8 +213,8 @@ def _part(document: dict[str, Any], key: str) -> dict[str, Any]:
 
 def _means(document: dict[str, Any]) -> dict[str, Float64[np.ndarray, " 3"]]:
     low, high = (_numbers(_part(document, "means"), key, "means.", 3) for key in ("mins", "maxs"))
-    if max(np.abs(low).max(), np.abs(high).max()) > _MAX_SIGNED_LOG:
-        raise _MetadataError(f"the range of means ends beyond ±{_MAX_SIGNED_LOG}, which float32 cannot hold")
+    if max(np.abs(low).max(), np.abs(high).max()) > MAX_SIGNED_LOG:
+        raise _MetadataError(f"the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold")
     return {"low": low, "high": high}
 
 
@@ -289,13 +272,7 @@ def _names(part: dict[str, Any], key: str, count: int) -> list[str]:
 
 
 def _whole(part: dict[str, Any], key: str, where: str, least: int, most: int) -> int:
-    value = part.get(key)
-    if isinstance(value, float) and value.is_integer():
-        value = int(value)
-    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+    value = whole_number(part.get(key), least, most)
+    if value is None:
         raise _MetadataError(f"{where}{key} is not a whole number from {least} to {most}; export the scene again")
     return value
-
-
-def _text(value: object) -> str | None:
-    return value[:100] if isinstance(value, str) else None

@@ -2,59 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from kissgs.core.resources import Workers
-from kissgs.core.splats import Splats
-from kissgs.io.containers import LOD_NAME, Source
-from kissgs.io.streamed import StreamedFormat
+from kissgs.formats import LOD_NAME
+from kissgs.io.containers import META_NAME, Source, stored_size
+from kissgs.io.streamed import Container, StreamedFormat
 from kissgs.sog.decode import decode_files
+from kissgs.sog.info import ranges_of
 from kissgs.sog.metadata import SogLayout, read_layout
 
 
-@dataclass(frozen=True, slots=True)
-class SogContainer:
-    """Container among the files of a streamed scene; ``folder`` is its path, or empty."""
+def _opened(files: Source, name: str) -> Container[SogLayout]:
+    """Read the container of a metadata file."""
+    layout, folder = read_layout(files, name), name[: name.rfind("/") + 1]
 
-    files: Source
-    layout: SogLayout
-    folder: str
+    def stored() -> tuple[str, int]:
+        return folder or META_NAME, sum(stored_size(files, folder + each) for each in (META_NAME, *layout.images))
 
-    @classmethod
-    def opened(cls, files: Source, name: str) -> SogContainer:
-        """Read the container of a metadata file.
-
-        Raises:
-            InvalidContainerError: the metadata is missing or invalid.
-            UnsupportedError: another version.
-        """
-        return cls(files, read_layout(files, name), name[: name.rfind("/") + 1])
-
-    @property
-    def count(self) -> int:
-        """See :class:`kissgs.io.streamed.Container`."""
-        return self.layout.count
-
-    @property
-    def sh_degree(self) -> int:
-        """See :class:`kissgs.io.streamed.Container`."""
-        return self.layout.sh_degree
-
-    @property
-    def antialiased(self) -> bool:
-        """See :class:`kissgs.io.streamed.Container`."""
-        return self.layout.antialiased
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """See :class:`kissgs.io.streamed.Container`."""
-        return self.layout.notes
-
-    def decode(self, out: Splats, pool: Workers) -> None:
-        """See :class:`kissgs.io.streamed.Container`."""
-        decode_files(self.files, self.layout, out, pool, self.folder)
+    return Container(layout, layout.count, stored, lambda out, pool: decode_files(files, layout, out, pool, folder))
 
 
-STREAMED = StreamedFormat(LOD_NAME, None, SogContainer.opened)
+STREAMED = StreamedFormat("streamed SOG scene", LOD_NAME, None, _opened, ranges_of)
 
-decode = STREAMED.decode
+FORMAT = STREAMED.codec

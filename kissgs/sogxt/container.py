@@ -11,6 +11,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from kissgs.core.errors import OutputError
+from kissgs.formats import ENDINGS
 from kissgs.io.containers import open_source
 from kissgs.io.files import atomic_file, check_writable, move_into_place, path_state, reason_of, refuse_existing, umask
 from kissgs.sogxt.names import FILES
@@ -41,26 +42,15 @@ def stored_sizes(files: Mapping[str, bytes], *, packed: bool) -> tuple[int, dict
 
 def is_packed(path: Path) -> bool:
     """Whether a container of that name is a zip, not a folder."""
-    return path.suffix.lower() in (".zip", ".sog")
+    return path.suffix.lower() in ENDINGS
 
 
 def write_container(
     files: Mapping[str, bytes], path: Path, *, overwrite: bool = False, names: Collection[str] = ()
 ) -> int:
-    """Write a container atomically: a zip if the name ends in ``.zip`` or ``.sog``, else a folder.
+    """Write a container atomically: a zip if the name ends in ``.zip`` or ``.sog``, else a folder; return its bytes.
 
-    Args:
-        files: the container's files.
-        path: the zip or the folder.
-        overwrite: replace what is there.
-        names: names that files of a folder to be replaced may have beside those of ``files``.
-
-    Returns:
-        Bytes written.
-
-    Raises:
-        OutputError: the path exists and ``overwrite`` is false, or the file system refuses. A folder is replaced only
-            if it holds a container and nothing else.
+    A folder is replaced only if it holds the files of a container, or those of ``names``, and nothing else.
     """
     check_destination(path, overwrite=overwrite, names={*files, *names})
     if is_packed(path):

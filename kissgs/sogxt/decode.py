@@ -38,21 +38,7 @@ def decode(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Splats:
-    """Decode a container.
-
-    Args:
-        source: a folder, a zip file, the bytes of a zip, or files in memory.
-        max_gaussians: largest number of Gaussians; more are refused before memory is allocated.
-        threads: number of threads; 0 means one per processor.
-        progress: receives "decode" events.
-
-    Returns:
-        The Gaussians in the order of the grid. Quaternions are as stored, of length about 1.
-
-    Raises:
-        InvalidContainerError: a part of the container is missing, damaged or invalid.
-        UnsupportedError: the container has images other than WebP, or more Gaussians than ``max_gaussians``.
-    """
+    """Decode a container in the order of its grid; quaternions are as stored, of length about 1."""
     with open_source(source) as files, Workers(threads) as pool:
         progress("decode", 0.0)
         planes = _Planes(files, read_layout(files), max_gaussians)
@@ -67,10 +53,6 @@ def decode_files(files: Source, layout: Layout, out: Splats, pool: Workers) -> N
     """Decode a container whose metadata states the number of Gaussians into ``out``, which has as many.
 
     ``out`` may have more SH coefficients than the container; they become zero.
-
-    Raises:
-        InvalidContainerError: an image is missing, damaged or invalid.
-        UnsupportedError: the images are far larger than the Gaussians need.
     """
     planes = _Planes(files, layout, len(out))
     planes.load(pool)

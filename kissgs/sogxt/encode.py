@@ -36,23 +36,7 @@ def encode(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Encoded:
-    """Encode a clean scene: :func:`kissgs.planning.planner.plan_encoding`, then :func:`write_files`.
-
-    Args:
-        splats: the scene.
-        settings: settings of the encoder.
-        sensitivity: see :func:`~kissgs.planning.planner.plan_encoding`.
-        recolor: see :func:`~kissgs.planning.planner.plan_encoding`.
-        cleaned: see :func:`write_files`.
-        compacted: see :func:`write_files`.
-        threads: number of threads; 0 means one per processor. The bytes do not depend on it.
-        progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook", "rounding",
-            "reorder" and "images".
-
-    Raises:
-        InvalidSceneError: ``sensitivity`` does not fit the scene.
-        UnsupportedError: the scene is too large for one container.
-    """
+    """Encode a clean scene: :func:`kissgs.planning.planner.plan_encoding`, then :func:`write_files`."""
     plan = plan_encoding(splats, settings, sensitivity=sensitivity, recolor=recolor, threads=threads, progress=progress)
     return write_files(plan, settings, cleaned=cleaned, compacted=compacted, threads=threads, progress=progress)
 
@@ -67,17 +51,7 @@ def write_files(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Encoded:
-    """Make the files of a plan.
-
-    Args:
-        plan: plan of :func:`~kissgs.planning.planner.plan_encoding`, perhaps fine-tuned.
-        settings: settings of the plan.
-        cleaned: changes by cleaning, for the metadata.
-        compacted: number of Gaussians that compaction removed, for the metadata.
-        finetune_steps: number of fine-tuning steps, for the metadata.
-        threads: number of threads; 0 means one per processor. The bytes do not depend on it.
-        progress: receives "images".
-    """
+    """Make the files of a plan; the bytes do not depend on the number of threads. The metadata records the counts."""
     images = render_planes(plan)
     with blas_workers(threads) as pool:
         files = compress_images(images, settings, pool, _stage(progress, "images"))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
@@ -17,6 +17,7 @@ from pydantic_core import PydanticCustomError
 
 from kissgs.core.origin import WORLD, Origin, recorded
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE, SH_REST_COUNTS
+from kissgs.io.containers import is_antialiased
 from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME
 
 TILE_ROWS, TILE_COLUMNS = 3, 5
@@ -62,46 +63,6 @@ class Provenance(BaseModel):
     sha256: dict[str, str] = Field(default_factory=dict, description="SHA-256 of each image file, hexadecimal.")
 
 
-class SimpleQuantize(BaseModel):
-    """Values of the smallest and the largest level in the field's image, per channel."""
-
-    min_values: Limit | list[Limit]
-    max_values: Limit | list[Limit]
-
-
-class Transform(BaseModel):
-    """One conversion step between levels and values."""
-
-    simple_quantize: SimpleQuantize
-
-
-class Op(BaseModel):
-    """Storage of one field."""
-
-    input_fields: list[str] = Field(min_length=1, max_length=1)
-    transforms: list[Transform] = Field(min_length=1)
-
-
-class Sides(BaseModel):
-    """Sizes of the images and the suffix of their files."""
-
-    grid_side: int = Field(ge=1, le=MAX_GRID_SIDE)
-    f_rest_centroids_side: int = Field(ge=1, le=MAX_CODEBOOK_SIDE)
-    image_codec: Literal["webp"]
-
-
-class ContainerMeta(BaseModel):
-    """``container_meta.yaml`` as kissgs writes it."""
-
-    meta: Sides
-    ops: list[Op]
-    model: Literal["antialiased"] | None = Field(
-        None, description="Variant of the renderer that the scene was trained with; missing for the classic one."
-    )
-    kissgs: Provenance | None = None
-    kissgs_crc32: int | None = Field(None, ge=0, lt=1 << 32, description="CRC-32 of all numbers that decoding needs.")
-
-
 class Layout(BaseModel):
     """All metadata that a decoder needs besides the images."""
 
@@ -121,7 +82,12 @@ class Layout(BaseModel):
     @property
     def antialiased(self) -> bool:
         """Whether the scene was trained with antialiasing."""
-        return self.model is not None and self.model.lower() == "antialiased"
+        return is_antialiased(self.model)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Phrases for what reading leaves out: nothing is."""
+        return ()
 
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
         """Return ``low`` and ``high`` of a field, one number per channel: float32 numbers, as float64."""

@@ -13,13 +13,11 @@ from pydantic import ValidationError
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.origin import WORLD, read_origin
-from kissgs.io.containers import LEVELS_NAME, LOD_NAME, Source
+from kissgs.formats import LEVELS_NAME, LOD_NAME
+from kissgs.io.containers import MAX_METADATA_BYTES, MAX_SIGNED_LOG, Source, stated_text
 from kissgs.io.files import parse_json
 from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout, Provenance
 from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME, YAML_NAME
-
-MAX_METADATA_BYTES = 1 << 20
-"""Largest size of a metadata file, bytes; kissgs writes about 4 kB each."""
 
 MAX_YAML_EVENTS = 20_000
 """Largest number of values, and beginnings and ends of lists and mappings, of the YAML; kissgs writes about 500."""
@@ -49,17 +47,9 @@ _WORD = re.compile(r"""[^ \t\r\n,:"'\[\]{}]+""")
 MISSING = object()
 """Placeholder for a missing checksum: other encoders and early versions of kissgs write none."""
 
-MAX_SIGNED_LOG = 88.7
-"""Largest signed logarithm of a position: exp of more exceeds float32."""
-
 
 def read_layout(source: Source) -> Layout:
-    """Read and check the metadata of a container.
-
-    Raises:
-        InvalidContainerError: the metadata is missing, damaged or invalid.
-        UnsupportedError: the images are not WebP, or ``meta.json`` is of another format or version.
-    """
+    """Read and check the metadata of a container."""
     names = source.names()
     if JSON_NAME in names:
         layout = _layout_of(_from_json(source.read(JSON_NAME, MAX_METADATA_BYTES)), JSON_NAME)
@@ -75,12 +65,7 @@ def read_layout(source: Source) -> Layout:
 
 
 def read_provenance(source: Source) -> Provenance | None:
-    """Return what kissgs recorded about the encoding, of which ``meta.json`` has a part; None for other encoders.
-
-    Raises:
-        InvalidContainerError: the metadata is missing, damaged or invalid.
-        UnsupportedError: see :func:`read_layout`.
-    """
+    """Return what kissgs recorded about the encoding, of which ``meta.json`` has a part; None for other encoders."""
     if YAML_NAME not in source.names():
         return read_layout(source).provenance
     return _layout_of(_from_yaml(source.read(YAML_NAME, MAX_METADATA_BYTES)), YAML_NAME).provenance
@@ -170,7 +155,7 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
         "ranges": ranges,
         "provenance": recorded,
         "origin": read_origin(document, YAML_NAME),
-        "model": _text(document.get("model")),
+        "model": stated_text(document.get("model")),
         CHECKSUM: document.get(CHECKSUM, MISSING),
     }
 
@@ -179,9 +164,6 @@ def _load_yaml(data: bytes) -> Any:  # noqa: ANN401
     """Return a document of lists, mappings with keys of text, and the plain values of YAML 1.2: see :func:`_value`.
 
     PyYAML's loaders know more (numbers of base 60, merge keys, keys of any type), which takes minutes to expand.
-
-    Raises:
-        YAMLError: it is no YAML, has more than that, or is beyond a limit.
     """
     waiting: list[tuple[Any, list[Any]]] = [(None, [])]
     anchors: dict[str | None, Any] = {}
@@ -265,7 +247,7 @@ def _from_json(data: bytes) -> dict[str, Any]:
             "codebook_side": _whole(rest["centroidSide"]),
             "ranges": ranges,
             "origin": read_origin(document, JSON_NAME),
-            "model": _text(document.get("model")),
+            "model": stated_text(document.get("model")),
             CHECKSUM: document.get(CHECKSUM, MISSING),
         }
         if "kissgs" in document:
@@ -306,10 +288,6 @@ def _check_dialect(document: Mapping[str, Any]) -> None:
 def _require_webp(codec: object) -> None:
     if codec != "webp":
         raise UnsupportedError(f"the container's images are {codec!r} files; only 'webp' is read")
-
-
-def _text(value: object) -> str | None:
-    return value[:100] if isinstance(value, str) else None
 
 
 def _flat(values: Any) -> list[Any]:  # noqa: ANN401

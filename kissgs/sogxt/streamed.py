@@ -3,68 +3,38 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
 
 from kissgs.core.errors import InvalidContainerError
-from kissgs.core.resources import Workers
-from kissgs.core.splats import Splats
-from kissgs.io.containers import LEVELS_NAME, Source, ZipSource
-from kissgs.io.streamed import StreamedFormat
+from kissgs.formats import LEVELS_NAME
+from kissgs.io.containers import Source, ZipSource, stored_size
+from kissgs.io.streamed import Container, StreamedFormat
+from kissgs.sogxt import names
 from kissgs.sogxt.decode import decode_files
+from kissgs.sogxt.info import ranges_of
 from kissgs.sogxt.metadata import Layout
 from kissgs.sogxt.metadata_reader import read_layout
-from kissgs.sogxt.names import FORMAT
 
 MAX_FILE_BYTES = 1 << 28
 """Largest size of a zip, bytes; one of 400,000 Gaussians takes about 5 MB."""
 
 
-@dataclass(frozen=True, slots=True)
-class SogxtContainer:
-    """Zip among the files of a streamed scene. Between metadata and images, its bytes are not kept."""
+def _opened(files: Source, name: str) -> Container[Layout]:
+    """Read the metadata of a zip, whose bytes are not kept until its images are decoded."""
 
-    files: Source
-    layout: Layout
-    name: str
-    count: int
+    def opened() -> Source:
+        return ZipSource(io.BytesIO(files.read(name, MAX_FILE_BYTES)), name)
 
-    @classmethod
-    def opened(cls, files: Source, name: str) -> SogxtContainer:
-        """Read the metadata of a zip.
-
-        Raises:
-            InvalidContainerError: the zip or the metadata is missing or invalid.
-            UnsupportedError: another version, or other images than WebP.
-        """
-        layout = read_layout(_zip(files, name))
-        if layout.count is None:
-            raise InvalidContainerError(f"{name} does not state its number of Gaussians; compress the scene again")
-        return cls(files, layout, name, layout.count)
-
-    @property
-    def sh_degree(self) -> int:
-        """See :class:`kissgs.io.streamed.Container`."""
-        return self.layout.sh_degree
-
-    @property
-    def antialiased(self) -> bool:
-        """See :class:`kissgs.io.streamed.Container`."""
-        return self.layout.antialiased
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """See :class:`kissgs.io.streamed.Container`."""
-        return ()
-
-    def decode(self, out: Splats, pool: Workers) -> None:
-        """See :class:`kissgs.io.streamed.Container`."""
-        decode_files(_zip(self.files, self.name), self.layout, out, pool)
+    layout = read_layout(opened())
+    if layout.count is None:
+        raise InvalidContainerError(f"{name} does not state its number of Gaussians; compress the scene again")
+    return Container(
+        layout,
+        layout.count,
+        lambda: (name, stored_size(files, name)),
+        lambda out, pool: decode_files(opened(), layout, out, pool),
+    )
 
 
-def _zip(files: Source, name: str) -> Source:
-    return ZipSource(io.BytesIO(files.read(name, MAX_FILE_BYTES)), name)
+STREAMED = StreamedFormat("streamed SOG-XT scene", LEVELS_NAME, names.FORMAT, _opened, ranges_of)
 
-
-STREAMED = StreamedFormat(LEVELS_NAME, FORMAT, SogxtContainer.opened)
-
-decode = STREAMED.decode
+FORMAT = STREAMED.codec

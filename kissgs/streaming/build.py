@@ -1,4 +1,4 @@
-"""Work items that turn a scene into a streamed scene: partition, levels of a chunk, one file, the manifest."""
+"""Steps that turn a scene into a streamed scene: partition, levels of a chunk, one file, the manifest."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from kissgs.cameras.virtual.regions import MAX_VIEWS, default_view_count, sensitivity_cameras
-from kissgs.core.array_types import Float32, UInt16
+from kissgs.core.array_types import Float32
 from kissgs.core.coarse_positions import STREAMED_REMEDY, Cuts, cuts_without_coarse, visible_sizes
 from kissgs.core.origin import WORLD
 from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, clean, concatenate, sampled_rows
-from kissgs.io.containers import ContainerName
+from kissgs.formats import ContainerName
 from kissgs.io.files import atomic_file
 from kissgs.pipeline.containers import MODELS, write_files
 from kissgs.pipeline.scene_files import reading_notes
@@ -31,11 +31,12 @@ from kissgs.sogxt.container import write_container
 from kissgs.sogxt.names import FORMAT
 from kissgs.streaming.layout import (
     CAMERAS,
+    ENVIRONMENT,
     OUT,
+    ContainerFile,
     Layout,
     chunk_file,
     environment_file,
-    environment_marker,
     leaves_file,
     level_file,
     read_leaves,
@@ -104,20 +105,6 @@ REACH = 1.3
 """Size of the image in which a sampled Gaussian counts as seen, in units of the image's."""
 
 
-def choose_cameras(scene: Splats, chunks: int, count: int, settings: EncodeSettings, threads: int) -> WeightedCameras:
-    """Return the cameras that see a scene, given by its coarsest level.
-
-    Args:
-        scene: the coarsest level.
-        chunks: number of chunks.
-        count: number of Gaussians of the finest level.
-        settings: settings of the encoder.
-        threads: number of threads; 0 means one per processor.
-    """
-    views = settings.sensitivity_views or max(default_view_count(count), min(MOST_VIEWS, VIEWS_PER_CHUNK * chunks))
-    return sensitivity_cameras(scene, None, count=views, size=settings.sensitivity_view_size, threads=threads)
-
-
 def cameras_json(cameras: WeightedCameras) -> dict[str, Any]:
     """Return the cameras as JSON; :func:`cameras_of` reads it."""
     return {
@@ -146,16 +133,9 @@ def measure_file(
     threads: int,
     progress: Progress = silent,
 ) -> Sensitivity:
-    """Measure the sensitivity of the Gaussians of a file, as part of the whole scene.
+    """Measure the sensitivity of the Gaussians of a file; ``others`` stand for the rest of the scene.
 
-    Args:
-        splats: the Gaussians of the file.
-        others: those of other chunks, from a coarse level.
-        cameras: cameras that see the scene.
-        level: level of the file. A level of half the Gaussians is meant for images of half the size.
-        settings: settings of the encoder.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        progress: receives the stage "sensitivity".
+    A level of half the Gaussians is meant for images of half the size.
     """
     size = max(MIN_SIZE, settings.sensitivity_view_size >> level)
     shown = [_shown(camera, splats) for camera in cameras.cameras]
@@ -193,10 +173,8 @@ def _rows(sensitivity: Sensitivity, rows: slice) -> Sensitivity:
     return replace(sensitivity, **{name: getattr(sensitivity, name)[rows] for name in arrays})
 
 
-# Work items that turn a scene into a streamed scene: partition, levels of a chunk, one file, the manifest.
-#
-# Every item reads and writes files of the work folder, and the last file that it writes marks it as done. So
-# interrupted work goes on where it was, and items may run in any process that sees the folder.
+# The steps. Every one reads and writes files of the work folder, and the last file that it writes marks it as done. So
+# interrupted work goes on where it was, and steps may run in any process that sees the folder.
 
 Blocks = Callable[[], Iterable[Splats]]
 """Function that reads the scene from its beginning, some Gaussians at a time."""
@@ -223,16 +201,7 @@ def partition(
     settings: EncodeSettings,
     progress: Progress = silent,
 ) -> Layout:
-    """Split a scene into chunks, one file of rows each, in two passes; return the layout.
-
-    Args:
-        work: the work folder.
-        blocks: reads the scene.
-        count: number of Gaussians in it before cleaning.
-        container: container of the files.
-        settings: settings of the encoder, which say whether invisible Gaussians are left out.
-        progress: receives "partition".
-    """
+    """Split a scene of ``count`` Gaussians before cleaning into chunks, one file of rows each, in two passes."""
     done = visible_count = 0
     origin = WORLD
 
@@ -303,11 +272,6 @@ def leaf_size(total: int, chunks: int, levels: int) -> int:
     return max(LEAF, math.ceil(UNEVEN * total / (chunks * parts)))
 
 
-def has_levels(work: Path, chunk: int) -> bool:
-    """Return whether a chunk's levels are complete."""
-    return leaves_file(work, chunk).exists()
-
-
 def make_levels(work: Path, layout: Layout, chunk: int, threads: int, progress: Progress = silent) -> None:
     """Merge a chunk into its levels, one file of rows each; ``progress`` receives "merge"."""
     rows = read_rows(chunk_file(work, chunk), layout.sh_degree, layout.counts[chunk])
@@ -318,127 +282,79 @@ def make_levels(work: Path, layout: Layout, chunk: int, threads: int, progress: 
     chunk_file(work, chunk).unlink(missing_ok=True)
 
 
-def has_file(work: Path, level: int, file: int) -> bool:
-    """Return whether a file is complete."""
-    return rows_file(work, level, file).exists()
-
-
 def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: int) -> None:
     """Choose the cameras that sensitivity is measured with, and write them to a file."""
     coarsest = concatenate(
         [_read_level(work, layout, layout.levels - 1, layout.filled), read_environment(work, layout)]
     )
     total = sum(layout.counts) + layout.environment
-    cameras = choose_cameras(coarsest, len(layout.filled), total, settings, threads)
+    least = min(MOST_VIEWS, VIEWS_PER_CHUNK * len(layout.filled))
+    views = settings.sensitivity_views or max(default_view_count(total), least)
+    size = settings.sensitivity_view_size
+    cameras = sensitivity_cameras(coarsest, None, count=views, size=size, threads=threads)
     write_json(work / CAMERAS, cameras_json(cameras))
 
 
-def has_cameras(work: Path) -> bool:
-    """Return whether the cameras are chosen."""
-    return (work / CAMERAS).exists()
-
-
 def make_file(
-    work: Path,
-    layout: Layout,
-    settings: EncodeSettings,
-    level: int,
-    file: int,
-    threads: int,
-    progress: Progress = silent,
+    work: Path, layout: Layout, settings: EncodeSettings, file: ContainerFile, threads: int, progress: Progress = silent
 ) -> None:
-    """Encode the Gaussians of one level of some chunks; ``progress`` receives the stages of the encoder."""
-    members = [chunk for chunk in layout.members(level, file) if layout.counts[chunk]]
-    splats = _read_level(work, layout, level, members)
-    counts = [count for chunk in members for count in read_leaves(work, chunk)["counts"][level]]
+    """Write a container; ``settings`` are those of the finest level, ``progress`` receives stages of the encoder."""
+    if file.name == ENVIRONMENT:
+        splats = read_environment(work, layout)
+        counts = [len(splats)]
+    else:
+        splats = _read_level(work, layout, file.level, file.chunks)
+        counts = [count for chunk in file.chunks for count in read_leaves(work, chunk)["counts"][file.level]]
     groups = np.repeat(np.arange(len(counts)), counts).astype(np.uint16)
-    stored = _encode(
-        work, layout, splats, groups, settings, level, members, layout.path(level, file), threads, progress
-    )
-    write_json(rows_file(work, level, file), stored)
-    if level != layout.context:
-        for chunk in members:
-            level_file(work, chunk, level).unlink(missing_ok=True)
+    settings = file_settings(settings, file.level, layout.sh_degree)
+    stored: dict[str, Any] = {"counts": [0] * len(counts), "note": ""}
+    if len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
+        sensitivity = None
+        if settings.rate_distortion:
+            others = _others(work, layout, file)
+            cameras = cameras_of(json.loads((work / CAMERAS).read_bytes()))
+            sensitivity = measure_file(splats, others, cameras, file.level, settings, threads, progress)
+            del others
+        plan = plan_encoding(
+            splats,
+            settings,
+            sensitivity=sensitivity,
+            container=MODELS[layout.container],
+            groups=groups,
+            keep_costs=False,
+            threads=threads,
+            progress=progress,
+        )
+        del sensitivity, splats
+        encoded = write_files(layout.container, plan, settings, threads=threads, progress=progress)
+        write_container(encoded.files, work / OUT / layout.path(file.name), overwrite=True)
+        rows = np.bincount(groups[encoded.order], minlength=len(counts)).tolist()
+        stored = {"counts": rows, "note": encoded.coarse}
+    write_json(rows_file(work, file.name), stored)
+    if file.level != layout.context:
+        for chunk in file.chunks:
+            level_file(work, chunk, file.level).unlink(missing_ok=True)
 
 
-def has_environment(work: Path) -> bool:
-    """Return whether the file of the environment is complete."""
-    return environment_marker(work).exists()
-
-
-def make_environment(
-    work: Path, layout: Layout, settings: EncodeSettings, threads: int, progress: Progress = silent
-) -> None:
-    """Encode the Gaussians of the environment; ``progress`` receives the stages of the encoder."""
-    splats = read_environment(work, layout)
-    groups = np.zeros(len(splats), np.uint16)
-    stored = _encode(work, layout, splats, groups, settings, 0, None, layout.environment_path, threads, progress)
-    write_json(environment_marker(work), stored)
-
-
-def _encode(
-    work: Path,
-    layout: Layout,
-    splats: Splats,
-    groups: UInt16[np.ndarray, " N"],
-    settings: EncodeSettings,
-    level: int,
-    members: Sequence[int] | None,
-    path: str,
-    threads: int,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Write a container; return the number of rows of each group in it, and a note if its positions are coarse.
-
-    Args:
-        work: the work folder.
-        layout: sizes of the scene.
-        splats: the Gaussians.
-        groups: group of each, ascending; groups stay together.
-        settings: settings of the encoder, for the finest level.
-        level: level of the Gaussians.
-        members: chunks that they are from; None for the environment.
-        path: name of the container in the folder of the result.
-        threads: number of threads; 0 means one per processor.
-        progress: receives "sensitivity" and the stages of the encoder.
-    """
-    settings, count = file_settings(settings, level, layout.sh_degree), int(groups[-1]) + 1
-    if not len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
-        return {"counts": [0] * count, "note": ""}
-    sensitivity = None
-    if settings.rate_distortion:
-        others = [_read_level(work, layout, layout.context, sorted({*layout.filled} - {*(members or ())}))]
-        if members is not None:
-            others.append(read_environment(work, layout))
-        cameras = cameras_of(json.loads((work / CAMERAS).read_bytes()))
-        sensitivity = measure_file(splats, concatenate(others), cameras, level, settings, threads, progress)
-        del others
-    plan = plan_encoding(
-        splats,
-        settings,
-        sensitivity=sensitivity,
-        container=MODELS[layout.container],
-        groups=groups,
-        keep_costs=False,
-        threads=threads,
-        progress=progress,
-    )
-    del sensitivity, splats
-    encoded = write_files(layout.container, plan, settings, threads=threads, progress=progress)
-    write_container(encoded.files, work / OUT / path, overwrite=True)
-    return {"counts": np.bincount(groups[encoded.order], minlength=count).tolist(), "note": encoded.coarse}
+def _others(work: Path, layout: Layout, file: ContainerFile) -> Splats:
+    """Return what stands for the rest of the scene where the sensitivity of a file is measured."""
+    chunks = [chunk for chunk in layout.filled if chunk not in file.chunks]
+    others = [_read_level(work, layout, layout.context, chunks)]
+    if file.name != ENVIRONMENT:
+        others.append(read_environment(work, layout))
+    return concatenate(others)
 
 
 def coarse_note(work: Path, layout: Layout) -> str:
     """Return the note of the first file of the finest level whose positions are coarse; else an empty string."""
-    notes = (json.loads(rows_file(work, *each).read_bytes())["note"] for each in layout.files() if each[0] == 0)
+    notes = (json.loads(rows_file(work, file.name).read_bytes())["note"] for file in layout.files() if not file.level)
     note = next(filter(None, notes), "")
     return note.removesuffix(f": {STREAMED_REMEDY}") if layout.container == "sog" else note
 
 
 def environment_count(work: Path) -> int:
     """Return the number of Gaussians in the file of the environment."""
-    return sum(json.loads(environment_marker(work).read_bytes())["counts"])
+    return sum(json.loads(rows_file(work, ENVIRONMENT).read_bytes())["counts"])
 
 
 def read_environment(work: Path, layout: Layout) -> Splats:
@@ -461,24 +377,25 @@ def make_manifest(work: Path, layout: Layout) -> None:
     """Write the manifest of all files."""
     lods: dict[tuple[int, int], dict[int, tuple[int, int, int]]] = {}
     filenames: list[str] = []
-    for level, file in layout.files():
-        counts = json.loads(rows_file(work, level, file).read_bytes())["counts"]
-        offset, at = 0, 0
-        for chunk in layout.members(level, file):
-            for leaf in range(len(read_leaves(work, chunk)["bounds"]) if layout.counts[chunk] else 0):
-                if counts[at]:
-                    lods.setdefault((chunk, leaf), {})[level] = (len(filenames), offset, counts[at])
-                offset, at = offset + counts[at], at + 1
+    for file in layout.files():
+        counts = json.loads(rows_file(work, file.name).read_bytes())["counts"]
+        leaves_of_file = [
+            (chunk, leaf) for chunk in file.chunks for leaf in range(len(read_leaves(work, chunk)["bounds"]))
+        ]
+        offset = 0
+        for leaf_of_chunk, count in zip(leaves_of_file, counts, strict=True):
+            if count:
+                lods.setdefault(leaf_of_chunk, {})[file.level] = (len(filenames), offset, count)
+            offset += count
         if any(counts):
-            filenames.append(layout.entry(layout.path(level, file)))
+            filenames.append(layout.entry(file.name))
     leaves = []
     for chunk in layout.filled:
         own = read_leaves(work, chunk)
         for leaf, (bounds, errors) in enumerate(zip(own["bounds"], own["errors"], strict=True)):
             if (chunk, leaf) in lods:  # some Gaussian of it is visible
                 leaves.append(Leaf(np.array(bounds), dict(sorted(lods[chunk, leaf].items())), errors))
-    path = layout.environment_path
-    environment = layout.entry(path) if (work / OUT / path).exists() else None
+    environment = layout.entry(ENVIRONMENT) if (work / OUT / layout.path(ENVIRONMENT)).exists() else None
     containers = FORMAT if layout.container == "sogxt" else None
     with atomic_file(work / OUT / layout.manifest, overwrite=True) as out:
         out.write(manifest(leaves, layout.levels, filenames, environment, containers, layout.origin))

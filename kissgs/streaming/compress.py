@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,11 @@ from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.origin import middle_of, with_origin, world_positions
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import BLOCK, Splats
-from kissgs.io.containers import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
+from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
 from kissgs.io.files import atomic_file, reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
-from kissgs.pipeline.scene_files import DEFAULT_READ_OPTIONS, AnyPath, ReadOptions, read_scene, recognise, stored_bytes
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
+from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, stored_bytes
 from kissgs.runners import Runner
 from kissgs.settings import Settings
 from kissgs.streaming import build
@@ -36,11 +38,17 @@ from kissgs.streaming.items import (
     read_json,
     remove,
     run_all,
-    run_environment,
-    run_file,
-    run_levels,
 )
-from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_layout, work_folder
+from kissgs.streaming.layout import (
+    CAMERAS,
+    ENVIRONMENT,
+    OUT,
+    PARTITION,
+    Layout,
+    keep_layout,
+    read_layout,
+    work_folder,
+)
 
 # ``with_time_left``: progress events of the work items of a streamed scene, with an estimate of the time left.
 
@@ -85,7 +93,7 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-WORK_LAYOUT = 3
+WORK_LAYOUT = 4
 """Version of the files in the work folder; another one's are not continued."""
 
 REPORT = "report.json"
@@ -187,36 +195,27 @@ def _make(
     """Make all levels and files that are not in the work folder yet."""
     encode = settings.encode
     report = with_time_left(progress, encode.rate_distortion)
-    path, stored = str(work.absolute()), encode.model_dump(mode="json")
 
-    def run(stage: str, items: list[Item], total: int) -> None:
-        done = 1 - len(items) / total
+    def run(stage: str, items: list[Item]) -> None:
+        left = [item for item in items if not item.done]
+        done = 1 - len(left) / len(items)
 
         def part(fraction: float) -> None:
             report(stage, done + fraction * (1 - done))
 
-        def within(at: int) -> Progress:
-            return as_stage(stage, lambda _, fraction, note="": part((at + fraction) / len(items)))
-
         if runner is not None:
-            run_all(runner, items, layout, threads, part)
+            run_all(runner, left, layout, threads, part)
             return
-        for at, (function, arguments) in enumerate(items):
-            part(at / len(items))
-            function({**arguments, "threads": threads}, within(at))
+        for at, item in enumerate(left):
+            part(at / len(left))
+            item.run(threads, as_stage(stage, lambda _, now, note="", at=at: part((at + now) / len(left))))
 
-    chunks = [chunk for chunk in layout.filled if not build.has_levels(work, chunk)]
-    run("merge", [(run_levels, {"work": path, "chunk": chunk}) for chunk in chunks], len(layout.filled))
-    if encode.rate_distortion and not build.has_cameras(work):
+    item = partial(Item, str(work.absolute()), encode.model_dump(mode="json"))
+    run("merge", [item(chunk=chunk) for chunk in layout.filled])
+    if encode.rate_distortion and not (work / CAMERAS).exists():
         report("cameras", 0.0)
         build.make_cameras(work, layout, encode, threads)
-    items: list[Item] = []
-    if layout.environment and not build.has_environment(work):
-        items.append((run_environment, {"work": path, "settings": stored}))
-    for level, file in layout.files():
-        if not build.has_file(work, level, file):
-            items.append((run_file, {"work": path, "level": level, "file": file, "settings": stored}))
-    run("images", items, len(layout.files()) + bool(layout.environment))
+    run("images", [item(file=file.name) for file in layout.all_files()])
     report("images", 1.0)
     build.make_manifest(work, layout)
     return _report(work, layout, len(layout.filled))
@@ -253,11 +252,7 @@ def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, i
 
 
 def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[str, Any]:
-    """Return what the work depends on.
-
-    Raises:
-        InvalidSceneError: the source cannot be read.
-    """
+    """Return what the work depends on."""
     try:
         status = source.stat()
         path = str(source.resolve())
@@ -317,10 +312,12 @@ def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
     out = work / OUT
     document = json.loads((out / layout.manifest).read_bytes())
     sizes = [0] * layout.levels
-    for level, file in layout.files():
-        path = out / layout.path(level, file)
-        sizes[level] += stored_bytes(path) if path.exists() else 0  # files without a visible Gaussian are not written
-    environment = out / layout.environment_path
+    for file in layout.files():
+        path = out / layout.path(file.name)
+        sizes[file.level] += (
+            stored_bytes(path) if path.exists() else 0
+        )  # files without a visible Gaussian are not written
+    environment = out / layout.path(ENVIRONMENT)
     environment_count, environment_bytes = 0, 0
     if environment.exists():
         environment_count, environment_bytes = build.environment_count(work), stored_bytes(environment)

@@ -1,4 +1,4 @@
-"""Work items of a streamed scene on a runner, and the work folder that holds their files."""
+"""The work folder of a streamed scene, and the work items that fill it, here or on a runner."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import shutil
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.core.progress import Progress
-from kissgs.io.containers import MANIFESTS
+from kissgs.formats import MANIFESTS
 from kissgs.io.files import atomic_file, path_state, reason_of
 from kissgs.io.streamed import MAX_TREE_BYTES
 from kissgs.runners import Resources, Runner, WorkItem, error_of
@@ -23,7 +24,7 @@ from kissgs.settings import EncodeSettings
 from kissgs.sog.encode import FILES
 from kissgs.streaming import build
 from kissgs.streaming.build import CHUNK
-from kissgs.streaming.layout import OUT, PARTITION, Layout, continuation, read_layout
+from kissgs.streaming.layout import OUT, PARTITION, Layout, continuation, leaves_file, read_layout, rows_file
 from kissgs.streaming.partition import row_bytes
 
 # The work folder of a streamed scene: whose work it holds, its room on the disk, and the last step of the work.
@@ -42,16 +43,7 @@ ENCODED_BYTES = 30
 
 
 def check_destination(manifest: Path, source: Path, *, overwrite: bool) -> None:
-    """Refuse to replace anything but a streamed scene, and that only if allowed.
-
-    Args:
-        manifest: the manifest in the folder to write.
-        source: the input, which must not be replaced.
-        overwrite: whether a streamed scene may be replaced.
-
-    Raises:
-        OutputError: the folder cannot be replaced, holds something else, or a scene that may not be replaced.
-    """
+    """Refuse to replace anything but a streamed scene, and that only if allowed."""
     folder, remedy = manifest.parent, f"name {manifest.name} in a new folder"
     present, is_folder = path_state(folder)
     if not folder.name:
@@ -94,15 +86,7 @@ def _paths_of(folder: Path) -> set[Path]:
 
 @contextlib.contextmanager
 def claimed(work: Path, mine: dict[str, Any]) -> Iterator[None]:
-    """Make the work folder, or check that the one that is there belongs to the same work; keep others out meanwhile.
-
-    Args:
-        work: the work folder.
-        mine: JSON that identifies the work: its input, settings and version.
-
-    Raises:
-        OutputError: it belongs to other work, another process works in it, or it cannot be written.
-    """
+    """Make the work folder, or check that the one that is there belongs to the same work; keep others out meanwhile."""
     try:
         if work.is_symlink():
             raise OutputError(f"{work} is a link; delete it, or choose another name")
@@ -173,11 +157,7 @@ def megabytes(count: float) -> str:
 
 
 def check_space(work: Path, needed: int) -> None:
-    """Check, before the partition, that the disk has room for the work folder; what is in it counts as free.
-
-    Raises:
-        OutputError: the disk is too full.
-    """
+    """Check, before the partition, that the disk has room for the work folder; what is in it counts as free."""
     present = sum(path.stat().st_size for path in work.rglob("*") if path.is_file())
     free = shutil.disk_usage(work).free
     if needed - present > free:
@@ -192,9 +172,6 @@ def finish(work: Path, manifest: Path, source: Path, *, overwrite: bool) -> None
 
     What the result replaces is in the work folder until the result is in place. The work folder is renamed before it is
     deleted: a part of it would look like other work.
-
-    Raises:
-        OutputError: the result cannot be moved, or somebody has put other files into the folder meanwhile.
     """
     result, folder = work / OUT, manifest.parent
     if (result / manifest.name).exists():
@@ -242,10 +219,8 @@ def read_json(path: Path) -> Any:  # noqa: ANN401  any JSON
         return None
 
 
-# Work items of a streamed scene on a runner: the levels of a chunk, and one file.
-#
-# Items of a step do not depend on each other. Each reads and writes the work folder, which all machines see; one that
-# is run twice, because its node was given up, writes the same bytes again.
+# Work items of a streamed scene. Those of a step do not depend on each other. One that is run twice, because its node
+# was given up, writes the same bytes again.
 
 PROCESS_BYTES = 500_000_000
 """Memory of an item for libraries, bytes."""
@@ -253,58 +228,55 @@ PROCESS_BYTES = 500_000_000
 MEMORY_RATIO = 5
 """Memory of an item for each byte of the Gaussians of its file as float32."""
 
-Item = tuple[Callable[[dict[str, Any], Progress], dict[str, Any]], dict[str, Any]]
-"""A function of this module, and its arguments without "threads"."""
-
 POLL_SECONDS = 0.5
 """Seconds between reports of progress, which may also stop the work."""
 
 
-def run_levels(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
-    """Make the levels of a chunk: "work", the work folder; "chunk"; "threads"."""
-    work = _shared(arguments)
-    chunk = arguments["chunk"]
-    _make_once(
-        lambda: build.has_levels(work, chunk),
-        lambda: build.make_levels(work, read_layout(work), chunk, arguments["threads"], progress),
-    )
+@dataclass(frozen=True, slots=True)
+class Item:
+    """Something to make from files of a work folder: the levels of a chunk, or a container of the result."""
+
+    work: str
+    settings: dict[str, Any]  # of the encoder
+    chunk: int | None = None
+    file: str = ""
+
+    @property
+    def done(self) -> bool:
+        """Whether it has been made."""
+        work = Path(self.work)
+        return (rows_file(work, self.file) if self.chunk is None else leaves_file(work, self.chunk)).exists()
+
+    def run(self, threads: int, progress: Progress) -> None:
+        """Make it, unless it is there.
+
+        A node that was given up may still be at work: what it completes meanwhile, it takes the input of.
+        """
+        work = Path(self.work)
+        layout, settings = read_layout(work), EncodeSettings.model_validate(self.settings)
+        if self.done:
+            return
+        try:
+            if self.chunk is not None:
+                build.make_levels(work, layout, self.chunk, threads, progress)
+            else:
+                file = next(each for each in layout.all_files() if each.name == self.file)
+                build.make_file(work, layout, settings, file, threads, progress)
+        except OutputError:
+            if not self.done:
+                raise
+
+
+def run_item(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
+    """Run an item on a runner: "item", its fields; "threads"."""
+    item = Item(**arguments["item"])
+    if read_json(Path(item.work) / PARTITION) is None:
+        raise UnsupportedError(
+            f"the machine {socket.gethostname()} does not see {item.work}; "
+            "--ray needs storage that all machines see at the same path"
+        )
+    item.run(arguments["threads"], progress)
     return {}
-
-
-def run_file(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
-    """Encode a file: "work", the work folder; "level" and "file"; "settings" of the encoder; "threads"."""
-    work, level, file = _shared(arguments), arguments["level"], arguments["file"]
-    settings = EncodeSettings.model_validate(arguments["settings"])
-    _make_once(
-        lambda: build.has_file(work, level, file),
-        lambda: build.make_file(work, read_layout(work), settings, level, file, arguments["threads"], progress),
-    )
-    return {}
-
-
-def run_environment(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
-    """Encode the environment: "work", the work folder; "settings" of the encoder; "threads"."""
-    work, settings = _shared(arguments), EncodeSettings.model_validate(arguments["settings"])
-    _make_once(
-        lambda: build.has_environment(work),
-        lambda: build.make_environment(work, read_layout(work), settings, arguments["threads"], progress),
-    )
-    return {}
-
-
-def _make_once(done: Callable[[], bool], make: Callable[[], None]) -> None:
-    """Make something unless it is there.
-
-    A node that was given up may still be at work: what it completes meanwhile, it takes the input of, and this item is
-    done.
-    """
-    if done():
-        return
-    try:
-        make()
-    except OutputError:
-        if not done():
-            raise
 
 
 def run_all(
@@ -314,25 +286,14 @@ def run_all(
     threads: int,
     report: Callable[[float], None],
 ) -> None:
-    """Run items and wait for them; if one fails, or the caller is stopped, the others are cancelled.
-
-    Args:
-        runner: engine of the items.
-        items: a function of this module and its arguments, without "threads", of each.
-        layout: sizes of the scene.
-        threads: processors of each item; 0 means one.
-        report: receives the fraction of the items that is done.
-
-    Raises:
-        KissgsError: an item failed.
-    """
+    """Run items and wait for them; if one fails, or the caller is stopped, the others are cancelled."""
     memory = PROCESS_BYTES + MEMORY_RATIO * max(layout.counts) * row_bytes(layout.sh_degree)
     requested = Resources(cpus=max(1, threads), memory=memory)
     if refusal := runner.refusal(requested):
         raise UnsupportedError(f"{refusal}; choose another number with --threads")
     handles = [
-        runner.submit(WorkItem(f"{__name__}:{function.__name__}", {**arguments, "threads": max(1, threads)}, requested))
-        for function, arguments in items
+        runner.submit(WorkItem(f"{__name__}:run_item", {"item": asdict(item), "threads": max(1, threads)}, requested))
+        for item in items
     ]
     waiting = {handle.outcome for handle in handles}
     try:
@@ -347,18 +308,3 @@ def run_all(
             runner.cancel(handle.id)
         wait([handle.outcome for handle in handles])
         raise
-
-
-def _shared(arguments: dict[str, Any]) -> Path:
-    """Return the work folder.
-
-    Raises:
-        UnsupportedError: this machine does not see it.
-    """
-    work = Path(arguments["work"])
-    if read_json(work / PARTITION) is None:
-        raise UnsupportedError(
-            f"the machine {socket.gethostname()} does not see {work}; --ray needs storage that all machines see at the "
-            "same path"
-        )
-    return work

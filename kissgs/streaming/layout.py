@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from kissgs.core.origin import Origin
-from kissgs.io.containers import MANIFESTS, ContainerName
+from kissgs.formats import MANIFESTS, ContainerName
+from kissgs.io.containers import META_NAME
 from kissgs.io.files import atomic_file
-from kissgs.sog.metadata import META_NAME
 
 CONTEXT = 280_000
 """Largest number of Gaussians of the level that stands for other chunks where sensitivity is measured."""
@@ -19,35 +19,33 @@ PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"
 """Names in the work folder: the marker of the partition, the cameras, and the folder of the result."""
 
 
+ENVIRONMENT = "environment"
+"""Name of the environment's container."""
+
+
+@dataclass(frozen=True, slots=True)
+class ContainerFile:
+    """A container of the result: one level of some chunks, or the environment, which has no chunks."""
+
+    name: str
+    level: int = 0
+    chunks: tuple[int, ...] = ()  # those that have Gaussians
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """Sizes of a streamed scene.
-
-    Attributes:
-        container: container of the files.
-        source_count: number of Gaussians before cleaning.
-        sh_degree: 0 to 3.
-        counts: number of Gaussians in each chunk.
-        depth: number of cuts one after another; there are 2^depth chunks.
-        levels: number of levels.
-        leaf: largest number of Gaussians in a leaf.
-        environment: number of Gaussians in the environment; 0 without one.
-        changed: number of Gaussians that cleaning removed or changed, by kind, and of those that are invisible.
-        notes: what reading the scene left out or changed, and where its positions are.
-        origin: see :class:`kissgs.Splats`.
-        antialiased: see :class:`kissgs.Splats`.
-    """
+    """Sizes of a streamed scene: numbers of Gaussians, but for ``depth`` and ``levels``."""
 
     container: ContainerName
-    source_count: int
+    source_count: int  # before cleaning
     sh_degree: int
-    counts: tuple[int, ...]
-    depth: int
+    counts: tuple[int, ...]  # in each chunk
+    depth: int  # number of cuts one after another; there are 2^depth chunks
     levels: int
-    leaf: int
+    leaf: int  # at most, in a leaf
     environment: int
-    changed: dict[str, int]
-    notes: tuple[str, ...]
+    changed: dict[str, int]  # by cleaning, by kind; and "invisible"
+    notes: tuple[str, ...]  # what reading the scene left out or changed, and where its positions are
     origin: Origin
     antialiased: bool = False
 
@@ -67,32 +65,28 @@ class Layout:
         total = sum(self.counts)
         return next((level for level in range(self.levels) if total >> level <= CONTEXT), self.levels - 1)
 
-    def path(self, level: int, file: int) -> str:
-        """Return the name of a container in the folder of the result: that of a folder for SOG, else of a zip."""
-        return f"{level}_{file}" if self.container == "sog" else f"{level}_{file}.zip"
+    def path(self, name: str) -> str:
+        """Return the path of a container in the folder of the result: that of a folder for SOG, else of a zip."""
+        return name if self.container == "sog" else f"{name}.zip"
 
-    def entry(self, path: str) -> str:
-        """Return how the manifest names a container of this name."""
-        return f"{path}/{META_NAME}" if self.container == "sog" else path
+    def entry(self, name: str) -> str:
+        """Return how the manifest names a container."""
+        return f"{name}/{META_NAME}" if self.container == "sog" else self.path(name)
 
-    @property
-    def environment_path(self) -> str:
-        """Name of the environment's container in the folder of the result, see :meth:`path`."""
-        return "environment" if self.container == "sog" else "environment.zip"
+    def files(self) -> list[ContainerFile]:
+        """Return the containers of all levels, the coarsest first: each has twice the chunks of one a level finer."""
+        found = []
+        for level in reversed(range(self.levels)):
+            size = 1 << min(level, self.depth)
+            for number in range((1 << self.depth) // size):
+                chunks = [chunk for chunk in range(number * size, (number + 1) * size) if self.counts[chunk]]
+                if chunks:
+                    found.append(ContainerFile(f"{level}_{number}", level, tuple(chunks)))
+        return found
 
-    def members(self, level: int, file: int) -> range:
-        """Return the chunks in a file of a level: twice as many as in one of the level before, up to all."""
-        size = 1 << min(level, self.depth)
-        return range(file * size, (file + 1) * size)
-
-    def files(self) -> list[tuple[int, int]]:
-        """Return level and number of every file, the coarsest level first."""
-        return [
-            (level, file)
-            for level in reversed(range(self.levels))
-            for file in range(1 << (self.depth - min(level, self.depth)))
-            if any(self.counts[chunk] for chunk in self.members(level, file))
-        ]
+    def all_files(self) -> list[ContainerFile]:
+        """Return all containers, the environment first if there is one."""
+        return [ContainerFile(ENVIRONMENT), *self.files()] if self.environment else self.files()
 
 
 def work_folder(manifest: Path) -> Path:
@@ -132,11 +126,6 @@ def environment_file(work: Path) -> Path:
     return work / "environment.f32"
 
 
-def environment_marker(work: Path) -> Path:
-    """Return the file of the number of Gaussians in the environment's container, which marks that as done."""
-    return work / "environment.json"
-
-
 def level_file(work: Path, chunk: int, level: int) -> Path:
     """Return the file of the Gaussians of one level of a chunk."""
     return work / f"chunk_{chunk}_level_{level}.f32"
@@ -147,9 +136,9 @@ def leaves_file(work: Path, chunk: int) -> Path:
     return work / f"chunk_{chunk}.json"
 
 
-def rows_file(work: Path, level: int, file: int) -> Path:
+def rows_file(work: Path, name: str) -> Path:
     """Return the file of the number of rows of each leaf in a container, which marks the container as done."""
-    return work / f"file_{level}_{file}.json"
+    return work / f"file_{name}.json"
 
 
 def write_json(path: Path, values: object) -> None:

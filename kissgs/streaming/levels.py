@@ -40,9 +40,6 @@ def level_errors(levels: Sequence[Splats]) -> list[float]:
     """Return the root mean square error of each level, in units of the range of colours; that of the finest is 0.
 
     No level has a smaller error than a finer one, so that a smaller error never asks for a coarser level.
-
-    Args:
-        levels: the leaf's Gaussians in each level, the finest first, clean.
     """
     squared = np.zeros(len(levels))
     for camera in _cameras(levels[0]):
@@ -77,15 +74,7 @@ MERGING = 0.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChunkLevels:
-    """The levels of a chunk.
-
-    Attributes:
-        levels: the Gaussians of each level, the finest first, leaf after leaf.
-        counts: number of Gaussians of each leaf, per level.
-        bounds: ``(leaves, 2, 3)`` lowest and highest corner of each leaf: the boxes of one standard deviation around
-            the Gaussians of all its levels.
-        errors: for each leaf, the error of each level (:func:`kissgs.streaming.levels.level_errors`).
-    """
+    """The levels of a chunk."""
 
     levels: list[Splats]
     counts: list[list[int]]
@@ -99,15 +88,7 @@ def level_count(count: int, coarsest: int) -> int:
 
 
 def chunk_levels(chunk: Splats, levels: int, leaf: int, threads: int, progress: Progress = silent) -> ChunkLevels:
-    """Split a chunk into leaves and merge each to half its Gaussians for every further level.
-
-    Args:
-        chunk: the Gaussians, clean, at least one.
-        levels: number of levels, the finest included.
-        leaf: largest number of Gaussians in a leaf.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        progress: receives the stage "merge".
-    """
+    """Split a chunk into leaves and merge each to half its Gaussians for every further level."""
     order, edges = leaf_groups(chunk.means, leaf)
     with Workers(threads) as pool:
         leaves = pool.map(
@@ -158,12 +139,7 @@ ONE_SIDED = 0.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Environment:
-    """Space beyond a ball.
-
-    Attributes:
-        center: ``(3,)`` centre of the scene, world units.
-        radius: of the ball; infinite if the scene has no environment.
-    """
+    """Space beyond a ball."""
 
     center: Float64[np.ndarray, "3"]
     radius: float

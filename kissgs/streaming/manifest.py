@@ -16,13 +16,7 @@ from kissgs.core.origin import WORLD, Origin, recorded
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Leaf:
-    """A leaf of the tree.
-
-    Attributes:
-        bounds: ``(2, 3)`` lowest and highest corner.
-        lods: for each level, the file, the first row and the number of rows; levels without rows are absent.
-        errors: error of each level; 0 for the finest.
-    """
+    """A leaf of the tree."""
 
     bounds: Float64[np.ndarray, "2 3"]
     lods: Mapping[int, tuple[int, int, int]]
@@ -37,16 +31,7 @@ def manifest(
     containers: str | None,
     origin: Origin,
 ) -> bytes:
-    """Return the manifest.
-
-    Args:
-        leaves: all leaves, neighbours after neighbours.
-        levels: number of levels; 0 is the finest.
-        filenames: file of each container, relative to the manifest.
-        environment: file of the environment; None without one.
-        containers: format of the containers; None for SOG, whose manifests do not name it.
-        origin: see :class:`kissgs.Splats`.
-    """
+    """Return the manifest."""
     counts = [sum(leaf.lods[level][2] for leaf in leaves if level in leaf.lods) for level in range(levels)]
     document = {
         "version": 1,

@@ -46,11 +46,7 @@ def from_rows(rows: Float32[np.ndarray, "N F"], *, antialiased: bool) -> Splats:
 
 
 def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
-    """Append rows to a file.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Append rows to a file."""
     try:
         with path.open("ab") as file:
             file.write(np.ascontiguousarray(rows).data)
@@ -59,21 +55,13 @@ def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
 
 
 def write_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
-    """Write a file of rows, atomically; an existing file is replaced.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write a file of rows, atomically; an existing file is replaced."""
     with atomic_file(path, overwrite=True) as file:
         file.write(np.ascontiguousarray(rows).data)
 
 
 def sync(path: Path) -> None:
-    """Wait until a file is on the disk.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Wait until a file is on the disk."""
     try:
         with path.open("ab") as file:
             os.fsync(file.fileno())
@@ -82,11 +70,7 @@ def sync(path: Path) -> None:
 
 
 def read_rows(path: Path, sh_degree: int, count: int) -> Float32[np.ndarray, "N F"]:
-    """Read a file of ``count`` rows.
-
-    Raises:
-        OutputError: the file cannot be read, or has another size.
-    """
+    """Read a file of ``count`` rows."""
     try:
         values = np.fromfile(path, np.float32)
         size = path.stat().st_size
@@ -105,16 +89,10 @@ def chunk_depth(count: int, chunk: int) -> int:
 def leaf_groups(
     means: Float32[np.ndarray, "n 3"], leaf: int
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " e"]]:
-    """Split a chunk into leaves of at most ``leaf`` Gaussians of equal counts.
+    """Split a chunk into leaves of at most ``leaf`` Gaussians: indices, ascending within each leaf, and its edges."""
+    from kissgs.rendering.cpu.neighbours import leaves_of
 
-    Returns:
-        Indices of the Gaussians, leaf after leaf, ascending within each; and the edges of the leaves in it.
-    """
-    from kissgs.rendering.cpu.neighbours import split_into_leaves
-
-    order, edges = np.arange(len(means), dtype=np.int32), np.empty(4 * len(means) // leaf + 2, np.int64)
-    leaves = split_into_leaves(np.ascontiguousarray(means.T), leaf, order, edges)
-    edges = edges[: leaves + 1]
+    order, edges = leaves_of(means, leaf)
     for first, last in itertools.pairwise(edges):
         order[first:last].sort()
     return order.astype(np.int64), edges

@@ -19,16 +19,7 @@ SAVE_INTERVAL = 30.0
 
 
 class Checkpoint:
-    """An ``.npz`` file with the state of one piece of work.
-
-    Args:
-        path: the file; None: nothing is saved.
-        key: identifies the work by its input, settings and version; a state is loaded only under the same key.
-
-    Raises:
-        OutputError: the file is a checkpoint of other work or no checkpoint at all, so that it must not be overwritten,
-            or it cannot be read or written.
-    """
+    """An ``.npz`` file with the state of one piece of work."""
 
     def __init__(self, path: Path | None, key: str) -> None:
         self._path, self._key = path, key
@@ -64,11 +55,7 @@ class Checkpoint:
         )
 
     def save(self, state: Mapping[str, np.ndarray]) -> None:
-        """Save a state in place of the former one, completely or not at all.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Save a state in place of the former one, completely or not at all."""
         if self._path is None:
             return
         started = time.monotonic()
@@ -77,11 +64,6 @@ class Checkpoint:
             np.savez(file, **arrays)
         self._saved_at = time.monotonic()
         self._save_seconds = self._saved_at - started
-
-    def remove(self) -> None:
-        """Delete the file, once the result is saved."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
 
 
 def delete_checkpoints(*checkpoints: Path | None) -> None:
@@ -93,10 +75,6 @@ def delete_checkpoints(*checkpoints: Path | None) -> None:
 
 
 def finetune_checkpoint_path(checkpoint: Path) -> Path:
-    """Return the path of fine-tuning's checkpoint, given that of compaction.
-
-    Raises:
-        OutputError: ``checkpoint`` is a folder.
-    """
+    """Return the path of fine-tuning's checkpoint, given that of compaction."""
     refuse_existing(checkpoint, overwrite=True)
     return checkpoint.with_name(f"{checkpoint.stem}-finetune{checkpoint.suffix}")

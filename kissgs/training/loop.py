@@ -68,27 +68,16 @@ class Regularizer(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class TrainingPlan:
-    """Settings of a training.
+    """Settings of a training."""
 
-    Attributes:
-        stage: name of the stage in progress events.
-        pace: number of steps.
-        rates: learning rates.
-        ssim_weight: weight of 1 - SSIM in the loss, 0 to 1; the mean absolute difference has the rest.
-        mse_weight: weight of the mean squared difference, added to both.
-        seed: seed of the order of the images, one number or several.
-        regularizers: further loss terms.
-        batch: number of images in each step.
-    """
-
-    stage: str
+    stage: str  # in progress events
     pace: Pace
     rates: LrSchedule
-    ssim_weight: float
-    mse_weight: float
-    seed: Sequence[int]
+    ssim_weight: float  # of 1 - SSIM, 0 to 1; the mean absolute difference has the rest
+    mse_weight: float  # of the mean squared difference, added to both
+    seed: Sequence[int]  # of the order of the images
     regularizers: tuple[Regularizer, ...] = ()
-    batch: int = 1
+    batch: int = 1  # images in each step
 
 
 def train(
@@ -101,20 +90,10 @@ def train(
     threads: int = 0,
     progress: Progress = silent,
 ) -> None:
-    """Fit a scene to target images, from step ``first`` on.
+    """Fit a scene to target images, from step ``first`` on; ``after`` receives the number of steps done.
 
-    The loss is :func:`kissgs.rendering.differentiable.photometric_loss` plus the plan's regularizers. On the CPU, it
-    depends on the seed but not on the number of threads; on a GPU it is not reproducible.
-
-    Args:
-        scene: the scene to train; changed in place.
-        targets: cameras and target images.
-        plan: settings of the training.
-        first: number of steps already done; without a deadline of the plan.
-        after: called after each step with the number of steps done.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the plan's stage, with count, loss and PSNR to the targets as its note. If it raises, the
-            scene is in the state after the last completed step.
+    On the CPU, the result depends on the seed but not on the number of threads; on a GPU it is not reproducible. If
+    ``progress`` raises, the scene is in the state after the last completed step.
     """
     order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
     with torch_threads(threads), keep_free_memory():
@@ -220,13 +199,7 @@ def torch_threads(threads: int) -> Iterator[None]:
 
 
 def exponential_lr(base: Mapping[str, float], begin: Mapping[str, float], end: Mapping[str, float]) -> LrSchedule:
-    """Return learning rates that change exponentially from ``base · begin`` to ``base · end``, as in 3DGS for means.
-
-    Args:
-        base: learning rates by parameter.
-        begin: factor of each at the first step, above 0.
-        end: factor of each after the last step, above 0.
-    """
+    """Return learning rates that change exponentially from ``base · begin`` to ``base · end``, as in 3DGS for means."""
 
     def rates(done: float) -> dict[str, float]:
         return {name: rate * begin[name] * (end[name] / begin[name]) ** done for name, rate in base.items()}

@@ -47,13 +47,7 @@ class GaussianModel:
     def __init__(
         self, splats: Splats, device: Device = "cpu", extents: Float32[np.ndarray, " N"] | None = None
     ) -> None:
-        """Copy a scene.
-
-        Args:
-            splats: the scene, clean.
-            device: device of the tensors.
-            extents: ``(N,)`` unit of length, world units, of the learning rate of each position; 1 by default.
-        """
+        """Copy a scene."""
         extents = np.ones(len(splats), np.float32) if extents is None else extents
         self._adam = PrunableAdam(tensors_of(splats, device), BOUNDS, {"means": torch.from_numpy(extents)})
         self._rest = splats.select(slice(0))
@@ -122,14 +116,7 @@ class GaussianModel:
         device: Device = "cpu",
         extents: Float32[np.ndarray, " N"] | None = None,
     ) -> GaussianModel:
-        """Return a model that continues exactly from a :meth:`state`.
-
-        Args:
-            state: the state.
-            scene: a scene that is like the trained one in all but its Gaussians.
-            device: device of the tensors.
-            extents: those of the model whose state it is.
-        """
+        """Return a model that continues exactly from a :meth:`state`."""
         arrays: dict[str, Any] = {name: state[name] for name in ATTRIBUTES}
         model = cls(replace(scene, **arrays), device, extents)
         model._adam.restore(state)

@@ -57,21 +57,11 @@ def adam(
     last: int,
     constants: np.ndarray,
 ) -> None:
-    """Make a step with the rows ``first`` to ``last`` (exclusive) of a parameter; arrays are flat.
+    """Make a step with the rows ``first`` to ``last`` (exclusive) of a parameter of ``width`` numbers; all are flat.
 
-    Args:
-        values: the parameter, of ``width`` numbers per row; changed.
-        mean: first moments; changed.
-        square: second moments; changed.
-        rows: ``(R,)`` rows that have a gradient of their own, ascending.
-        gradient: the gradient of each of these.
-        everywhere: a gradient of all rows, which is added; empty for none.
-        factors: factor of the learning rate of each number; empty for 1.
-        width: number of numbers in a row.
-        first: first row.
-        last: end of the rows, exclusive.
-        constants: learning rate / (1 - beta1^t); 1 / sqrt(1 - beta2^t); the absolute value to which gradients are
-            clamped, NaN and infinite ones being 0; the smallest and the largest value that a step may reach.
+    ``gradient`` is that of ``rows``, which ascend; ``everywhere``, if not empty, is added for all rows; ``factors`` of
+    the learning rate may be empty for 1. ``constants``: learning rate / (1 - beta1^t); 1 / sqrt(1 - beta2^t); the
+    absolute value to which gradients are clamped; the smallest and the largest value that a step may reach.
     """
     rate, correction, most, smallest, largest = constants[0], constants[1], constants[2], constants[3], constants[4]
     zero, finite = np.float32(0), np.float32(3.4028234e38)
@@ -145,13 +135,7 @@ class PrunableAdam:
         bounds: Mapping[str, tuple[float, float]] | None = None,
         factors: Mapping[str, Tensor] | None = None,
     ) -> None:
-        """Copy the parameters.
-
-        Args:
-            values: initial float32 values by name. Rows are what :meth:`keep` selects.
-            bounds: smallest and largest value that a step may reach, by name; by default none.
-            factors: ``(N,)`` float32 factors of the learning rate of each row, by name; 1 by default.
-        """
+        """Copy the parameters."""
         self._bounds, factors = bounds or {}, factors or {}
         self._leaves = {name: _leaf(value.detach().clone(), factors.get(name)) for name, value in values.items()}
 
@@ -165,10 +149,6 @@ class PrunableAdam:
 
         Parameters without any gradient stay. NaN and infinite gradients count as 0, others are clamped to
         :data:`MAX_GRADIENT`. On the CPU, torch's number of threads is used; the result does not depend on it.
-
-        Args:
-            rates: learning rates by name.
-            rows: gradients of some rows, to which those of the tensors are added; for parameters on the CPU.
         """
         index, of_rows = (np.empty(0, np.int32), {}) if rows is None else rows
         parts: list[Callable[[], None]] = []

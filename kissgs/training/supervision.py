@@ -20,8 +20,6 @@ from kissgs.rendering.gsplat_backend import ImageRenderer, image_renderer
 from kissgs.rendering.rasterizer import Device, render
 from kissgs.settings.training import TrainingViewSettings
 
-# Supervision views: the views that train, score and evaluate a scene during compaction or fine-tuning.
-
 SCORING_STRIDE = 4
 """One in this many virtual training cameras scores Gaussians."""
 
@@ -46,37 +44,27 @@ MAX_EVAL_VIEWS = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SupervisionViews:
-    """Views by their role.
+    """Views by their role."""
 
-    Attributes:
-        train: training views, samples of larger photographs; none if nothing is trained.
-        score: views that score Gaussians: the training views of a capture and some synthetic ones, or some virtual
-            cameras and close-ups, each with a background of its own. Virtual ones have the usual dilation, so
-            that Gaussians between the sampled pixels of photographs count too.
-        test: evaluation views: held-out views, or some training views if there are none, whole. All have photographs or
-            none.
-        background: ``(3,)`` RGB from 0 to 1.
-        source: description of the training views.
-        captured: whether the training views are those of a capture.
-        note: note for the user, a sentence without capital and full stop; may be empty.
-        synthetic: number of the last training views, virtual ones beside a capture, which take turns.
-        synthetic_per_epoch: number of these in each epoch.
-    """
-
-    train: tuple[View, ...]
+    train: tuple[View, ...]  # samples of larger photographs; none if nothing is trained
     score: tuple[View, ...]
+    """Views that score Gaussians: the training views of a capture and some synthetic ones, or some virtual cameras and
+    close-ups, each with a background of its own. Virtual ones have the usual dilation, so that Gaussians between the
+    sampled pixels of photographs count too."""
+
     test: tuple[View, ...]
+    """Held-out views for evaluation, or some training views if there are none, whole; all have photographs or none."""
+
     background: Float32[np.ndarray, "3"]
-    source: str
-    captured: bool = False
+    source: str  # of the training views, in words
+    captured: bool = False  # whether the training views are those of a capture
     note: str = ""
-    synthetic: int = 0
+    synthetic: int = 0  # number of the last training views, virtual ones beside a capture, which take turns
     synthetic_per_epoch: int = 0
 
     def with_scoring(self, most: int) -> SupervisionViews:
         """Return these views, of which at most ``most`` score: every so many-th."""
-        chosen = np.unique(np.linspace(0, len(self.score) - 1, min(most, len(self.score))).astype(int))
-        return replace(self, score=tuple(self.score[n] for n in chosen))
+        return replace(self, score=_evenly_selected(self.score, min(most, len(self.score))))
 
     @property
     def eval_views(self) -> Views:
@@ -95,14 +83,8 @@ def supervision_views(
 ) -> SupervisionViews:
     """Return a capture's training views with virtual ones of the whole scene, or virtual views alone.
 
-    Args:
-        splats: the scene, finite.
-        views: views of a capture. Without training views, virtual ones train and the test views evaluate.
-        settings: number of virtual views, and image size; smaller images stay as they are.
-        scoring_stride: every so many-th virtual view scores. 1: no view trains, so that :data:`SCORING_STRIDE` times
-            fewer are drawn; 0: none scores.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the stage ``"cameras"``.
+    Every ``scoring_stride``-th virtual view scores. 1: no view trains, so that :data:`SCORING_STRIDE` times fewer are
+    drawn; 0: none scores.
     """
     if views is None or not views.train:
         virtual = _virtual_views(splats, settings, scoring_stride, threads, progress)
@@ -188,12 +170,8 @@ def _note(views: Views) -> str:
 
 def _evaluation_views(views: Views) -> tuple[View, ...]:
     """Return the evaluation views of a capture: all with photographs, or none."""
-    return tuple(_evenly_selected(_photographed(views.test or views.train)))
-
-
-def _photographed(views: Sequence[View]) -> Sequence[View]:
-    """Return the views with a photograph, or all if none has one."""
-    return [view for view in views if view.photo is not None] or views
+    chosen = views.test or views.train
+    return _evenly_selected([view for view in chosen if view.photo is not None] or chosen)
 
 
 def _virtual_views(
@@ -214,7 +192,7 @@ def _virtual_views(
     return SupervisionViews(
         train=drawn.train,
         score=scoring,
-        test=tuple(_evenly_selected(drawn.test or drawn.train)),
+        test=_evenly_selected(drawn.test or drawn.train),
         background=drawn.background,
         source=f"{len(drawn.train)} virtual camera{'' if len(drawn.train) == 1 else 's'}"
         + (f", and {close_up_count} close-ups that score" if close_up_count else ""),
@@ -249,9 +227,9 @@ def _thinned(view: View, number: int, size: int) -> View:
     return view.sampled(stride, (min(number % stride, width - 1), min(number // stride % stride, height - 1)))
 
 
-def _evenly_selected(views: Sequence[View]) -> list[View]:
-    selected = np.unique(np.linspace(0, len(views) - 1, MAX_EVAL_VIEWS).astype(int))
-    return [views[n] for n in selected]
+def _evenly_selected(views: Sequence[View], most: int = MAX_EVAL_VIEWS) -> tuple[View, ...]:
+    selected = np.unique(np.linspace(0, len(views) - 1, most).astype(int))
+    return tuple(views[n] for n in selected)
 
 
 # Training targets: cameras with photographs, or with renderings of the original scene.
@@ -262,22 +240,13 @@ NEAREST_CAMERAS, EXTENT_RATIO = 4, 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingTargets:
-    """Cameras and their target images.
-
-    Attributes:
-        cameras: one or more cameras.
-        images: ``(H, W, 3)`` target of each camera: a photograph in uint8, or a rendering in float16 from 0 to 1.
-        backgrounds: ``(3,)`` RGB from 0 to 1 of each camera.
-        target_source: "photos" if any target is a photograph, else "renderings".
-        synthetic: number of the last cameras, virtual ones beside a capture, which take turns.
-        synthetic_per_epoch: number of these that have a step in each epoch, at most ``synthetic``.
-    """
+    """Cameras and their target images."""
 
     cameras: tuple[Camera, ...]
-    images: tuple[Shaped[np.ndarray, "H W 3"], ...]
+    images: tuple[Shaped[np.ndarray, "H W 3"], ...]  # photographs in uint8, renderings in float16 from 0 to 1
     backgrounds: tuple[Float32[np.ndarray, "3"], ...]
-    target_source: Literal["photos", "renderings"]
-    synthetic: int = 0
+    target_source: Literal["photos", "renderings"]  # "photos" if any is
+    synthetic: int = 0  # see SupervisionViews
     synthetic_per_epoch: int = 0
 
     def __len__(self) -> int:
@@ -320,10 +289,6 @@ class TrainingTargets:
         If a scene has several objects with cameras around each, the extent of all cameras does not represent the size
         of one object. For a scene of one object, most points get ``largest``. Synthetic cameras count: an object that
         was not photographed has no others.
-
-        Args:
-            means: ``(N, 3)`` points, world units.
-            largest: upper limit, world units.
         """
         positions = np.array([camera.position for camera in self.cameras])
         nearest = np.full((len(means), min(NEAREST_CAMERAS, len(positions))), np.inf)
@@ -345,19 +310,7 @@ def training_targets(
     device: Device = "cpu",
     progress: Progress = silent,
 ) -> TrainingTargets:
-    """Load the photographs of the training views, and render ``reference`` for those that have none.
-
-    Args:
-        reference: the original scene, finite.
-        supervision: one or more training views.
-        threads: number of threads; 0 means one per processor.
-        device: device that renders.
-        progress: receives the stage ``"targets"``.
-
-    Raises:
-        InvalidViewsError: a photograph cannot be read.
-        UnsupportedError: an image would take too much memory.
-    """
+    """Load the photographs of the training views, and render ``reference`` for those that have none."""
     views, background = supervision.train, supervision.background
     renderer, images = _renderer(reference, threads, device), []
     backgrounds = tuple(background if view.background is None else view.background for view in views)

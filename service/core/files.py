@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import kissgs
+from kissgs.formats import UPLOADS
 
 Format = Literal["sogxt", "sog"]
 """Names of the library's containers."""
@@ -18,10 +19,8 @@ DEFAULT: Format = "sogxt"
 class ContainerFile:
     """Ending and media type of a container.
 
-    Attributes:
-        ending: ending of the file's name.
-        media_type: type of the response. A ``.sog`` is a zip as well, but some browsers unpack what is called a zip, or
-            change the ending of its name; SOG has no registered type of its own.
+    A ``.sog`` is a zip as well, but some browsers unpack what is called a zip, or change the ending of its name; SOG
+    has no registered type of its own.
     """
 
     ending: str
@@ -38,7 +37,7 @@ CONTAINER_FILES: dict[Format, ContainerFile] = {
     "sog": ContainerFile(".sog", "application/octet-stream"),
 }
 
-UPLOAD_FILES = ("scene.ply", "scene.sog", "scene.spz", "scene.splat", "scene.ksplat", "scene.glb")
+UPLOAD_FILES = tuple(f"scene{ending}" for ending in UPLOADS.values())
 """Names of a job's upload, of which it has one: the ending tells formats that are not recognised by their content."""
 
 
@@ -49,9 +48,6 @@ def container_file(options: dict[str, Any]) -> ContainerFile:
 
 BYTES_PER_GAUSSIAN = (68, 104, 164, 248)
 """Bytes per Gaussian of a ``.ply``, by SH degree."""
-
-RESULT_BYTES_PER_GAUSSIAN, RESULT_BYTES = 64, 32 << 20
-"""Upper bound for a result, which has every file of its container twice: per Gaussian, and for codebooks and report."""
 
 STEPS_BYTES = 300_000
 """Upper bound for a checkpoint's record of completed steps, at the largest step count that the settings allow."""

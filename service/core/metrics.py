@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, ProcessCollector
 from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest
 
@@ -18,49 +20,32 @@ class Metrics:
     """All metrics of one service, in a separate registry."""
 
     def __init__(self) -> None:
-        self.registry = CollectorRegistry()
-        r = self.registry
+        self.registry = r = CollectorRegistry()
+        gauge, counter = partial(Gauge, registry=r), partial(Counter, registry=r)
+        histogram, seconds = partial(Histogram, registry=r), partial(Histogram, registry=r, buckets=_SECONDS)
         ProcessCollector(registry=r)
         Info("kissgs_build", "Version of the software.", registry=r).info({"version": kissgs.__version__})
-        self.queue_limit = Gauge("kissgs_queue_limit", "Maximum number of waiting jobs.", registry=r)
-        self.jobs = Gauge("kissgs_jobs", "Jobs by state.", ["state"], registry=r)
-        self.busy = Gauge("kissgs_workers_busy", "Jobs with a running process.", registry=r)
-        self.disk = Gauge("kissgs_disk_bytes", "Bytes on disk of the files of all jobs.", registry=r)
-        self.uploads = Gauge("kissgs_uploads_in_flight", "Uploads in progress.", registry=r)
-        self.submitted = Counter("kissgs_jobs_submitted", "Jobs accepted, by preset.", ["preset"], registry=r)
-        self.ended = Counter("kissgs_jobs_ended", "Jobs ended, by state and code.", ["state", "code"], registry=r)
-        self.restarts = Counter("kissgs_job_restarts", "Jobs restarted after a crash.", registry=r)
-        self.bytes_in = Counter("kissgs_upload_bytes", "Bytes of accepted uploads.", registry=r)
-        self.bytes_out = Counter("kissgs_container_bytes", "Bytes of encoded containers.", registry=r)
-        self.waited = Histogram("kissgs_queue_seconds", "Seconds from upload to start.", buckets=_SECONDS, registry=r)
-        self.ran = Histogram(
-            "kissgs_job_seconds", "Seconds from start to end, by preset.", ["preset"], buckets=_SECONDS, registry=r
-        )
-        self.stages = Histogram(
-            "kissgs_stage_seconds", "Seconds per stage of a job.", ["stage"], buckets=_SECONDS, registry=r
-        )
-        self.ratio = Histogram(
-            "kissgs_ratio",
-            "Upload bytes divided by container bytes.",
-            buckets=(2, 5, 8, 10, 12, 15, 20, 25, 30, 40, 60, 100),
-            registry=r,
-        )
-        self.per_second = Histogram(
-            "kissgs_gaussians_per_second",
-            "Gaussians per second of a job.",
-            buckets=(1e3, 3e3, 1e4, 3e4, 1e5, 3e5, 1e6, 3e6),
-            registry=r,
-        )
-        self.requests = Counter(
-            "kissgs_http_requests", "Requests by method, route and status.", ["method", "route", "status"], registry=r
-        )
-        self.latency = Histogram(
-            "kissgs_http_seconds",
-            "Seconds to the first byte of the response, by route.",
-            ["route"],
-            buckets=(0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 5, 30),
-            registry=r,
-        )
+        self.queue_limit = gauge("kissgs_queue_limit", "Maximum number of waiting jobs.")
+        self.jobs = gauge("kissgs_jobs", "Jobs by state.", ["state"])
+        self.busy = gauge("kissgs_workers_busy", "Jobs with a running process.")
+        self.disk = gauge("kissgs_disk_bytes", "Bytes on disk of the files of all jobs.")
+        self.uploads = gauge("kissgs_uploads_in_flight", "Uploads in progress.")
+        self.submitted = counter("kissgs_jobs_submitted", "Jobs accepted, by preset.", ["preset"])
+        self.ended = counter("kissgs_jobs_ended", "Jobs ended, by state and code.", ["state", "code"])
+        self.restarts = counter("kissgs_job_restarts", "Jobs restarted after a crash.")
+        self.bytes_in = counter("kissgs_upload_bytes", "Bytes of accepted uploads.")
+        self.bytes_out = counter("kissgs_container_bytes", "Bytes of encoded containers.")
+        self.waited = seconds("kissgs_queue_seconds", "Seconds from upload to start.")
+        self.ran = seconds("kissgs_job_seconds", "Seconds from start to end, by preset.", ["preset"])
+        self.stages = seconds("kissgs_stage_seconds", "Seconds per stage of a job.", ["stage"])
+        ratios = (2, 5, 8, 10, 12, 15, 20, 25, 30, 40, 60, 100)
+        self.ratio = histogram("kissgs_ratio", "Upload bytes divided by container bytes.", buckets=ratios)
+        rates = (1e3, 3e3, 1e4, 3e4, 1e5, 3e5, 1e6, 3e6)
+        self.per_second = histogram("kissgs_gaussians_per_second", "Gaussians per second of a job.", buckets=rates)
+        labels = ["method", "route", "status"]
+        self.requests = counter("kissgs_http_requests", "Requests by method, route and status.", labels)
+        text, times = "Seconds to the first byte of the response, by route.", (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05)
+        self.latency = histogram("kissgs_http_seconds", text, ["route"], buckets=(*times, 0.1, 0.25, 0.5, 1, 5, 30))
 
     def job_ended(self, job: Job, state: State, seconds: float | None) -> None:
         """Record a job that has ended after running for ``seconds``; None if it never started."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib.util import find_spec
 
 import kissgs
@@ -14,11 +15,31 @@ MEASURED_BY = "kissgs compress fox.ply, kissgs evaluate fox.ply fox.zip --views 
 EVALUATION = 60.0
 """Approximate CPU seconds per million Gaussians to decode, select 24 cameras, and render two small images from each."""
 
-_FACTS: dict[kissgs.Preset, tuple[str, str, float, float, float]] = {
-    kissgs.Preset.FAST: ("Fast", "Takes seconds; for previews and quick checks.", 13.02, -0.37, 13),
-    kissgs.Preset.BALANCED: ("Balanced", "The best quality for its size. The default.", 11.90, -0.28, 205),
-    kissgs.Preset.SMALL: ("Small", "Slightly smaller, and slower.", 11.71, -0.27, 380),
-    kissgs.Preset.PAPER: ("Paper", "KISS-GS as published, for comparison.", 17.20, -0.36, 260),
+
+@dataclass(frozen=True, slots=True)
+class _Facts:
+    """Texts and figures of a preset, and approximate CPU seconds: a fixed part, and a part per million Gaussians."""
+
+    title: str
+    text: str
+    bytes_per_gaussian: float
+    psnr_change: float
+    encoding: float  # per million Gaussians
+    training: tuple[float, float]  # of a compaction to one fifth
+    tuning: tuple[float, float]  # of all Gaussians
+
+
+_FACTS: dict[kissgs.Preset, _Facts] = {
+    kissgs.Preset.FAST: _Facts(
+        "Fast", "Takes seconds; for previews and quick checks.", 13.02, -0.37, 13, (10, 120), (50, 300)
+    ),
+    kissgs.Preset.BALANCED: _Facts(
+        "Balanced", "The best quality for its size. The default.", 11.90, -0.28, 205, (300, 600), (50, 1300)
+    ),
+    kissgs.Preset.SMALL: _Facts("Small", "Slightly smaller, and slower.", 11.71, -0.27, 380, (600, 1200), (100, 2600)),
+    kissgs.Preset.PAPER: _Facts(
+        "Paper", "KISS-GS as published, for comparison.", 17.20, -0.36, 260, (700, 2000), (1000, 40_000)
+    ),
 }
 
 
@@ -31,14 +52,14 @@ def presets() -> Presets:
         presets=[
             PresetFacts(
                 name=name,
-                title=title,
-                description=text,
+                title=facts.title,
+                description=facts.text,
                 settings=kissgs.Settings(preset=name).model_dump(mode="json"),
-                bytes_per_gaussian=size,
-                psnr_change=change,
-                cpu_seconds_per_million=seconds,
+                bytes_per_gaussian=facts.bytes_per_gaussian,
+                psnr_change=facts.psnr_change,
+                cpu_seconds_per_million=facts.encoding,
             )
-            for name, (title, text, size, change, seconds) in _FACTS.items()
+            for name, facts in _FACTS.items()
         ],
     )
 
@@ -48,24 +69,6 @@ START_SECONDS = 1.0
 
 BUSY_CORES = 1.8
 """Average number of busy cores on a two-core server."""
-
-
-TRAINING = {
-    kissgs.Preset.FAST: (10.0, 120.0),
-    kissgs.Preset.BALANCED: (300.0, 600.0),
-    kissgs.Preset.SMALL: (600.0, 1200.0),
-    kissgs.Preset.PAPER: (700.0, 2000.0),
-}
-"""Approximate CPU seconds of a compaction to one fifth: a fixed part, and a part per million Gaussians."""
-
-
-FINETUNING = {
-    kissgs.Preset.FAST: (50.0, 300.0),
-    kissgs.Preset.BALANCED: (50.0, 1300.0),
-    kissgs.Preset.SMALL: (100.0, 2600.0),
-    kissgs.Preset.PAPER: (1000.0, 40_000.0),
-}
-"""Approximate CPU seconds to fine-tune all Gaussians: a fixed part, and a part per million Gaussians."""
 
 SEARCH_FACTOR = 4.0
 """Factor on the total time of a job that searches for a goal, which encodes several times."""
@@ -80,10 +83,10 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     ``kind`` is :attr:`service.core.schemas.JobOptions.kind`.
     """
     name, *stages = kind.split("+")
-    preset, millions = kissgs.Preset(name), gaussians / 1e6
-    encoding = (_FACTS[preset][4] + evaluate * EVALUATION) * millions
+    facts, millions = _FACTS[kissgs.Preset(name)], gaussians / 1e6
+    encoding = (facts.encoding + evaluate * EVALUATION) * millions
     compacts, tunes, searches = (suffix.removeprefix("+") in stages for suffix in (COMPACTED, FINETUNED, SEARCHED))
-    training, tuning = (fixed + per_million * millions for fixed, per_million in (TRAINING[preset], FINETUNING[preset]))
+    training, tuning = (fixed + per_million * millions for fixed, per_million in (facts.training, facts.tuning))
     if compacts and tunes and searches:
         return START_SECONDS + (SEARCH_FACTOR * encoding + training + TUNED_CONTAINERS * tuning) / BUSY_CORES
     cpu = encoding + compacts * training + tunes * tuning

@@ -123,6 +123,16 @@ def problem(code: str, detail: str, *, errors: list[dict[str, Any]] | None = Non
     )
 
 
+def invalid(detail: str) -> ProblemError:
+    """Return the problem of an invalid request."""
+    return ProblemError("invalid-request", detail)
+
+
+def disk_full(detail: str) -> ProblemError:
+    """Return the problem of a full disk."""
+    return ProblemError("disk-full", detail, retry_after=600)
+
+
 def unusable_database() -> ProblemError:
     """Return the problem of a failing database; its cause appears only in the log and in ``/readyz``."""
     return ProblemError("database", "the job database cannot be used for now; try again later", retry_after=5)

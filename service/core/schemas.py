@@ -220,7 +220,7 @@ class PresetFacts(ApiModel):
     name: kissgs.Preset
     title: str
     description: str
-    settings: dict[str, Any] = Field(description="All settings of the preset.")
+    settings: dict[str, Any] = Field(description="All values of the preset; options change what JobOptions lists.")
     bytes_per_gaussian: float = Field(
         description="Container bytes per Gaussian, measured on the scene that `measured_on` names."
     )

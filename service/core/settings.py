@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, BeforeValidator, ByteSize, ConfigDict, Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 PREFIX = "KISSGS_"
@@ -24,6 +24,13 @@ OWNER = r"[A-Za-z0-9._@-]{1,64}"
 """Valid names of key owners."""
 
 Seconds = Annotated[float, Field(gt=0, le=10 * 365 * 86400)]
+
+
+Words = Annotated[
+    tuple[str, ...],
+    BeforeValidator(lambda value: _words(value.lower()) if isinstance(value, str) else value),
+]
+"""Words of a text, in lower case, as browsers send them."""
 
 
 class SettingsError(Exception):
@@ -53,10 +60,10 @@ class ServiceSettings(BaseSettings):
         (),
         description="Keys as owner:sha256 (created by `kissgs-serve key`); without keys, everyone may use the service.",
     )
-    names: Annotated[tuple[str, ...], NoDecode] = Field(
+    names: Annotated[Words, NoDecode] = Field(
         (), description="Accepted host names; by default localhost if the service listens there without keys, else all."
     )
-    cors_origins: Annotated[tuple[str, ...], NoDecode] = Field(
+    cors_origins: Annotated[Words, NoDecode] = Field(
         (), description="Origins whose web pages may use the service (CORS); none by default."
     )
 
@@ -94,9 +101,10 @@ class ServiceSettings(BaseSettings):
     )
 
     keep_seconds: Seconds = Field(86400, description="Seconds for which results are kept after a job has ended.")
-    drain_seconds: float = Field(20, ge=0, description="Seconds that a stopping service waits for running jobs.")
 
     # What no operator needs to choose.
+    drain_seconds: ClassVar[float] = 20
+    """Seconds that a stopping service waits for running jobs, before it puts them back into the queue."""
     max_header_bytes: ClassVar[int] = 64 << 10
     """Maximum bytes of a .ply header: one with all known properties has three thousand."""
     upload_idle_seconds: ClassVar[float] = 30
@@ -130,19 +138,13 @@ class ServiceSettings(BaseSettings):
             keys.append({"owner": found[1], "sha256": found[2]})
         return keys
 
-    @field_validator("names", mode="before")
+    @field_validator("cors_origins")
     @classmethod
-    def _split_names(cls, value: Any) -> Any:  # noqa: ANN401
-        return [word.lower() for word in _words(value)] if isinstance(value, str) else value
-
-    @field_validator("cors_origins", mode="before")
-    @classmethod
-    def _split_origins(cls, value: Any) -> Any:  # noqa: ANN401
-        origins = _words(value) if isinstance(value, str) else value
-        for origin in origins:
+    def _check_origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for origin in value:
             if not re.fullmatch(r"\*|https?://[^/\s]+", origin):
                 raise ValueError(f"{origin!r} is not an origin such as https://example.org")
-        return [origin.lower() for origin in origins]  # as browsers send them
+        return value
 
     @property
     def max_uploads_of_one(self) -> int:
@@ -167,11 +169,7 @@ class ServiceSettings(BaseSettings):
 
     @classmethod
     def from_environment(cls) -> Self:
-        """Read ``KISSGS_*``.
-
-        Raises:
-            SettingsError: there are unknown names or invalid values; the message lists all of them.
-        """
+        """Read ``KISSGS_*``; a :class:`SettingsError` lists all unknown names and invalid values."""
         known = {PREFIX + name.upper() for name in cls.model_fields}
         given = {name for name in os.environ if name.upper().startswith(PREFIX)}
         unknown = sorted(name for name in given if name.upper() not in known | CLIENT_NAMES)

@@ -23,7 +23,7 @@ import kissgs
 from ..core.clock import Clock
 from ..core.metrics import Metrics
 from ..core.notifier import JobNotifier
-from ..core.problems import Problem, ProblemError, answer, field_errors, unusable_database
+from ..core.problems import Problem, ProblemError, answer, disk_full, field_errors, unusable_database
 from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings, SettingsError
 from ..jobs.admission import Admission
@@ -60,11 +60,7 @@ log = logging.getLogger("kissgs.service")
 
 
 def create_app(settings: ServiceSettings) -> FastAPI:
-    """Create the service as an ASGI application. Opens its data folder and database and recovers unfinished jobs.
-
-    Raises:
-        SettingsError: the data folder or the database cannot be used.
-    """
+    """Create the service as an ASGI application. Opens its data folder and database and recovers unfinished jobs."""
     context = _build_and_recover(settings)
     app = FastAPI(
         title="kissgs",
@@ -107,9 +103,7 @@ def _build_and_recover(settings: ServiceSettings) -> ServiceContainer:
         try:
             recover(context)
         except BaseException:
-            context.worker.runners.close()
-            context.store.close()
-            context.storage.close()
+            context.close()
             raise
     except kissgs.RunnerError as error:
         raise SettingsError(f"KISSGS_RUNNER: jobs cannot run on a Ray cluster: {error}") from error
@@ -122,17 +116,13 @@ def _build_and_recover(settings: ServiceSettings) -> ServiceContainer:
 
 def build(settings: ServiceSettings) -> ServiceContainer:
     """Create all parts of a service without starting them."""
-    storage, clock = JobStorage(settings.data_dir), Clock()
-    try:
+    with contextlib.ExitStack() as opened:
+        storage, clock = JobStorage(settings.data_dir), Clock()
+        opened.callback(storage.close)
         store = open_store(storage, clock)
-        try:
-            runners = JobRunners.open(settings)
-        except BaseException:
-            store.close()
-            raise
-    except BaseException:
-        storage.close()
-        raise
+        opened.callback(store.close)
+        runners = JobRunners.open(settings)
+        opened.pop_all()  # the service closes them
     storage.remove_unfinished(store.ids())
     clock.start_after(store.latest_time())
     storage.keep_reserve()
@@ -163,9 +153,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await run_sync(context.worker.runners.close)
-        context.store.close()
-        context.storage.close()
+        await run_sync(context.close)
 
 
 def _answer_errors(app: FastAPI) -> None:
@@ -183,11 +171,8 @@ def _answer_errors(app: FastAPI) -> None:
         headers = dict(error.headers or {})
         match error.status_code:
             case HTTPStatus.NOT_FOUND:
-                return answer(
-                    ProblemError(
-                        "not-found", f"{request.scope['path'][:200]} does not exist; /openapi.json lists all paths"
-                    )
-                )
+                text = f"{request.scope['path'][:200]} does not exist; /openapi.json lists all paths"
+                return answer(ProblemError("not-found", text))
             case HTTPStatus.METHOD_NOT_ALLOWED:
                 allowed = _allowed(request.scope["path"])
                 text = f"{request.method[:20]} is not allowed for this path; use {allowed}"
@@ -203,7 +188,7 @@ def _answer_errors(app: FastAPI) -> None:
     async def database(request: Request, error: SQLAlchemyError) -> JSONResponse:
         log.error("the job database failed: %s", error)
         if is_full(error):
-            return answer(ProblemError("disk-full", "the server's disk is full; try again later", retry_after=600))
+            return answer(disk_full("the server's disk is full; try again later"))
         return answer(unusable_database())
 
 

@@ -57,12 +57,7 @@ class StrictConnection(h11.Connection):
     """h11 that refuses requests whose end other programs may see elsewhere, and take the rest for a request."""
 
     def next_event(self) -> h11.Event | type[h11.NEED_DATA] | type[h11.PAUSED]:
-        """Return the next event.
-
-        Raises:
-            h11.RemoteProtocolError: the request is invalid, or has Transfer-Encoding and either a Content-Length or
-                HTTP/1.0, which has no chunks.
-        """
+        """Return the next event."""
         event = super().next_event()
         if isinstance(event, h11.Request):
             names = {name for name, _ in event.headers}
@@ -175,11 +170,7 @@ def allow_connections() -> None:
 
 
 def listen(settings: ServiceSettings) -> socket.socket:
-    """Open the listening socket.
-
-    Raises:
-        SettingsError: the port is in use, or the address does not belong to this machine.
-    """
+    """Open the listening socket."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
         listener = socket.create_server((settings.host, settings.port), family=family, backlog=2048)

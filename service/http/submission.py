@@ -17,9 +17,8 @@ from starlette.requests import Request
 from ..core.files import checkpoint_bytes
 from ..core.models import Job
 from ..core.presets import can_train
-from ..core.problems import ProblemError, field_errors, unusable_database
+from ..core.problems import ProblemError, disk_full, field_errors, invalid, unusable_database
 from ..core.schemas import JobOptions
-from ..jobs.admission import FULL_SECONDS
 from ..jobs.container import ServiceContainer
 from ..jobs.worker import QUEUE
 from ..storage.job_records import LimitExceeded
@@ -61,9 +60,6 @@ async def submit(
     Returns:
         The job, and whether it is new. A repeated idempotency key with an identical scene and options gives the
         existing job.
-
-    Raises:
-        ProblemError: the request is invalid, or a limit or the state of the service prevents the submission.
     """
     if context.worker.draining:
         raise ProblemError("stopping", "the service is stopping; try again in a minute", retry_after=60)
@@ -106,23 +102,20 @@ async def submit(
 
 
 def parse_options(text: str | bytes) -> JobOptions:
-    """Parse options from JSON.
-
-    Raises:
-        ProblemError: they are invalid; the problem lists every invalid field. Or they cannot be met on this server.
-    """
+    """Parse options from JSON; the problem of invalid ones lists every invalid field."""
     try:
         options = JobOptions.model_validate_json(text).decided(photographs=None, torch=can_train())
     except ValidationError as error:
         named, found = field_errors(error.errors())
         raise ProblemError(
-            "invalid-request", f"the options are invalid: {named}; GET /v1/presets lists all settings", errors=found
+            "invalid-request",
+            f"the options are invalid: {named}; JobOptions in /openapi.json lists all settings",
+            errors=found,
         ) from error
     if options.trains and not can_train():
-        raise ProblemError(
-            "invalid-request",
+        raise invalid(
             "these options need torch, which this server does not have; use preset fast without fine-tuning, or "
-            "compact with method merge, or ask the operator to install the extra train",
+            "compact with method merge, or ask the operator to install the extra train"
         )
     return options
 
@@ -172,9 +165,8 @@ async def _form_bytes(context: ServiceContainer, request: Request, spool: Spool)
         yield chunk
         received += len(chunk)
         if received - spool.size > MAX_FORM_BYTES + len(chunk):
-            raise ProblemError(
-                "invalid-request",
-                f"the form has more than {MAX_FORM_BYTES} bytes beside the scene, which is the limit; send less",
+            raise invalid(
+                f"the form has more than {MAX_FORM_BYTES} bytes beside the scene, which is the limit; send less"
             )
 
 
@@ -193,14 +185,9 @@ async def _receive_form(
         match event:
             case PartBegin(field, filename):
                 if field not in ("file", "options"):
-                    raise ProblemError(
-                        "invalid-request",
-                        f"the form has an unknown field {field[:40]!r}; send 'file' and 'options' only",
-                    )
+                    raise invalid(f"the form has an unknown field {field[:40]!r}; send 'file' and 'options' only")
                 if field in seen:
-                    raise ProblemError(
-                        "invalid-request", f"the form has the field {field!r} twice; send each field once"
-                    )
+                    raise invalid(f"the form has the field {field!r} twice; send each field once")
                 seen.append(field)
                 name = name or filename if field == "file" else name
                 spool.name = filename or name or "" if field == "file" else spool.name
@@ -209,14 +196,11 @@ async def _receive_form(
             case PartData(data):
                 text += data
                 if len(text) > MAX_OPTIONS_BYTES:
-                    raise ProblemError(
-                        "invalid-request",
-                        f"the options exceed {MAX_OPTIONS_BYTES} bytes, which is the limit; send less",
-                    )
+                    raise invalid(f"the options exceed {MAX_OPTIONS_BYTES} bytes, which is the limit; send less")
     if "file" not in seen:
-        raise ProblemError("invalid-request", "the form has no field 'file'; send the scene in it")
+        raise invalid("the form has no field 'file'; send the scene in it")
     if "options" in seen and options is not None:
-        raise ProblemError("invalid-request", "the options are both in the form and in the URL; send them once")
+        raise invalid("the options are both in the form and in the URL; send them once")
     if "options" in seen:
         options = parse_options(bytes(text))
     return Submission(await spool.finish(), options or JobOptions(), scene_name(name), key)
@@ -261,7 +245,7 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
             return known, False  # a concurrent request with the same key was faster
         if isinstance(error, OSError):
             text = f"the upload cannot be stored: {(error.strerror or str(error)).lower()}; try again later"
-            raise ProblemError("disk-full", text, retry_after=FULL_SECONDS) from error
+            raise disk_full(text) from error
         raise
 
 

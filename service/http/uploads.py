@@ -20,10 +20,11 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect, Request
 
 import kissgs
+from kissgs.formats import DOUBLE_ENDINGS, UPLOADS, alternatives
 
-from ..core.problems import ProblemError
+from ..core.problems import ProblemError, disk_full, invalid
 from ..core.settings import ServiceSettings
-from ..jobs.admission import FULL_SECONDS, Admission
+from ..jobs.admission import Admission
 
 MAX_PART_HEADER_BYTES = 8192
 
@@ -91,7 +92,7 @@ class _Parser:
     def _counted(self, data: bytes) -> bytes:
         self._size += len(data)
         if self._size > MAX_PART_HEADER_BYTES:
-            raise ProblemError("invalid-request", f"the headers of a part take more than {MAX_PART_HEADER_BYTES} bytes")
+            raise invalid(f"the headers of a part take more than {MAX_PART_HEADER_BYTES} bytes")
         return data
 
     def _end_header(self) -> None:
@@ -102,9 +103,7 @@ class _Parser:
         disposition = self._headers.get(b"content-disposition", b"")
         _, options = parse_options_header(disposition)
         if b"name" not in options:
-            raise ProblemError(
-                "invalid-request", "a part of the form has no field name; send the fields 'file' and 'options'"
-            )
+            raise invalid("a part of the form has no field name; send the fields 'file' and 'options'")
         filename = _extended_name(disposition)
         if filename is None and b"filename" in options:
             filename = options[b"filename"].decode("utf-8", "replace")
@@ -145,9 +144,7 @@ class _Preamble:
         self._head += chunk
         found = self._line.search(self._head)
         if (found.start() if found else len(self._head)) > MAX_PREAMBLE_BYTES + len(self._boundary):
-            raise ProblemError(
-                "invalid-request", f"the form has more than {MAX_PREAMBLE_BYTES} bytes before its first boundary"
-            )
+            raise invalid(f"the form has more than {MAX_PREAMBLE_BYTES} bytes before its first boundary")
         if not found:
             return b""
         self.over = True
@@ -155,30 +152,22 @@ class _Preamble:
 
 
 async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterator[PartBegin | PartData]:
-    """Yield the parts of a form in the order in which they arrive.
-
-    Raises:
-        ProblemError: the form is invalid or incomplete.
-    """
+    """Yield the parts of a form in the order in which they arrive."""
     _, options = parse_options_header(content_type)
     boundary = options.get(b"boundary", b"")
     if not 1 <= len(boundary) <= 256:
-        raise ProblemError(
-            "invalid-request", "the Content-Type has no valid boundary; let your HTTP library generate the header"
-        )
+        raise invalid("the Content-Type has no valid boundary; let your HTTP library generate the header")
     try:
         parser, preamble = _Parser(boundary), _Preamble(boundary)
         async for chunk in chunks:
             for event in parser.feed(preamble.feed(chunk)):
                 yield event
     except FormParserError as error:
-        raise ProblemError("invalid-request", f"the form cannot be read: {error}") from error
+        raise invalid(f"the form cannot be read: {error}") from error
     if not preamble.over:
-        raise ProblemError(
-            "invalid-request", "the form has no line with its boundary; let your HTTP library generate the body"
-        )
+        raise invalid("the form has no line with its boundary; let your HTTP library generate the body")
     if not parser.complete:
-        raise ProblemError("invalid-request", "the form ends before its last boundary; send it again")
+        raise invalid("the form ends before its last boundary; send it again")
 
 
 BLOCK_BYTES = 1 << 20
@@ -186,9 +175,6 @@ BLOCK_BYTES = 1 << 20
 
 LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")
 """Last line of a header, matched as a whole because a comment may end with ``end_header``."""
-
-UPLOAD_ENDINGS = {"ply": "ply", "sog": "sog", "spz": "spz", "splat": "splat", "ksplat": "ksplat", "gltf": "glb"}
-"""Formats of uploads, and their file endings: all that are one file."""
 
 HEAD_BYTES = 512
 """Bytes from which a format is recognised."""
@@ -219,7 +205,7 @@ class Received:
     @property
     def file_name(self) -> str:
         """Name of the upload in the folder of its job."""
-        return f"scene.{UPLOAD_ENDINGS[self.info.format]}"
+        return f"scene{UPLOADS[self.info.format]}"
 
 
 class Spool:
@@ -254,11 +240,7 @@ class Spool:
         return self._size
 
     async def write(self, data: bytes) -> None:
-        """Process the next bytes.
-
-        Raises:
-            ProblemError: the scene is invalid, exceeds a limit, or does not fit on the disk.
-        """
+        """Process the next bytes, unless the scene is invalid, exceeds a limit, or does not fit on the disk."""
         line = max(self._pending.rfind(b"\n"), 0)  # start of the last line, which may continue
         self._pending += data
         self._size += len(data)
@@ -274,11 +256,7 @@ class Spool:
             await run_sync(self._flush)
 
     async def finish(self) -> Received:
-        """Write the remaining bytes to disk and validate the upload.
-
-        Raises:
-            ProblemError: as :meth:`write`.
-        """
+        """Write the remaining bytes to disk and validate the upload."""
         await run_sync(self._close)
         async with self._admission.parsing:
             info = await run_sync(self._read_info)
@@ -322,17 +300,17 @@ class Spool:
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             text = f"the upload cannot be written: {reason}; try again later"
-            raise ProblemError("disk-full", text, retry_after=FULL_SECONDS) from error
+            raise disk_full(text) from error
 
     def _read_info(self) -> kissgs.SceneInfo:
         """Read the headers of the complete upload; refuse formats that are not one binary file."""
         name = f"upload{Path(self.name).suffix}"
         try:
             kind = kissgs.recognise(self._path, name=name)
-            if kind not in UPLOAD_ENDINGS:
+            if kind not in UPLOADS:
                 raise ProblemError(
                     "unsupported",
-                    "the upload is a zip file, but not a .sog; send a .ply, .sog, .spz, .splat, .ksplat or .glb",
+                    f"the upload is a zip file, but not a .sog; send a {alternatives(tuple(UPLOADS.values()))}",
                 )
             if kind == "gltf" and not self._is_glb():  # as large as the upload, and would be parsed in this process
                 raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")
@@ -376,11 +354,7 @@ class Spool:
 
 
 def refuse_count(count: int, size: int, most: int) -> None:
-    """Refuse a scene of more than ``most`` Gaussians, or of more than different ones take in ``size`` bytes.
-
-    Raises:
-        ProblemError: there are too many.
-    """
+    """Refuse a scene of more than ``most`` Gaussians, or of more than different ones take in ``size`` bytes."""
     if count > most:
         raise ProblemError(
             "unsupported",
@@ -396,11 +370,7 @@ def refuse_count(count: int, size: int, most: int) -> None:
 
 
 async def timed(request: Request, settings: ServiceSettings, stopping: asyncio.Event) -> AsyncIterator[bytes]:
-    """Yield the body of a request.
-
-    Raises:
-        ProblemError: the body stalls, is too slow or is incomplete, or the service is ``stopping``.
-    """
+    """Yield the body of a request, unless it stalls, is too slow or incomplete, or the service is ``stopping``."""
     clock = asyncio.get_running_loop().time
     idle, begun, received = settings.upload_idle_seconds, clock(), 0
     chunks = aiter(request.stream())
@@ -444,8 +414,8 @@ def scene_name(given: str | None) -> str:
     """Return a scene name that is safe in listings and downloads: no path, no control characters, never empty."""
     name = re.split(r"[/\\]", unicodedata.normalize("NFC", given or ""))[-1]
     name = "".join(c for c in name if unicodedata.category(c)[0] != "C" and c not in '"<>|:*?')
-    endings = ("compressed.ply", "spz.glb", *UPLOAD_ENDINGS.values())
-    ending = next((f".{ending}" for ending in endings if name.lower().endswith(f".{ending}")), "")
+    endings = (*DOUBLE_ENDINGS, *UPLOADS.values())
+    ending = next((ending for ending in endings if name.lower().endswith(ending)), "")
     name = name[: len(name) - len(ending)]
     name = name.strip(" .")
     return name[:100] or "scene"

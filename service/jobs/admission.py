@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NoReturn
 
-from ..core.models import Job
-from ..core.problems import ProblemError
+from ..core.models import Job, State
+from ..core.problems import ProblemError, disk_full
 from ..core.settings import ServiceSettings
 from ..storage.job_files import JobStorage
 from ..storage.job_records import LimitExceeded, Store
@@ -23,9 +23,6 @@ BUSY_SECONDS = 5.0
 PARSES_AT_ONCE = 2
 """Uploads whose headers are read at a time, which takes up to 30 MB and half a second each. One hostile upload does not
 delay all others, and the memory of many does not add up."""
-
-FULL_SECONDS = 600.0
-"""``Retry-After`` of refusals because of a full disk, seconds."""
 
 
 @dataclass
@@ -43,23 +40,14 @@ class Admission:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def check(self, owner: str) -> None:
-        """Refuse a request before its body is read, if :meth:`add` would refuse it afterwards.
-
-        Raises:
-            ProblemError: ``queue-full`` or ``too-many-jobs``.
-        """
-        if self.store.waiting() >= self.settings.max_queue:
+        """Refuse a request before its body is read, if :meth:`add` would refuse it afterwards."""
+        if self.store.counts()[State.QUEUED] >= self.settings.max_queue:
             raise self._refused("queue")
         if owner and self.store.active_of(owner) >= self.settings.max_jobs_per_key:
             raise self._refused("owner")
 
     def add(self, job: Job) -> Job:
-        """Queue a job.
-
-        Raises:
-            ProblemError: ``queue-full`` or ``too-many-jobs``.
-            LimitExceeded: its idempotency key is in use.
-        """
+        """Queue a job."""
         try:
             return self.store.add(job, max_queue=self.settings.max_queue, max_owner=self.settings.max_jobs_per_key)
         except LimitExceeded as refused:
@@ -74,11 +62,7 @@ class Admission:
 
     @contextlib.contextmanager
     def slot(self, client: str) -> Iterator[None]:
-        """Count an upload of a client, the owner of a key or an address, while it is received.
-
-        Raises:
-            ProblemError: ``too-many-uploads``.
-        """
+        """Count an upload of a client, the owner of a key or an address, while it is received."""
         if self.uploads >= self.settings.max_uploads:
             self._refuse_upload(f"{self.uploads} uploads are in progress")
         if self._uploads[client] >= self.settings.max_uploads_of_one:
@@ -96,32 +80,21 @@ class Admission:
         raise ProblemError("too-many-uploads", text, retry_after=BUSY_SECONDS)
 
     def check_space(self, size: int) -> None:
-        """Refuse ``size`` bytes that would not fit even without the reclaimable files of ended jobs; reserve nothing.
-
-        Raises:
-            ProblemError: ``disk-full``.
-        """
+        """Refuse ``size`` bytes that would not fit even without the reclaimable files of ended jobs."""
         with self._lock:
             if not self._fits(size) and not self._fits(size, self.store.reclaimable_bytes()):
                 raise self._full(size)
 
     def reserve(self, size: int) -> None:
-        """Reserve disk space in bytes; if there is not enough, remove reclaimable files of ended jobs.
-
-        Raises:
-            ProblemError: ``disk-full``.
-        """
+        """Reserve disk space in bytes; if there is not enough, remove reclaimable files of ended jobs."""
         with self._lock:
             if not self._fits(size) and not self._fits(size, self.store.reclaimable_bytes()):
                 raise self._full(size)
             while not self._fits(size):
-                reclaimable = self.store.reclaimable()
-                if not reclaimable:
+                oldest = self.store.reclaimable(1)
+                if not oldest:
                     raise self._full(size)
-                for number, job_id in reclaimable:
-                    self._reclaim(number, job_id)
-                    if self._fits(size):
-                        break
+                self._reclaim(*oldest[0])
             self._reserved += size
 
     def wrote(self, size: int) -> None:
@@ -153,7 +126,7 @@ class Admission:
             f"the server has no disk space for {size:,} more bytes; try again later, "
             "or delete jobs that you no longer need"
         )
-        return ProblemError("disk-full", text, retry_after=FULL_SECONDS)
+        return disk_full(text)
 
     def _refused(self, limit: str) -> ProblemError:
         seconds = self.queue.current().seconds_to_room()

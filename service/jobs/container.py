@@ -64,6 +64,12 @@ class ServiceContainer:
     event_stream: EventStream
     readiness: Readiness = field(default_factory=Readiness)
 
+    def close(self) -> None:
+        """End all jobs and release the data folder."""
+        self.worker.runners.close()
+        self.store.close()
+        self.storage.close()
+
 
 def _context(request: Request) -> ServiceContainer:
     context: ServiceContainer = request.app.state.context

@@ -32,11 +32,7 @@ class Decoder:
     _processes: dict[str, JobProcess] = field(default_factory=dict)
 
     async def scene(self, job: Job) -> tuple[Path, dict[str, Any]]:
-        """Return the path of the decoded ``.ply`` of a succeeded job, and its size and SHA-256 by name.
-
-        Raises:
-            ProblemError: the disk is full, the decoding failed, or the job was deleted or has expired meanwhile.
-        """
+        """Return the path of the decoded ``.ply`` of a succeeded job, and its size and SHA-256 by name."""
         try:
             described = await run_sync(self.storage.read_decoded, job.id)
             if described is None:

@@ -19,11 +19,7 @@ Task = dict[str, Any]
 
 
 def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
-    """Compress the scene ``source`` into the folder ``result`` of ``work``, and return the summary that is there, too.
-
-    Raises:
-        kissgs.KissgsError: the scene cannot be compressed.
-    """
+    """Compress the scene ``source`` into the folder ``result`` of ``work``, and return its summary."""
     import kissgs
 
     result = _run_compression(task, progress)
@@ -99,11 +95,7 @@ def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed
 
 
 def decode(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
-    """Decode the container ``source`` to ``decoded.ply`` in ``work``, and return its size and SHA-256.
-
-    Raises:
-        kissgs.KissgsError: the container cannot be decoded.
-    """
+    """Decode the container ``source`` to ``decoded.ply`` in ``work``, and return its size and SHA-256."""
     import kissgs
 
     target = Path(task["work"]) / "decoded.ply"

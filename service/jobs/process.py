@@ -63,15 +63,11 @@ class JobRunners:
 
     @classmethod
     def open(cls, settings: ServiceSettings) -> JobRunners:
-        """Open the runner that the settings name.
-
-        Raises:
-            kissgs.RunnerError: Ray is not installed or its cluster cannot be reached.
-        """
-        local = runners.open_runner("local", unlimited=True)
+        """Open the runner that the settings name."""
+        local = runners.LocalRunner()
         if settings.ray_address is None:
             return cls(settings, local, local)
-        return cls(settings, runners.open_runner("ray", settings.ray_address), local)
+        return cls(settings, runners.RayRunner(settings.ray_address), local)
 
     def health_problem(self) -> str | None:
         """Return why no job can run at the moment; None if jobs can."""
@@ -91,7 +87,7 @@ class JobRunners:
         settings = self.settings
         cpus = settings.job_threads or 1
         if settings.ray_address is not None and not settings.job_threads:
-            cpus = max(1, int(self.runner.stats().smallest_cpus))
+            cpus = max(1, int(min((node.cpus for node in self.runner.nodes), default=0)))
         return Resources(cpus, int(settings.job_memory), settings.job_gpus if trains else 0)
 
     def item(self, task: dict[str, Any]) -> WorkItem:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
-import heapq
+import itertools
 import json
 import statistics
 import threading
-from collections import deque
 from collections.abc import AsyncIterator, Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
-from weakref import WeakValueDictionary
+from dataclasses import dataclass
 
 from anyio.to_thread import run_sync
 
@@ -30,35 +26,39 @@ class QueueEstimator:
         self._store, self._workers = store, workers
         self._lock = threading.Lock()
         self._changes: int | None = None
-        self._latest: _Queue | None = None
+        self._latest: Queue | None = None
 
-    def current(self) -> QueueEstimates:
+    def current(self) -> Queue:
         """Return the estimates at this moment."""
         with self._lock:
             changes = self._store.changes  # first, so that a change during the reading is read the next time
             if self._latest is None or changes != self._changes:
-                self._latest, self._changes = _Queue(self._store, self._workers), changes
-            return QueueEstimates(self._latest, self._store.clock())
+                self._latest, self._changes = Queue(self._store, self._workers), changes
+            return self._latest
 
 
-class _Queue:
-    """All active jobs at one time, and the rates of recent ones."""
+class Queue:
+    """All active jobs at one time, the rates of recent ones, and what follows for their positions and times."""
 
     def __init__(self, store: Store, workers: int) -> None:
-        self._store = store
+        self._store, self._workers = store, workers
         self._rates: dict[tuple[str, bool], float | None] = {}
-        self.workers = workers
         active, turns = store.active(), store.turns
-        self.running = [(self.total(job), job.started_at) for job in active if job.state == State.RUNNING]
-        self.positions: dict[int, int] = {}
-        self.seconds_before: dict[int, float] = {}
+        self._running = [job for job in active if job.state == State.RUNNING]
+        self._positions: dict[int, int] = {}
+        self._seconds_before: dict[int, float] = {}
         before = 0.0
         for job in _in_turn((job for job in active if job.state == State.QUEUED), turns):
-            self.positions[job.number] = 1 + len(self.positions)
-            self.seconds_before[job.number] = before
-            before += _remaining(self.total(job), 0.0)
+            self._positions[job.number] = 1 + len(self._positions)
+            self._seconds_before[job.number] = before
+            before += self._remaining(job)
 
-    def total(self, job: Job) -> float:
+    @property
+    def now(self) -> float:
+        """The current time in seconds since 1970."""
+        return self._store.clock()
+
+    def _total(self, job: Job) -> float:
         """Estimate the seconds of a job from start to end, from recent jobs with equal preset and evaluation."""
         kind = _kind_without_limit(job), job.evaluate
         if kind not in self._rates:
@@ -70,37 +70,33 @@ class _Queue:
             total = limited_seconds(*kind, job.gaussians, total, limit)
         return total
 
-
-class QueueEstimates:
-    """Estimates at one moment, ``now`` in seconds since 1970."""
-
-    def __init__(self, queue: _Queue, now: float) -> None:
-        self.now, self._queue = now, queue
-        self._running = [_remaining(total, now - (now if began is None else began)) for total, began in queue.running]
+    def _remaining(self, job: Job) -> float:
+        """Estimate the seconds that a queued or running job is still to run; it is never taken for done."""
+        total, started = self._total(job), job.started_at if job.state == State.RUNNING else None
+        return max(total - (self.now - started if started is not None else 0.0), 0.1 * total, 0.5)
 
     def position(self, job: Job) -> int:
         """Return the position of a queued job; 1 is next."""
-        return self._queue.positions.get(job.number, 1)  # just started
+        return self._positions.get(job.number, 1)  # just started
 
     def seconds_left(self, job: Job) -> float:
         """Estimate the seconds until a queued or running job ends."""
-        runs = job.state == State.RUNNING and job.started_at is not None
-        seconds = _remaining(self._queue.total(job), self.now - (job.started_at or self.now) if runs else 0.0)
+        seconds = self._remaining(job)
         if job.state != State.QUEUED:
             return seconds
-        before = self._queue.seconds_before.get(job.number, 0.0)
-        return seconds + (sum(self._running) + before) / self._queue.workers
+        before = sum(map(self._remaining, self._running)) + self._seconds_before.get(job.number, 0.0)
+        return seconds + before / self._workers
 
     def seconds_to_room(self) -> float:
         """Estimate the seconds until the queue has room, 1 to 300."""
-        return min(300.0, max(1.0, min(self._running, default=1.0) / self._queue.workers))
+        return min(300.0, max(1.0, min(map(self._remaining, self._running), default=1.0) / self._workers))
 
 
-def _remaining(total: float, spent: float) -> float:
-    return max(total - spent, 0.1 * total, 0.5)  # a running job is never taken for done
+_OF_RESULTS = ("source_format", "compacted", "finetuning", "invisible", "cleaned", "evaluation")
+"""Entries of a result's summary that the status has under the same names."""
 
 
-def job_status(job: Job, queue: QueueEstimates) -> JobStatus:
+def job_status(job: Job, queue: Queue) -> JobStatus:
     """Return the current status of a job."""
     waits, runs, result = job.state == State.QUEUED, job.state == State.RUNNING, job.result or {}
     return JobStatus(
@@ -112,22 +108,17 @@ def job_status(job: Job, queue: QueueEstimates) -> JobStatus:
         estimate=_estimate(job, queue) if waits or runs else None,
         options=JobOptions.model_validate(job.options),
         upload_bytes=job.upload_bytes,
-        source_format=result.get("source_format"),
         gaussians=job.gaussians,
         sh_degree=job.sh_degree,
         kept=result.get("count"),
-        compacted=result.get("compacted"),
-        finetuning=result.get("finetuning"),
         note=result.get("note") or None,
-        invisible=result.get("invisible"),
-        cleaned=result.get("cleaned"),
-        evaluation=result.get("evaluation"),
         sizes=_sizes(job),
         timings=_timings(job, queue.now),
         starts=job.starts,
         problem=job.problem,
         links=_links(job),
         expires_at=as_datetime(job.expires_at) if job.expires_at is not None else None,
+        **{name: result.get(name) for name in _OF_RESULTS},
     )
 
 
@@ -139,7 +130,7 @@ def _kind_without_limit(job: Job) -> str:
     return job.preset.removesuffix(TIMED) + (FINETUNED if open_to_tuning else "")
 
 
-def _estimate(job: Job, queue: QueueEstimates) -> Estimate:
+def _estimate(job: Job, queue: Queue) -> Estimate:
     seconds = queue.seconds_left(job)
     return Estimate(seconds_left=round(seconds, 1), ready_at=as_datetime(queue.now + seconds))
 
@@ -192,17 +183,6 @@ RETRY_MILLISECONDS = 1000
 """Delay after which a browser reconnects, milliseconds."""
 
 
-class _Feed:
-    """Events of one job, read from the database once for all its clients."""
-
-    def __init__(self) -> None:
-        self.events: list[Event] = []
-        self.job: Job | None = None
-        self.lock = asyncio.Lock()
-        self.changed = asyncio.Event()
-        self.changed.set()  # nothing has been read
-
-
 @dataclass(frozen=True)
 class EventStream:
     """Streams of job events to any number of clients."""
@@ -210,70 +190,43 @@ class EventStream:
     store: Store
     notifier: JobNotifier
     queue: QueueEstimator
-    _feeds: WeakValueDictionary[str, _Feed] = field(default_factory=WeakValueDictionary)
 
     async def stream(self, job: Job, after: int) -> AsyncIterator[str]:
         """Yield the events with a ``seq`` above ``after``, until the job ends or is deleted, or the service stops."""
         yield f"retry: {RETRY_MILLISECONDS}\n\n"
-        feed = self._feeds.get(job.id)
-        if feed is None:
-            feed = self._feeds[job.id] = _Feed()
         while True:
-            await self._refresh(feed, job)
-            current = feed.job
-            for event in feed.events[after:]:  # ids count from 1 without gaps
-                after = event.seq
-                yield await self._format(event, current)
-            if (
-                current is None
-                or (after >= current.last_event and current.state not in ACTIVE)
-                or self.notifier.closing
-            ):
+            changed = self.notifier.subscribe(job.id)  # before reading, so that no later event is missed
+            current, events = await run_sync(self._read, job, after)
+            for seq, text in events:
+                after = seq
+                yield text
+            ended = current is None or (after >= current.last_event and current.state not in ACTIVE)
+            if ended or self.notifier.closing:
                 return
-            if not await wait(feed.changed, KEEPALIVE_SECONDS):
+            if not await wait(changed, KEEPALIVE_SECONDS):
                 yield ": keep-alive\n\n"
 
-    async def _refresh(self, feed: _Feed, job: Job) -> None:
-        """Read new events, unless another client's request has just done so."""
-        async with feed.lock:
-            if feed.changed.is_set():
-                changed = self.notifier.subscribe(job.id)  # before reading, so that no later event is missed
-                feed.job, new = await run_sync(self._read, job, len(feed.events))
-                feed.events += new
-                feed.changed = changed
-
-    def _read(self, job: Job, after: int) -> tuple[Job | None, list[Event]]:
+    def _read(self, job: Job, after: int) -> tuple[Job | None, list[tuple[int, str]]]:
+        """Return the job as it is now, None if it was deleted, and number and text of each event after ``after``."""
         current = self.store.get(job.id)
-        return current, self.store.events(job.number, after)
+        return current, [(event.seq, self._text(event, current)) for event in self.store.events(job.number, after)]
 
-    def _status(self, job: Job) -> dict[str, Any]:
-        return job_status(job, self.queue.current()).model_dump(mode="json", exclude_none=True)
-
-    async def _format(self, event: Event, current: Job | None) -> str:
+    def _text(self, event: Event, current: Job | None) -> str:
+        """Return the text of an event; only the latest state has the full status."""
         data = event.data
-        if (
-            event.kind == "state" and current is not None and event.seq == current.last_event
-        ):  # the full status is sent with the latest event only
-            data = {**data, "job": await run_sync(self._status, current)}
+        if event.kind == "state" and current is not None and event.seq == current.last_event:
+            status = job_status(current, self.queue.current())
+            data = {**data, "job": status.model_dump(mode="json", exclude_none=True)}
         return f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"
 
 
 def _in_turn(queued: Iterable[Job], turns: Mapping[str, int]) -> list[Job]:
-    """Return queued jobs in the order in which :meth:`Store.claim` starts them.
+    """Return queued jobs in the order in which :meth:`Store.claim` starts them: one of each owner, then the next ones.
 
-    The owners take turns, first the one whose ``turns``, the number of its last start, is the lowest; of one owner, the
-    oldest job is first.
+    First is the owner whose ``turns``, the number of its last start, is the lowest; of one owner, the oldest job.
     """
-    waiting: dict[str, deque[Job]] = {}
+    waiting: dict[str, list[Job]] = {}
     for job in sorted(queued, key=lambda job: job.number):
-        waiting.setdefault(job.owner, deque()).append(job)
-    heads = [(turns.get(owner, 0), jobs[0].number, owner) for owner, jobs in waiting.items()]
-    heapq.heapify(heads)
-    order: list[Job] = []
-    latest = max(turns.values(), default=0)
-    while heads:
-        _, _, owner = heapq.heappop(heads)
-        order.append(waiting[owner].popleft())
-        if waiting[owner]:
-            heapq.heappush(heads, (latest + len(order), waiting[owner][0].number, owner))
-    return order
+        waiting.setdefault(job.owner, []).append(job)
+    owners = sorted(waiting.values(), key=lambda jobs: (turns.get(jobs[0].owner, 0), jobs[0].number))
+    return [job for turn in itertools.zip_longest(*owners) for job in turn if job is not None]

@@ -63,10 +63,6 @@ class JobCompletion:
         """Record how a start of a job ended, and whether it is started again; the call can be repeated if it fails.
 
         ``job`` is as it was started, ``work`` the folder of this start, if it has got one.
-
-        Raises:
-            OSError: the files cannot be stored or removed.
-            SQLAlchemyError: the database fails.
         """
         self.store.check()  # else files would change without a record in the database
         self.storage.check()

@@ -23,7 +23,7 @@
  *   note?: string, problem?: ProblemDocument, links: Record<string, string>, expires_at?: string}} Status
  * @typedef {{jobs: Status[], next: string | null}} JobPage
  * @typedef {{max_upload_bytes: number, max_header_bytes: number, max_gaussians: number, job_seconds: number,
- *   keys_required: boolean, training: boolean}} Limits
+ *   formats: string[], keys_required: boolean, training: boolean}} Limits
  * @typedef {{name: string, title: string, description: string, bytes_per_gaussian: number, psnr_change: number,
  *   cpu_seconds_per_million: number, settings: {encode: {rate_distortion: boolean}}}} Preset
  * @typedef {{default: string, measured_on: string, presets: Preset[]}} Presets

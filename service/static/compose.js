@@ -5,7 +5,7 @@ import { bytes, count } from "./format.js";
 import { formatField } from "./container_formats.js";
 import { goalField } from "./goal.js";
 import { keepField } from "./keep.js";
-import { UnsuitableFile, inspect } from "./ply.js";
+import { UnsuitableFile, endingsOf, inspect } from "./ply.js";
 import { presetList } from "./presets.js";
 import { timeField } from "./time_limit.js";
 
@@ -27,6 +27,7 @@ export function composer(limits, presets, submit) {
   let chosen = null;
   let inspections = 0; // only the result of the latest is shown
 
+  input.accept = endingsOf(limits).join();
   byId("file-limits").textContent =
     `Up to ${bytes(limits.max_upload_bytes)} and ${count(limits.max_gaussians)} Gaussians.`;
 

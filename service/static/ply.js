@@ -26,13 +26,17 @@ export async function inspect(file, limits) {
     throw new UnsuitableFile(`${file.name} has ${size}; the limit of this service is ${most}.`);
   }
   const start = await head(file, limits.max_header_bytes);
-  const facts = otherFormat(start, file) ?? parse(new TextDecoder("latin1").decode(start), file.name);
+  const endings = endingsOf(limits);
+  const facts = otherFormat(start, file, endings) ?? parse(new TextDecoder("latin1").decode(start), file.name, endings);
   if (facts.gaussians !== null && facts.gaussians > limits.max_gaussians) {
     const [number, most] = [count(facts.gaussians), count(limits.max_gaussians)];
     throw new UnsuitableFile(`${file.name} has ${number} Gaussians; the limit of this service is ${most}.`);
   }
   return facts;
 }
+
+/** Return the endings of files that the service takes. @param {import("./api.js").Limits} limits */
+export const endingsOf = ({ formats }) => formats.filter((name) => !name.includes(".")).map((name) => `.${name}`);
 
 /**
  * @param {File} file
@@ -50,20 +54,25 @@ async function head(file, size) {
 const MARKS = ["PK\x03\x04", "\x1f\x8b", "NGSP", "glTF"];
 
 /**
- * Return what can be seen of a file that is not a .ply; null for a .ply and for anything unknown.
+ * Return what can be seen of a file that is not a .ply; null for a .ply and for anything unknown. Of files that this page
+ * does not know by their content, the service reads those with other endings.
  * @param {Uint8Array} head
  * @param {File} file
+ * @param {string[]} endings
  * @returns {PlyFacts | null}
  */
-function otherFormat(head, file) {
+function otherFormat(head, file, endings) {
   const unknown = { gaussians: null, shDegree: null, packed: false };
   const start = String.fromCharCode(...head.subarray(0, 24)); // not a TextDecoder: its latin1 is windows-1252
+  if (start.startsWith("ply")) return null;
   const mark = MARKS.find((each) => start.startsWith(each));
   if (mark === "NGSP") return { ...unknown, gaussians: numberAt(start, 8) };
   if (mark) return unknown;
-  if (/\.splat$/i.test(file.name) && !start.startsWith("ply") && file.size % 32 === 0)
+  if (/\.splat$/i.test(file.name) && file.size % 32 === 0)
     return { gaussians: file.size / 32, shDegree: 0, packed: false };
-  return start.startsWith("\0\x01\0\0") && file.size >= 4096 ? { ...unknown, gaussians: numberAt(start, 16) } : null;
+  if (start.startsWith("\0\x01\0\0") && file.size >= 4096) return { ...unknown, gaussians: numberAt(start, 16) };
+  const others = endings.filter((ending) => ending !== ".ply" && ending !== ".splat");
+  return others.some((ending) => file.name.toLowerCase().endsWith(ending)) ? unknown : null;
 }
 
 /**
@@ -76,11 +85,12 @@ const numberAt = (text, at) => [3, 2, 1, 0].reduce((sum, i) => sum * 256 + (text
 /**
  * @param {string} text
  * @param {string} name
+ * @param {string[]} endings
  * @returns {PlyFacts}
  */
-function parse(text, name) {
+function parse(text, name, endings) {
   if (!/^ply\s*\n/.test(text))
-    throw new UnsuitableFile(`${name} is not a scene: send a .ply, .sog, .spz, .splat, .ksplat or .glb.`);
+    throw new UnsuitableFile(`${name} is not a scene: send a ${endings.slice(0, -1).join(", ")} or ${endings.at(-1)}.`);
   const end = text.search(/^end_header\s*$/m);
   if (end < 0) throw new UnsuitableFile(`${name} is not a valid .ply: its header has no end.`);
   const header = text.slice(0, end);

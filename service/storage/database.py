@@ -53,22 +53,14 @@ def is_full(error: BaseException) -> bool:
 
 
 def check_rows(connection: sa.Connection) -> None:
-    """Read the last row of each table, with all columns, as a quick check.
-
-    Raises:
-        SQLAlchemyError: a table or a column is missing or damaged.
-    """
+    """Read the last row of each table, with all columns, as a quick check."""
     for table in Base.metadata.sorted_tables:
         last = [column.desc() for column in table.primary_key]
         connection.execute(sa.select(table).order_by(*last).limit(1)).all()
 
 
 def check_writable(connection: sa.Connection) -> None:
-    """Overwrite a value with itself, because SQLite reports a read-only database only on a write.
-
-    Raises:
-        SQLAlchemyError: the database cannot be written to.
-    """
+    """Overwrite a value with itself, because SQLite reports a read-only database only on a write."""
     connection.execute(sa.update(Meta).where(Meta.name == IDENTITY).values(value=Meta.value))
 
 
@@ -117,11 +109,7 @@ class DatabaseMonitor:
         keep_open(self._connection)
 
     def check_files(self) -> None:
-        """Check that the database's files are those that were opened; takes microseconds.
-
-        Raises:
-            DatabaseReplacedError: a file was removed or replaced.
-        """
+        """Check that the database's files are those that were opened; takes microseconds."""
         for path, known in self._files.items():
             found = _inode(path)
             if found != known:
@@ -131,11 +119,7 @@ class DatabaseMonitor:
                 )
 
     def check_identity(self, connection: sa.Connection | Session) -> None:
-        """Check that the file has not got the content of another database.
-
-        Raises:
-            DatabaseReplacedError: it has.
-        """
+        """Check that the file has not got the content of another database."""
         if connection.scalar(sa.select(Meta.value).where(Meta.name == IDENTITY)) != self.identity:
             raise DatabaseReplacedError("it was replaced by another database")
 
@@ -222,10 +206,6 @@ def connect(file: Path, *, create: bool = True) -> tuple[sa.Engine, Sessions, Se
     Returns:
         The engine; sessions for writing, each with exclusive access from its first statement; and sessions for reading,
         which wait for no lock.
-
-    Raises:
-        NewDatabaseError: the database is new, and ``create`` is false. Nothing has been created.
-        SettingsError: it cannot be opened, is damaged, or has another schema version. It is unchanged.
     """
     opened: list[Any] = []
     first = _engine(file, START_SECONDS, opened)

@@ -57,11 +57,7 @@ JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", "checkpoint*.npz", "decoded.p
 
 
 class JobStorage:
-    """The data folder, locked by one service at a time. Methods block, and raise ``OSError`` if a file cannot be used.
-
-    Raises:
-        SettingsError: it cannot be created or written to, or another service uses it.
-    """
+    """The data folder, locked by one service at a time. Methods block, and raise ``OSError`` for unusable files."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
@@ -172,9 +168,6 @@ class JobStorage:
         """Move the result from a work folder to its final path; do nothing if that is done already.
 
         A previous result moves to the work folder.
-
-        Raises:
-            OSError: the result cannot be moved, or there is none.
         """
         result, written = self.result(job_id), work / RESULT
         if written.is_dir():
@@ -240,14 +233,14 @@ class JobStorage:
             if not os.path.lexists(folder):
                 return True
             if folder.is_symlink() or not folder.is_dir():
-                self.move_to_orphaned(folder.name, "was not created by the service")
+                self.set_aside(folder.name, "was not created by the service")
                 return True
             for pattern in JOB_FILES:
                 for path in folder.glob(pattern):
                     self.discard(path)
             with contextlib.suppress(FileNotFoundError):
                 if not all(any(path.match(pattern) for pattern in JOB_FILES) for path in folder.iterdir()):
-                    self.move_to_orphaned(folder.name, "has files that are not the service's")
+                    self.set_aside(folder.name, "has files that are not the service's")
                     return True
                 with contextlib.suppress(OSError):
                     folder.rmdir()
@@ -272,17 +265,13 @@ class JobStorage:
         """Return the ids of all jobs that have a folder."""
         return {path.name for path in self.jobs.iterdir() if JOB.fullmatch(path.name) and path.is_dir()}
 
-    def move_to_orphaned(self, job_id: str, why: str) -> None:
-        """Move the folder of a job to the orphaned folder and log why; ``why`` continues "its folder ..."."""
-        self._move_to_orphaned(self.jobs / job_id)
-        log.warning("job %s: its folder %s and was moved to %s", job_id, why, self.orphaned)
-
     def set_aside(self, job_id: str, why: str) -> None:
-        """Move the folder of a job to the orphaned folder; remove it if it is empty."""
+        """Move the folder of a job to the orphaned folder and log why, "its folder ..."; remove it if it is empty."""
         with contextlib.suppress(OSError):  # not empty, not a folder, or missing
             (self.jobs / job_id).rmdir()
         if os.path.lexists(self.jobs / job_id):
-            self.move_to_orphaned(job_id, why)
+            self._move_to_orphaned(self.jobs / job_id)
+            log.warning("job %s: its folder %s and was moved to %s", job_id, why, self.orphaned)
 
     def set_aside_unknown(self, known: set[str]) -> None:
         """Move the folders of all jobs except ``known`` ones to the orphaned folder; call it before uploads start."""
@@ -332,11 +321,7 @@ class JobStorage:
         return None
 
     def check(self) -> None:
-        """Check that files can be stored.
-
-        Raises:
-            OSError: they cannot.
-        """
+        """Check that files can be stored."""
         if problem := self.health_problem():
             raise OSError(problem)
 

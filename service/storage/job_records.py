@@ -40,11 +40,7 @@ class LimitExceeded(Exception):
 
 
 class Store:
-    """Jobs and events in a database. Methods block for milliseconds and are safe in any thread.
-
-    Raises:
-        SettingsError: as for :func:`service.storage.database.connect`.
-    """
+    """Jobs and events in a database. Methods block for milliseconds and are safe in any thread."""
 
     def __init__(self, file: Path, clock: Callable[[], float], *, create: bool = True) -> None:
         self._engine, self._writing, self._reading = connect(file, create=create)
@@ -66,11 +62,7 @@ class Store:
     # The database itself -------------------------------------------------------------------------------------------
 
     def check(self) -> None:
-        """Check that the database's files are those that were opened; takes microseconds.
-
-        Raises:
-            DatabaseReplacedError: a file was removed or replaced.
-        """
+        """Check that the database's files are those that were opened; takes microseconds."""
         self._monitor.check_files()
 
     def health_problem(self) -> str | None:
@@ -183,20 +175,10 @@ class Store:
         with self._reading() as session:
             return int(session.scalar(query.where(Job.state.in_(ENDED))) or 0)
 
-    def waiting(self) -> int:
-        """Return the number of queued jobs."""
-        with self._reading() as session:
-            return _count(session, Job.state == State.QUEUED)
-
     # Jobs ----------------------------------------------------------------------------------------------------------
 
     def add(self, job: Job, *, max_queue: int, max_owner: int) -> Job:
-        """Queue a job.
-
-        Raises:
-            LimitExceeded: ``max_queue`` jobs are queued, ``max_owner`` jobs of its owner are active, or its idempotency
-                key is in use.
-        """
+        """Queue a job, unless ``max_queue`` are queued, or ``max_owner`` of its owner are queued or running."""
         try:
             with self._write() as session:
                 if _count(session, Job.state == State.QUEUED) >= max_queue:
@@ -298,12 +280,7 @@ def _add_event(session: Session, job: Job, kind: str, data: dict[str, Any]) -> N
 
 
 def open_store(folder: JobStorage, clock: Callable[[], float]) -> Store:
-    """Open the database of a data folder, on a full disk with the space of its reserve and of incomplete uploads.
-
-    Raises:
-        SettingsError: it cannot be opened, it is missing although the folder has jobs, or none of its waiting and
-            running jobs has a folder. Nothing has been removed.
-    """
+    """Open the database of a data folder, on a full disk with the space of its reserve and of incomplete uploads."""
     stored = folder.job_ids()
     store = _open(folder, clock, stored)
     active = store.ids(*ACTIVE)

@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def settings(**changes: object) -> kissgs.Settings:
-    return kissgs.Settings.from_preset("balanced", finetune={"enabled": True, **SHORT, **changes}, **LOOK)
+    return kissgs.Settings.research("balanced", finetune={"enabled": True, **SHORT, **changes}, **LOOK)
 
 
 def test_output_and_report_are_those_of_the_library(folder: Path, tmp_path: Path) -> None:
@@ -53,13 +53,6 @@ def test_sog_is_fine_tuned_too(folder: Path, tmp_path: Path) -> None:
     assert (tmp_path / "b.sog").read_bytes() == found.to_zip()
     assert json.loads(done.stdout)["finetuning"]["steps"] == 6
     assert len(kissgs.load(tmp_path / "b.sog")) == len(found.order)
-
-
-@pytest.mark.quick(0)
-def test_photographs_are_training_targets(folder: Path, tmp_path: Path) -> None:
-    words = ["compress", folder / "a.ply", "-o", tmp_path / "b.zip", "--finetune", "4", "--views", folder / "capture"]
-    report = json.loads(run(*words, *OPTIONS, "--json").stdout)["finetuning"]
-    assert (report["steps"], report["target_source"]) == (4, "photos")
 
 
 def test_the_default_number_of_steps_is_that_of_the_preset() -> None:

@@ -28,6 +28,7 @@ from kissgs.cli import app as commands
 from kissgs.cli import console
 from kissgs.core.splats import clean
 from kissgs.rendering.images import reframed
+from kissgs.rendering.metrics import psnr
 
 
 @pytest.fixture(scope="module")
@@ -115,8 +116,8 @@ def test_a_saved_camera_renders_the_same_image(folder: Path, tmp_path: Path) -> 
     assert run(*words, tmp_path / "b.png", "--view", kept).returncode == 0
     assert np.array_equal(pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png"))
     (tmp_path / "cameras.json").write_text(f"[{kept.read_text()}, {kept.read_text()}]")
-    assert run(*words, tmp_path / "c.webp", "--view", f"{tmp_path}/cameras.json:1", "--quality", "100").returncode == 0
-    assert np.array_equal(pixels(tmp_path / "a.png"), pixels(tmp_path / "c.webp"))
+    assert run(*words, tmp_path / "c.png", "--view", f"{tmp_path}/cameras.json:1").returncode == 0
+    assert np.array_equal(pixels(tmp_path / "a.png"), pixels(tmp_path / "c.png"))
     assert read_cameras(kept)[0].camera.width == 80
     taken = failure(*words, tmp_path / "d.png", "--size", "8x6", "--save-camera", kept)
     assert f"{kept} exists already" in taken
@@ -125,7 +126,7 @@ def test_a_saved_camera_renders_the_same_image(folder: Path, tmp_path: Path) -> 
 
 def test_an_orbit_is_an_animation_or_a_contact_sheet(folder: Path, tmp_path: Path) -> None:
     words = ["render", folder / "a.ply", "--orbit", "--size", "40x30", "--json", "-o"]
-    report = json.loads(run(*words, tmp_path / "a.webp", "--frames", "9", "--fps", "10", "--quality", "100").stdout)
+    report = json.loads(run(*words, tmp_path / "a.webp", "--frames", "9").stdout)
     assert (report["width"], report["height"], report["frames"], len(report["cameras"])) == (40, 30, 9, 9)
     with Image.open(tmp_path / "a.webp") as film:
         assert (film.n_frames, film.info["loop"]) == (9, 0)
@@ -137,8 +138,8 @@ def test_an_orbit_is_an_animation_or_a_contact_sheet(folder: Path, tmp_path: Pat
             if number == 4:
                 entry = report["cameras"][4]
                 camera = kissgs.Camera(np.array(entry["viewmat"]), np.array(entry["K"]), 40, 30)
-                assert close(np.asarray(film.convert("RGB")), shown(camera))
-    assert sum(durations) == 900
+                assert psnr(np.asarray(film.convert("RGB")) / 255, shown(camera) / 255) > 28
+    assert sum(durations) == 9 * 1000 // 12
     report = json.loads(run(*words, tmp_path / "a.png", "--frames", "6").stdout)
     assert (report["frames"], len(report["cameras"])) == (1, 6)
     assert pixels(tmp_path / "a.png").shape == (report["height"], report["width"], 3)
@@ -171,8 +172,6 @@ def test_impossible_requests_are_refused(folder: Path, tmp_path: Path) -> None:
     assert "is a camera file" in fails("--view", "a.json", "--views", folder / "capture")
     assert "leave out --save-camera" in fails("--sheet", "--save-camera", tmp_path / "a.json")
     assert "leave out --frames: it only applies to --orbit" in fails("--frames", "9")
-    assert "leave out --fps: it only applies to animations" in fails("--orbit", "--fps", "9", "-o", there)
-    assert "leave out --quality" in fails("--quality", "9", "-o", there)
     assert "written as .png or .webp" in fails("-o", tmp_path / "a.jpg")
     assert "no folder" in fails("-o", tmp_path / "none" / "a.png")
     assert "both write to standard output" in fails("-o", "-", "--json")
@@ -191,12 +190,6 @@ def test_impossible_requests_are_refused(folder: Path, tmp_path: Path) -> None:
     assert "too much memory" in fails("-o", there, "--size", "60000x60000", "--view", "0")
     assert "16,383 pixels a side" in fails("-o", tmp_path / "a.webp", "--size", "16384x1", "--view", "0")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_json_errors_have_a_code(folder: Path, tmp_path: Path) -> None:
-    done = run("render", folder / "a.ply", "-o", tmp_path / "a.png", "--view", "nobody", "--json")
-    assert done.returncode == 2
-    assert json.loads(done.stdout)["error"]["code"] == "invalid-views"
 
 
 def test_an_interrupted_animation_leaves_no_file(folder: Path, tmp_path: Path) -> None:
@@ -239,12 +232,14 @@ def test_the_clock_of_the_progress_bar_runs_through_all_stages(
     assert "0:01:15" in capsys.readouterr().err
 
 
-def test_warmup_compiles_all_kernels(tmp_path: Path) -> None:
+@pytest.mark.parametrize("torch", ["", "import sys; sys.modules['torch'] = None; "], ids=["torch", "no torch"])
+def test_warmup_compiles_all_kernels(torch: str, tmp_path: Path) -> None:
     """A kernel compiles at its first call, so that one that is not loaded here is compiled later."""
     home = Path(kissgs.__file__).parents[1]
     sources = [path.read_text(encoding="utf-8") for path in home.glob("kissgs/**/*.py")]
-    wanted = sum(source.count("\n@compiled(") for source in sources)
-    lines = "from kissgs.cli.app import warmup; from kissgs.core.numba_kernels import kernels; warmup(); "
+    trained = (home / "kissgs/training/optimizer.py").read_text(encoding="utf-8")
+    wanted = sum(source.count("\n@compiled(") for source in sources if not torch or source != trained)
+    lines = torch + "from kissgs.cli.app import warmup; from kissgs.core.numba_kernels import kernels; warmup(); "
     lines += "print(len(kernels), all(kernel.signatures for kernel in kernels))"
     places = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", lines], capture_output=True, timeout=300, check=True, env=places)

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers.evaluations import evaluation_of
 from helpers.training_scenes import around, cloud, same
 from PIL import Image
 
@@ -12,7 +13,7 @@ from kissgs import CompactSettings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.budget import compact_scene
 from kissgs.evaluation.evaluate import compare_images, evaluate
-from kissgs.evaluation.results import ASSUMED_PSNR, Comparison, Evaluation, ImageMetrics, ViewComparison, drop_of
+from kissgs.evaluation.results import ASSUMED_PSNR, drop_of
 from kissgs.rendering.rasterizer import render
 
 ONLY_PRUNE = {"sparsify_steps": 0, "refine_steps": 0, "min_keep_per_scoring": 0.6}
@@ -116,17 +117,6 @@ def test_without_photographs_the_drop_assumes_errors_of_a_usual_capture():
     for error in (ASSUMED_PSNR, 40.0, 50.0):
         worse = scene + rng.normal(0, 10 ** (-error / 20), truth.shape)
         psnr = [-10 * math.log10(np.mean((a - b) ** 2)) for a, b in ((scene, truth), (worse, truth), (worse, scene))]
-        evaluation = evaluation_of(psnr[2])
+        evaluation = evaluation_of([psnr[2]])
         assert drop_of(evaluation) == pytest.approx(psnr[0] - psnr[1], abs=0.1)
-    assert drop_of(evaluation_of(math.inf)) == pytest.approx(0, abs=1e-9)
-
-
-def evaluation_of(psnr):
-    evaluation = evaluate(cloud(5), cloud(5), Views((), around(1), black(), ""))
-    metrics = ImageMetrics(psnr=psnr, ssim=1.0, ms_ssim=1.0)
-    comparison = Comparison(reference=None, candidate=metrics, candidate_vs_reference=metrics)
-    (view,) = evaluation.views
-    changed = ViewComparison(view=view.view, comparison=comparison)
-    return Evaluation(
-        **{name: getattr(evaluation, name) for name in evaluation.__slots__ if name != "views"}, views=(changed,)
-    )
+    assert drop_of(evaluation_of([math.inf])) == pytest.approx(0, abs=1e-9)

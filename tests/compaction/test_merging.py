@@ -11,14 +11,15 @@ from hypothesis import strategies as st
 
 import kissgs
 from kissgs import CompactSettings
-from kissgs.compaction import covariance_kernels, nearest_kernels
+from kissgs.compaction import covariance_kernels
 from kissgs.compaction import merging as merge_kernels
 from kissgs.compaction.budget import Compactor, compact_scene
-from kissgs.compaction.merging import BLUR, CONTRAST, LEAF, NEIGHBOURS, SPACING_RANK, merge_gaussians
+from kissgs.compaction.merging import BLUR, CONTRAST, merge_gaussians
 from kissgs.compaction.scoring import highest_indices
+from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN
 from kissgs.rendering.camera import look_at
-from kissgs.rendering.cpu.neighbours import split_into_leaves
+from kissgs.rendering.cpu.neighbours import nearest_neighbours, unique_pairs
 from kissgs.rendering.rasterizer import render
 
 AXES = ((1, 2), (0, 2), (0, 1))
@@ -73,7 +74,7 @@ def two(seed, coefficients=3):
     return scene, scene.means.astype(np.float64), covariance(scene), alphas, colors
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_moments_opacity_and_error_of_a_pair(seed):
     scene, means, full, alphas, colors = two(seed)
     spacing, pixels = np.full(2, 3.0), Pixels()
@@ -175,26 +176,17 @@ def test_two_gaussians_at_one_place_cover_as_both_together():
 def test_nearest_neighbours(count):
     rng = np.random.default_rng(count)
     means = rng.normal(size=(count, 3)) * [1, 1e3, 1e-3]
-    near, spacing = neighbours(means)
+    known = min(8, count - 1)
+    with Workers(2) as pool:
+        near, spacing = nearest_neighbours(means, known, min(3, known - 1), pool)
     distances = ((means[:, None] - means) ** 2).sum(axis=2)
     np.fill_diagonal(distances, np.inf)
     assert (near == np.argsort(distances, axis=1)[:, : near.shape[1]]).all()
-    np.testing.assert_allclose(spacing, np.sort(distances, axis=1)[:, min(SPACING_RANK, near.shape[1] - 1)])
+    np.testing.assert_allclose(spacing, np.sort(distances, axis=1)[:, min(3, known - 1)])
     pairs = np.empty((near.size, 2), np.int32)
-    pairs = pairs[: nearest_kernels.unique_pairs(near, pairs)]
+    pairs = pairs[: unique_pairs(near, pairs)]
     listed = sorted(map(tuple, pairs.tolist()))
     assert listed == sorted({(min(i, j), max(i, j)) for i, row in enumerate(near.tolist()) for j in row})
-
-
-def neighbours(means):
-    count = len(means)
-    order, edges = np.arange(count, dtype=np.int32), np.empty(4 * count // LEAF + 2, np.int64)
-    leaves = split_into_leaves(np.ascontiguousarray(means.T.astype(np.float32)), LEAF, order, edges)
-    boxes = np.empty((2 << (leaves - 1).bit_length(), 2, 3))
-    nearest_kernels.fill_boxes(means, order, edges, leaves, boxes)
-    near, spacing = np.empty((count, min(NEIGHBOURS, count - 1)), np.int32), np.empty(count)
-    nearest_kernels.nearest(means, order, edges, boxes, 0, leaves, min(SPACING_RANK, near.shape[1] - 1), near, spacing)
-    return near, spacing
 
 
 @given(st.integers(0, 10**6))
@@ -215,25 +207,18 @@ def test_covariances_become_rotations_and_scales_again(seed):
     np.testing.assert_allclose(again, covariance(scene), atol=tolerance)
 
 
-@pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize(("count", "left"), [(1, 1), (2, 1), (7, 3), (8, 7), (9, 1), (100, 33)])
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize(("count", "left"), [(0, 1), (1, 1), (2, 1), (8, 7), (9, 9), (100, 33)])
 def test_the_count_is_exact_and_gaussians_that_stay_are_untouched(degree, count, left):
     scene = cloud(count, degree=degree)
     merged, index = merge_gaussians(scene, left)
+    left = min(left, count)
     assert len(merged) == left
     assert (np.diff(index, prepend=-1) > 0).all()
     assert same(kissgs.clean(merged)[0], merged)
     alone = [n for n, origin in enumerate(index) if (merged.means[n] == scene.means[origin]).all()]
     assert same(merged.select(np.array(alone, int)), scene.select(index[alone]))
     assert len(alone) >= 2 * left - count
-
-
-@pytest.mark.parametrize("count", [0, 1, 9])
-def test_a_scene_with_few_gaussians_is_unchanged(count):
-    scene = cloud(count)
-    merged, index = merge_gaussians(scene, max(count, 1))
-    assert same(merged, scene)
-    assert index.tolist() == list(range(count))
 
 
 def test_the_result_depends_neither_on_threads_nor_on_the_order():
@@ -258,9 +243,8 @@ EXTREMES = {
 
 
 @pytest.mark.parametrize("name", EXTREMES)
-@pytest.mark.parametrize("seed", range(3))
-def test_extreme_values_give_a_clean_scene(name, seed):
-    scene, rng = cloud(60, degree=1), np.random.default_rng(seed)
+def test_extreme_values_give_a_clean_scene(name):
+    scene, rng = cloud(60, degree=1), np.random.default_rng(0)
     values = rng.choice(np.float32(EXTREMES[name]), size=getattr(scene, name).shape)
     scene = kissgs.clean(replace(scene, **{name: values}))[0]
     for left in (30, 7, 1):
@@ -304,9 +288,5 @@ def test_a_budget_is_met_by_merging_without_views():
     assert [(step.name, step.count) for step in result.report.steps] == [("input", 200), ("merge", 50)]
     assert (result.report.target_source, result.report.source) == ("nothing", "")
     assert all(getattr(result.splats, name).dtype == np.float32 for name in ATTRIBUTES)
-
-
-def test_merging_draws_no_cameras_that_nothing_uses():
-    compactor = Compactor.of(cloud(200, degree=1), CompactSettings(ratio=0.25, method="merge"), None)
-    assert compactor.supervision.train == compactor.supervision.score == ()
-    assert len(compactor(50).splats) == 50
+    supervision = Compactor.of(scene, CompactSettings(ratio=0.25, method="merge"), None).supervision
+    assert supervision.train == supervision.score == (), "it draws no cameras that nothing uses"

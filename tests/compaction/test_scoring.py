@@ -35,7 +35,7 @@ def test_one_round_keeps_the_highest_scores():
     assert prune_by_score(scene, VIEWS, black(), 20).tolist() == sorted(np.argsort(-scores)[:20].tolist())
 
 
-@pytest.mark.parametrize("min_score", [0.05, 0.3, 10.0])
+@pytest.mark.parametrize("min_score", [0.3, 10.0])
 def test_no_score_is_below_a_share_of_that_of_a_camera_nearby(min_score):
     """The unit is the median ratio of score to close-up coverage over the Gaussians that were seen."""
     scene = cloud(80)
@@ -51,9 +51,8 @@ def test_no_score_is_below_a_share_of_that_of_a_camera_nearby(min_score):
     assert hidden[kept].any()
 
 
-@pytest.mark.parametrize("min_keep", [0.0, 0.3, 0.8, 0.99])
-@pytest.mark.parametrize("count", [1, 7, 79])
-@pytest.mark.quick(4)
+@pytest.mark.parametrize("min_keep", [0.0, 0.8])
+@pytest.mark.parametrize("count", [1, 79])
 def test_any_number_of_rounds_keeps_exactly_the_requested_count(min_keep, count):
     kept = prune_by_score(cloud(80), VIEWS, black(), count, min_keep_per_scoring=min_keep)
     assert len(kept) == count
@@ -100,22 +99,7 @@ def test_images_of_any_size_have_the_same_weight():
     assert kept != sorted(np.argsort(-sums, kind="stable")[:20].tolist())
 
 
-def test_progress_rises_to_1():
-    fractions = []
-    views = [replace(view, background=np.full(3, n % 3 / 2, np.float32)) for n, view in enumerate(VIEWS)]
-    prune_by_score(
-        cloud(30),
-        views,
-        black(),
-        5,
-        min_keep_per_scoring=0.6,
-        progress=lambda stage, fraction, note="": fractions.append(fraction),
-    )
-    assert fractions == sorted(fractions)
-    assert fractions[-1] == 1.0
-
-
-@pytest.mark.parametrize(("min_keep", "scorings"), [(0.0, 1), (0.1, 1), (0.25, 1), (0.5, 2), (0.7, 4), (0.99, 138)])
+@pytest.mark.parametrize(("min_keep", "scorings"), [(0.0, 1), (0.25, 1), (0.5, 2), (0.99, 138)])
 def test_the_number_of_scorings_is_the_smallest_possible(min_keep, scorings):
     """Pruning goes from 80 Gaussians to 20, a quarter."""
     events = []
@@ -126,3 +110,5 @@ def test_the_number_of_scorings_is_the_smallest_possible(min_keep, scorings):
     prune_by_score(cloud(80), VIEWS[:1], black(), 20, min_keep_per_scoring=min_keep, progress=progress)
     found = (len(events) - 1) / 2  # each scoring reports its beginning and its end
     assert found == scorings if scorings < 5 else 55 < found <= scorings, "60 removals, one or more per scoring"
+    assert events == sorted(events)
+    assert events[-1] == 1.0

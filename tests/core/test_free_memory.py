@@ -43,24 +43,6 @@ def test_the_memory_of_large_arrays_is_used_again_within_the_block_only():
     assert kept < usual / 4
 
 
-def test_the_options_are_those_of_the_outermost_block(monkeypatch):
-    found = []
-    monkeypatch.setattr(free_memory, "_set_thresholds", lambda *thresholds: found.append(thresholds))
-    large = (free_memory.LARGEST_TRIM, free_memory.LARGEST_MMAP)
-    usual = (free_memory.USUAL_TRIM, free_memory.USUAL_MMAP)
-
-    def fail():
-        with keep_free_memory():
-            with keep_free_memory():
-                pass
-            assert found == [large]
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        fail()
-    assert found == [large, usual]
-
-
 def test_other_c_libraries_are_left_alone(monkeypatch):
     monkeypatch.setattr(free_memory, "_libc_function", lambda name: None)
     with keep_free_memory():

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import kissgs
+from kissgs.cameras.random_cameras import MIN_DISTANCE
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import (
     BACKGROUNDS,
     HEIGHT,
     KINDS,
-    MIN_DISTANCE,
     MIN_MEAN_ALPHA,
     WIDTH,
     evaluation_views,

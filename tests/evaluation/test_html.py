@@ -15,7 +15,6 @@ from PIL import Image
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.views import View, Views
 from kissgs.core.errors import Cancelled
-from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.evaluate import compare_images, evaluate
 from kissgs.evaluation.html import (
     FULL_SCALES,
@@ -28,7 +27,6 @@ from kissgs.evaluation.html import (
     heat_map,
     html_report,
     rms_difference,
-    select_views,
     worst_crop,
 )
 
@@ -158,9 +156,8 @@ def test_twelve_of_many_views_are_shown_the_worst_first():
     one = SCENE.select(slice(0, 300))
     views = cameras(test=30, train=0, size=(8, 6))
     found = compare_images(one, damaged(one), views)
-    shown = select_views(found)
     by_psnr = np.argsort([each.comparison.candidate_vs_reference.psnr for each in found.views], kind="stable")
-    assert shown == by_psnr[:MAX_VIEWS].tolist()
+    shown = by_psnr[:MAX_VIEWS].tolist()
     text = html_report(found, ReportScene(name="a", splats=one), ReportScene(name="b", splats=damaged(one)))
     page = Page(text)
     assert [section["id"] for section in page.of("section") if "id" in section] == [f"view-{i}" for i in shown]
@@ -235,21 +232,3 @@ def test_the_worst_crop_is_centred_on_the_largest_error(height, width, side, see
 
 def test_without_errors_the_crop_is_the_middle():
     assert worst_crop(np.zeros((200, 301), np.float32), 160) == (slice(20, 180), slice(70, 230))
-
-
-def test_damaged_gaussians_are_in_the_crop():
-    """The Gaussians around one pixel are damaged."""
-    views = cameras(test=1, size=(400, 300))
-    view = views.test[0]
-    homogeneous = np.append(SCENE.means, np.ones((len(SCENE), 1)), axis=1) @ view.camera.viewmat.T
-    pixels = homogeneous[:, :3] @ view.camera.K.T
-    pixels = pixels[:, :2] / pixels[:, 2:]
-    near = np.abs(pixels - [300, 200]).max(axis=1) < 15
-    assert near.any()
-    arrays = {name: getattr(SCENE, name).copy() for name in ATTRIBUTES}
-    arrays["sh0"][near] += 3
-    damaged_scene = Splats(**arrays)
-    levels = rms_difference(rendered_view(damaged_scene, view), rendered_view(SCENE, view))
-    rows, columns = worst_crop(levels, 160)
-    assert rows.start < 200 < rows.stop
-    assert columns.start < 300 < columns.stop

@@ -5,56 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.evaluations import compared, evaluation_of, evaluation_with, metrics
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.cameras.views import View
 from kissgs.evaluation.results import (
     ASSUMED_PSNR,
     MAX_ERROR_RATIO,
     MAX_SSIM_RATIO,
-    Comparison,
-    Evaluation,
-    ImageMetrics,
-    ViewComparison,
     drop_of,
     psnr_of,
     ssim_drop_of,
 )
-from kissgs.rendering.camera import look_at
-
-VIEW = View(
-    "a", look_at(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), fov=1.0, width=4, height=4)
-)
-
-
-def metrics(psnr, ssim=0.5):
-    return ImageMetrics(psnr=psnr, ssim=ssim, ms_ssim=0.5)
-
-
-def evaluation_of(psnrs, photo_psnrs=None):
-    """Return an evaluation; ``photo_psnrs``: PSNRs of reference and candidate to the photograph of each view."""
-    compared = [
-        Comparison(reference=None, candidate=metrics(psnr), candidate_vs_reference=metrics(psnr)) for psnr in psnrs
-    ]
-    if photo_psnrs is not None:
-        compared = [
-            Comparison(reference=metrics(one), candidate=metrics(other), candidate_vs_reference=metrics(psnr))
-            for (one, other), psnr in zip(photo_psnrs, psnrs, strict=True)
-        ]
-    return evaluation_with(compared)
-
-
-def evaluation_with(compared):
-    return Evaluation(
-        against="photos" if compared[0].reference else "renderings",
-        split="all",
-        source="",
-        background=np.zeros(3, np.float32),
-        reference_count=1,
-        candidate_count=1,
-        views=tuple(ViewComparison(view=VIEW, comparison=each) for each in compared),
-    )
 
 
 def similarities(*ssims):
@@ -62,10 +24,10 @@ def similarities(*ssims):
     pairs = [ssim if isinstance(ssim, tuple) else (None, ssim) for ssim in ssims]
     return evaluation_with(
         [
-            Comparison(
-                reference=None if own is None else metrics(30.0, own),
-                candidate=metrics(30.0, ssim),
-                candidate_vs_reference=metrics(30.0, ssim if own is None else 0.2),
+            compared(
+                None if own is None else metrics(30.0, own),
+                metrics(30.0, ssim),
+                metrics(30.0, ssim if own is None else 0.2),
             )
             for own, ssim in pairs
         ]

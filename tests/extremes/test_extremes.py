@@ -17,7 +17,7 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 def check(splats, preset="fast", **changes):
     """Assert a finite result within the errors that the report states; return the decoded scene and the result."""
-    result = compress(splats, settings=Settings.from_preset(preset, **{"sh_tolerance": 0, **GLANCE, **changes}))
+    result = compress(splats, settings=Settings.research(preset, **{"sh_tolerance": 0, **GLANCE, **changes}))
     found = decompress(result.files)
     assert all(np.isfinite(getattr(found, name)).all() for name in ATTRIBUTES)
     reference_decoder.assert_equal_scenes(found, reference_decoder.decode(result.files), result.files)
@@ -71,7 +71,7 @@ def test_a_rotation_without_length_becomes_none(quat):
     assert (clean(splats)[0].quats[3] == [1, 0, 0, 0]).all()
 
 
-@pytest.mark.parametrize("length", [1e-45, 1e-38, 1e-20, 1e-3, 1e3, 1e20, 1e38])
+@pytest.mark.parametrize("length", [1e-45, 1e-20, 1e3, 1e38])
 def test_rotations_of_any_length_are_normalised(length):
     """float32 squares of these underflow to 0 or overflow to infinity. Denormal numbers keep few digits."""
     splats = random_scene(30, 0, seed=4)
@@ -86,6 +86,7 @@ def test_rotations_of_any_length_are_normalised(length):
 
 @pytest.mark.parametrize("preset", ["fast", "paper"])
 @pytest.mark.parametrize("scale", [1e-45, 1e-30, 1e-6, 1e6, 1e14])
+@pytest.mark.quick(5)
 def test_worlds_of_any_size(scale, preset):
     splats = random_scene(60, 0, seed=2)
     found, _ = check(replaced(splats, means=splats.means / 40 * scale), preset)
@@ -113,6 +114,7 @@ def test_positions_at_the_limit():
         ("shN", -1e-20, 1e-20),
     ],
 )
+@pytest.mark.quick(9)
 def test_whole_attributes_at_the_edge(attribute, low, high, preset):
     splats = random_scene(50, 2, seed=5)
     shape = getattr(splats, attribute).shape
@@ -126,6 +128,7 @@ def test_whole_attributes_at_the_edge(attribute, low, high, preset):
 
 @pytest.mark.parametrize("attribute", FIELDS)
 @pytest.mark.parametrize("preset", ["fast", "paper"])
+@pytest.mark.quick(7)
 def test_one_outlier_among_thousands(attribute, preset):
     """It stretches the range of its channel for all: the report must say by how much. Positions suffer little."""
     outlier = {"means": 1e6, "quats": -1, "scales": 12, "opacities": 13.8, "sh0": 500, "shN": 500}[attribute]
@@ -142,6 +145,7 @@ def test_one_outlier_among_thousands(attribute, preset):
 
 @pytest.mark.parametrize("preset", ["fast", "small", "paper"])
 @pytest.mark.parametrize("count", [1, 65, 500])
+@pytest.mark.quick(5)
 def test_gaussians_that_are_all_the_same(count, preset):
     splats = constant_scene(count, 3)
     found, result = check(splats, preset, prune_threshold_bits=0)
@@ -151,7 +155,8 @@ def test_gaussians_that_are_all_the_same(count, preset):
 
 
 @pytest.mark.parametrize("attribute", FIELDS)
-@pytest.mark.parametrize("value", [0.0, -0.0, 1e-45, -7.25])
+@pytest.mark.parametrize("value", [-0.0, 1e-45, -7.25])
+@pytest.mark.quick(9)
 def test_constant_attributes(attribute, value):
     splats = random_scene(40, 1, seed=9)
     constant = np.full(getattr(splats, attribute).shape, value)
@@ -162,6 +167,7 @@ def test_constant_attributes(attribute, value):
 
 @pytest.mark.parametrize("preset", ["fast", "balanced", "small", "paper"])
 @pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.quick(5)
 def test_scenes_of_which_nothing_is_left(degree, preset):
     nothing = replaced(random_scene(5, degree), means=np.full((5, 3), np.nan))
     for splats, removed in ((nothing, 5), (nothing.select(slice(0, 0)), 0)):

@@ -23,7 +23,7 @@ from kissgs.training.optimizer import PrunableAdam
 
 
 def compressed(splats, preset="fast"):
-    return kissgs.compress(splats, settings=Settings.from_preset(preset, **GLANCE))
+    return kissgs.compress(splats, settings=Settings.research(preset, **GLANCE))
 
 
 def test_steps_of_a_world_1e6_across():
@@ -125,8 +125,8 @@ def test_centres_of_footprints_are_right_to_a_ten_thousandth_of_a_pixel(size):
         blobs(500), means=means, scales=np.full((500, 3), np.log(size * 1e-3)), opacities=np.full(500, 2.0)
     )
     with Workers(1) as pool:
-        prints = draw(scene, view, np.zeros(3), pool).footprints
-    rows = prints.rows()
+        frame = draw(scene, view, np.zeros(3), pool)
+    prints, rows = frame.footprints, frame.rows()
     there = scene.means[prints.visible[rows]].astype(np.float64) @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     wanted = (there / there[:, 2:]) @ view.K.T
     assert len(wanted) > 300

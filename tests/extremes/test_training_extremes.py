@@ -50,7 +50,7 @@ def check(scene, count, supervision, seen=True, **changes):
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_degenerate_scenes_train_without_nan(scene):
     check(scene(), 20, targets_of(), seen=scene is not loud)  # no image from 0 to 1 has colours of a million
 

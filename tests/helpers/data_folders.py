@@ -36,15 +36,14 @@ def service(folder):
         recover(context)
         yield context
     finally:
-        context.store.close()
-        context.storage.close()
+        context.close()
 
 
-def add_a_job(context):
+def add_a_job(context, scene=b"ply"):
     """Add a queued job; return its id."""
     job_id = uuid.uuid4().hex
     upload = context.storage.new_upload()
-    upload.write_bytes(b"ply")
+    upload.write_bytes(scene)
     context.storage.adopt(upload, job_id)
     job = Job(
         id=job_id, owner="", name="scene", options={"preset": "fast"}, preset="fast", evaluate=False, gaussians=3,
@@ -69,10 +68,10 @@ def finish_a_job(context, state=State.SUCCEEDED):
 
 @pytest.fixture(scope="module")
 def sample_folder(tmp_path_factory):
-    """Data folder with 120 succeeded jobs."""
+    """Data folder with 40 succeeded jobs, whose database has several pages."""
     folder = tmp_path_factory.mktemp("sample") / "data"
     with service(folder) as context:
-        for _ in range(120):
+        for _ in range(40):
             finish_a_job(context)
     return folder
 

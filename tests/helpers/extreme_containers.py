@@ -71,7 +71,7 @@ def chosen(name, preset):
 
 
 def encode_settings(preset):
-    return Settings.from_preset(preset, sh_tolerance=0).encode
+    return Settings.research(preset, sh_tolerance=0).encode
 
 
 @functools.cache

@@ -19,7 +19,6 @@ def save_and_wait(self, state):
     save(self, state)
     saved.append(len(saved))
     (folder / f"saves-{{os.getpid()}}").write_text(str(len(saved)))
-    time.sleep({pause})
     while len(saved) == {saves} and (folder / "hold").exists():
         (folder / "waiting").touch()
         time.sleep(0.01)
@@ -37,11 +36,11 @@ class HeldTraining:
         program: Python code to run in the process that trains, before anything else.
     """
 
-    def __init__(self, folder: Path, saves: int, *, pause: float = 0.0) -> None:
-        """Let it wait after so many ``saves``, and ``pause`` seconds after each; ``folder`` belongs to it."""
+    def __init__(self, folder: Path, saves: int) -> None:
+        """Let it wait after so many ``saves``; ``folder`` belongs to it."""
         self._folder = folder
         (folder / "hold").touch()
-        self.program = PROGRAM.format(folder=str(folder), saves=saves, pause=pause)
+        self.program = PROGRAM.format(folder=str(folder), saves=saves)
 
     def wait(self, seconds: float = 300) -> None:
         """Wait until training waits."""

@@ -4,12 +4,12 @@ import random
 import time
 
 import numpy as np
-from hypothesis import settings
 
+from helpers.examples import thorough
 from helpers.memory import takes_less_than
 from kissgs.core.errors import KissgsError
 
-DEFAULT_MUTATIONS, THOROUGH_MUTATIONS = 100, 2000
+DEFAULT_MUTATIONS, THOROUGH_MUTATIONS = 40, 1000
 
 MEMORY = 40_000_000
 """Bytes; the files here hold some dozen Gaussians, so anything near this came from trusting a number."""
@@ -22,16 +22,10 @@ MEMORY_EVERY = 10
 """Memory is measured at every so many mutations, because tracing makes a call ten times slower."""
 
 
-def mutation_count():
-    """Return how many mutations to try: more under the hypothesis profile "thorough"."""
-    name = getattr(settings, "get_current_profile_name", lambda: "default")()
-    return THOROUGH_MUTATIONS if name == "thorough" else DEFAULT_MUTATIONS
-
-
 def mutations(data, seed):
     """Yield damaged copies: cut off, bits flipped, bytes and numbers overwritten, parts removed or doubled."""
     draw = random.Random(seed)
-    for _ in range(mutation_count()):
+    for _ in range(THOROUGH_MUTATIONS if thorough() else DEFAULT_MUTATIONS):
         damaged = bytearray(data)
         for _ in range(draw.choice([1, 1, 1, 2, 4])):
             # Headers are at the beginning, where most of the decisions are.

@@ -35,4 +35,4 @@ QUICK = {
 
 def with_photographs(finetune=None, **goal):
     tuning = {"steps": 20, "view_size": 40, **(finetune or {})}
-    return Settings.from_preset("balanced", compact=QUICK, finetune=tuning, **FEW_VIEWS, **goal)
+    return Settings.research("balanced", compact=QUICK, finetune=tuning, **FEW_VIEWS, **goal)

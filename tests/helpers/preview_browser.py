@@ -3,21 +3,16 @@
 import base64
 import io
 import re
-import shutil
 import time
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from helpers.service import ROOT
+from helpers.viewers import chromium
+from helpers.web_tools import ROOT
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 VENDOR = ROOT / "web_decoder" / "vendor"
-SOFTWARE = [
-    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-]
 
 COUNT_RESOURCES = """
 const contexts = new Map();
@@ -46,15 +41,10 @@ window.resourceCounts = () => {
 
 @pytest.fixture(scope="module")
 def software_browser():
-    playwright = pytest.importorskip("playwright.sync_api")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium is installed")
     if not VENDOR.exists():
         pytest.skip("scripts/vendor has not run")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+    with chromium() as browser:
         yield browser
-        browser.close()
 
 
 class Preview:

@@ -32,4 +32,4 @@ def random_sensitivity(splats, seed=0, spread=2.0):
 
 
 def encode_rd(splats, sensitivity, **changes):
-    return encode(splats, Settings.from_preset("balanced", **changes).encode, sensitivity=sensitivity)
+    return encode(splats, Settings.research("balanced", **changes).encode, sensitivity=sensitivity)

@@ -94,6 +94,10 @@ class RayCluster:
                         found.append(pid)
         return found
 
+    def kill_node_of(self, pid: int) -> None:
+        """Kill the node that a process runs on."""
+        kill_tree(next(node for node in self.nodes if pid in tree(node.pid)))
+
     def left_by_items(self) -> list[str]:
         """Return the paths of temporary folders of items, on all nodes that run."""
         running = [node for node in self.nodes if node.poll() is None]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from helpers.ray_cluster import NODE_MEMORY, RayCluster
-from helpers.service import Service
+from helpers.service import ServiceProcess
 
 
-class RayService(Service):
+class RayService(ServiceProcess):
     """A service and a cluster of nodes with one processor each, which see no data folder but those that are shared."""
 
     workers = 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -40,9 +39,7 @@ class Facts:
     """Counts of the features that occur in a stream."""
 
     transforms: list = field(default_factory=list)
-    modes: Counter = field(default_factory=Counter)
     tile_bits: list = field(default_factory=list)
-    meta_bits: list = field(default_factory=list)
     palettes: list = field(default_factory=list)
     caches: list = field(default_factory=list)
     groups: int = 0
@@ -102,9 +99,7 @@ class Reader:
             elif kind != SUBTRACT_GREEN:
                 bits = self.read(3) + 2
                 self.facts.tile_bits.append(bits)
-                found = self.image(tiles(width, bits), tiles(self.height, bits))
-                if kind == PREDICTOR and width > 1 and self.height > 1:
-                    self.facts.modes.update(pixel >> 8 & 15 for pixel in found)
+                self.image(tiles(width, bits), tiles(self.height, bits))
         self.image(width, self.height, main=True)
 
     def lengths(self, size):
@@ -142,7 +137,6 @@ class Reader:
             facts.caches.append(cache_bits)
             if self.read(1):
                 bits = self.read(3) + 2
-                facts.meta_bits.append(bits)
                 choice = [pixel >> 8 & 0xFFFF for pixel in self.image(tiles(width, bits), tiles(height, bits))]
                 groups = max(choice) + 1
             facts.groups = groups

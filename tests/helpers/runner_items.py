@@ -45,10 +45,6 @@ def fail(arguments, progress):
     raise LookupError("a bug")
 
 
-def environment(arguments, progress):
-    return {"names": [name for name in os.environ if name.startswith("KISSGS_")]}
-
-
 def crash(arguments, progress):
     os.kill(os.getpid(), signal.SIGSEGV)
 

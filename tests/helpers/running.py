@@ -20,6 +20,11 @@ def outcome_of(runner, work):
     return runner.submit(work).outcome.result(120)
 
 
+def processors(runner):
+    """Return the number of processors of all nodes."""
+    return sum(node.cpus for node in runner.nodes)
+
+
 def wait_until(condition, seconds=60):
     end = time.monotonic() + seconds
     while not condition():

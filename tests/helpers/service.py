@@ -1,16 +1,19 @@
-"""``Service``: a service in a separate process, on the loopback interface."""
+"""``Service`` and ``ServiceProcess``: a service on the loopback interface, in this process or in one of its own."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import json
+import logging
 import os
 import re
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -18,6 +21,10 @@ import httpx
 
 import kissgs
 from kissgs.io.ply import write_ply
+from service.core.settings import ServiceSettings
+from service.http.app import create_app
+from service.http.server import Server, listen
+from service.jobs.container import ServiceContainer
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,25 +39,32 @@ SMALL = scene_bytes()
 """Scene whose job takes hardly longer than the start of its process."""
 
 FAST = json.dumps({"preset": "fast"})
-SLOW = json.dumps({"preset": "paper", "encode": {"plas_radius_decay": 0.99, "sh_kmeans_iterations": 50}})
+SLOW = json.dumps(
+    {"preset": "paper", "encode": {"plas_radius_decay": 0.99, "sh_kmeans_iterations": 50}, "for_research": True}
+)
 """Settings that keep a worker busy."""
 
 
 class Service:
     """Service for use as ``with Service(folder, KISSGS_X=…) as service``; ``service.http`` is its HTTP client.
 
-    Settings in small letters are constants of ``ServiceSettings``, such as ``sync_seconds=2``.
+    It runs in a thread of this process, with a server and job processes as ``kissgs-serve`` has them. Settings in small
+    letters are constants of ``ServiceSettings``, such as ``sync_seconds=2``.
     """
+
+    workers = 1
+    """Number of jobs that run simultaneously."""
 
     def __init__(self, folder: Path, **settings: object) -> None:
         self.folder = folder
         self.constants = {name: value for name, value in settings.items() if name.islower()}
         self.settings = {
+            "KISSGS_PORT": 0,
+            "KISSGS_DATA_DIR": folder,
             "KISSGS_MIN_FREE_BYTES": 0,
             **{name: value for name, value in settings.items() if not name.islower()},
         }
         self.log = folder.parent / f"{folder.name}.log"
-        self.process: subprocess.Popen | None = None
 
     def __enter__(self) -> Service:
         self.start()
@@ -58,47 +72,51 @@ class Service:
 
     def __exit__(self, *error: object) -> None:
         self.http.close()
-        self.kill(signal.SIGKILL)
+        self.stop()
 
     def start(self) -> Service:
-        begin = self.log.stat().st_size if self.log.exists() else 0
-        kept = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
-        chosen = {"KISSGS_PORT": 0, "KISSGS_DATA_DIR": self.folder, **self.settings}
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-P", *self._program()],
-                env={**kept, "PYTHONPATH": str(ROOT), **{name: str(value) for name, value in chosen.items()}},
-                stdout=log,
-                stderr=log,
-            )
-        for _ in range(6000):
-            output = self.log.read_bytes()[begin:].decode(errors="replace")
-            found = re.search(r"listening on (http://127\.0\.0\.1:([0-9]+))", output)
-            if found:
-                self.url, self.port = found[1], int(found[2])
-                self.http = httpx.Client(base_url=self.url, timeout=300, trust_env=False)
-                return self
-            if self.process.poll() is not None:
-                break
-            time.sleep(0.05)
-        raise AssertionError(f"the service did not start: {self.log.read_text()[-3000:]}")
+        model = type("Settings", (ServiceSettings,), {**self.constants, "__module__": __name__})
+        settings = model(**{name.removeprefix("KISSGS_").lower(): value for name, value in self.settings.items()})
+        self._handler = logging.FileHandler(self.log)
+        logger = logging.getLogger("kissgs")
+        logger.addHandler(self._handler)
+        logger.setLevel(logging.INFO)
+        app = create_app(settings)
+        listener = listen(settings)
+        self._server = _Server(app, app.state.context)
+        self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [listener]})
+        self._thread.start()
+        assert self._server.listening.wait(60)
+        self._connect(listener.getsockname()[1])
+        return self
 
-    def _program(self) -> list[str]:
-        if not self.constants:
-            return ["-m", "service"]
-        changes = "".join(f"ServiceSettings.{name} = {value!r}\n" for name, value in self.constants.items())
-        imports = "from service.__main__ import main\nfrom service.core.settings import ServiceSettings\n"
-        return ["-c", f"{imports}{changes}main()"]
+    def interrupt(self) -> None:
+        """Ask the service to end, as Ctrl-C does: the first time soon, the second time at once."""
+        with contextlib.suppress(RuntimeError):  # its loop has ended
+            self._server.loop.call_soon_threadsafe(self._server.handle_exit, signal.SIGINT, None)
 
-    def kill(self, number: int) -> int:
-        """Send a signal, wait for the end, and return the exit status."""
-        if self.process.poll() is None:
-            self.process.send_signal(number)
-        return self.process.wait(timeout=300)
+    def join(self, seconds: float = 300) -> None:
+        """Wait for the end of a service that was interrupted."""
+        self._thread.join(seconds)
+        assert not self._thread.is_alive()
+        logging.getLogger("kissgs").removeHandler(self._handler)
+        self._handler.close()
+
+    def stop(self) -> None:
+        """End all jobs and the service."""
+        while self._thread.is_alive():
+            self.interrupt()
+            self._thread.join(0.1)
+        self.join()
 
     def restart(self) -> Service:
+        """Start a service that has ended once more."""
         self.http.close()
         return self.start()
+
+    def _connect(self, port: int) -> None:
+        self.url, self.port = f"http://127.0.0.1:{port}", port
+        self.http = httpx.Client(base_url=self.url, timeout=300, trust_env=False)
 
     # Common actions of tests ---------------------------------------------------------------------------------
 
@@ -107,6 +125,11 @@ class Service:
             "/v1/jobs", content=data, params={"options": options, "name": "a scene.ply"}, headers=headers
         )
         assert answer.status_code == 202, answer.text
+        return answer.json()
+
+    def cancel(self, job: dict) -> dict:
+        answer = self.http.post(f"/v1/jobs/{job['id']}/cancel")
+        assert answer.status_code == 200, answer.text
         return answer.json()
 
     def status(self, job: dict, wait: float = 0) -> dict:
@@ -122,17 +145,12 @@ class Service:
                 return status
         raise AssertionError(f"job {job['id']} has not ended: {status}")
 
-    def result(self, job: dict) -> bytes:
-        """Return the container of a job, which must succeed."""
-        status = self.ended(job)
-        assert status["state"] == "succeeded", status
-        return self.http.get(status["links"]["result"]).content
-
     def only_result(self, job: dict) -> bytes:
         """Return the container of a job, which must succeed and leave no temporary files."""
-        content = self.result(job)
+        status = self.ended(job)
+        assert status["state"] == "succeeded", status
         assert self.leftovers() == []
-        return content
+        return self.http.get(status["links"]["result"]).content
 
     def running(self, job: dict, stage: str | None = None, seconds: float = 300) -> dict:
         """Wait until the job's process runs, in ``stage`` if given; return the status."""
@@ -146,25 +164,19 @@ class Service:
             time.sleep(0.02)
         raise AssertionError(f"job {job['id']} does not run: {status}\n{self.log.read_text()[-3000:]}")
 
-    workers = 1
-    """Number of jobs that run simultaneously."""
-
     def occupy(self) -> list[dict]:
         """Submit a long job for each worker, and return them once all are running."""
         jobs = [self.submit(scene_bytes(20_000, 3), SLOW) for _ in range(self.workers)]
         return [self.running(job) for job in jobs]
 
     def children(self) -> list[int]:
-        """Return the ids of all job processes."""
-        with contextlib.suppress(OSError):
-            tasks = Path(f"/proc/{self.process.pid}/task").iterdir()
-            return [int(pid) for task in tasks for pid in (task / "children").read_text().split()]
-        return []
-
-    def memory(self) -> int:
-        """Return the peak resident memory of the server process, bytes."""
-        text = Path(f"/proc/{self.process.pid}/status").read_text()
-        return int(re.search(r"VmHWM:\s+([0-9]+) kB", text)[1]) << 10
+        """Return the ids of all job processes, which work in the folders of their jobs."""
+        found = []
+        for process in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                if (process / "cwd").readlink().is_relative_to(self.folder / "jobs"):
+                    found.append(int(process.name))
+        return found
 
     def stored(self) -> set[str]:
         """Return the ids of all jobs that have files."""
@@ -185,6 +197,67 @@ class Service:
         connection = socket.create_connection(("127.0.0.1", self.port), timeout=300)
         connection.sendall(data)
         return connection
+
+
+class _Server(Server):
+    """Server that says when it listens."""
+
+    def __init__(self, app: object, context: ServiceContainer) -> None:
+        super().__init__(app, context)
+        self.listening = threading.Event()
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        self.loop = asyncio.get_running_loop()
+        await super().startup(sockets)
+        self.listening.set()
+
+
+class ServiceProcess(Service):
+    """Service in a process of its own, ``python -m service``, which can be killed and started again."""
+
+    process: subprocess.Popen | None = None
+
+    def start(self) -> Service:
+        begin = self.log.stat().st_size if self.log.exists() else 0
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
+        chosen = {name: str(value) for name, value in self.settings.items()}
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", *self._program()],
+                env={**kept, "PYTHONPATH": str(ROOT), **chosen},
+                stdout=log,
+                stderr=log,
+            )
+        for _ in range(6000):
+            output = self.log.read_bytes()[begin:].decode(errors="replace")
+            if found := re.search(r"listening on http://127\.0\.0\.1:([0-9]+)", output):
+                self._connect(int(found[1]))
+                return self
+            if self.process.poll() is not None:
+                break
+            time.sleep(0.05)
+        raise AssertionError(f"the service did not start: {self.log.read_text()[-3000:]}")
+
+    def _program(self) -> list[str]:
+        if not self.constants:
+            return ["-m", "service"]
+        changes = "".join(f"ServiceSettings.{name} = {value!r}\n" for name, value in self.constants.items())
+        imports = "from service.__main__ import main\nfrom service.core.settings import ServiceSettings\n"
+        return ["-c", f"{imports}{changes}main()"]
+
+    def stop(self) -> None:
+        self.kill(signal.SIGKILL)
+
+    def kill(self, number: int) -> int:
+        """Send a signal, wait for the end, and return the exit status."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.process.wait(timeout=300)
+
+    def memory(self) -> int:
+        """Return the peak resident memory of the server process, bytes."""
+        text = Path(f"/proc/{self.process.pid}/status").read_text()
+        return int(re.search(r"VmHWM:\s+([0-9]+) kB", text)[1]) << 10
 
 
 def read_response(connection: socket.socket) -> bytes:

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import kissgs
 from helpers.reference_sog import sog_files, sog_folder, streamed_files
 from kissgs import Settings
-from kissgs.sog import streamed as streamed_sog
 from kissgs.sog.decode import decode as decode_sog
-from kissgs.sogxt import streamed as streamed_sogxt
+from kissgs.sog.streamed import STREAMED as SOG_FORMAT
 from kissgs.sogxt.decode import decode as decode_sogxt
+from kissgs.sogxt.streamed import STREAMED as SOGXT_FORMAT
 from kissgs.streaming import build
 
-ALL = Settings.from_preset("fast", prune_invisible=False)
+ALL = Settings.research("fast", prune_invisible=False)
 FAST = Settings.from_preset("fast")
 
 
@@ -35,11 +35,17 @@ class Kind:
         return streamed_files(levels, environment=environment, container=self.container, manifest=self.manifest)
 
 
-SOG = Kind("streamed-sog", "lod-meta.json", streamed_sog.decode, sog_folder, lambda scene: decode_sog(sog_files(scene)))
+SOG = Kind(
+    "streamed-sog",
+    "lod-meta.json",
+    SOG_FORMAT.decode,
+    sog_folder,
+    lambda scene: decode_sog(sog_files(scene)),
+)
 SOGXT = Kind(
     "streamed-sogxt",
     "levels.json",
-    streamed_sogxt.decode,
+    SOGXT_FORMAT.decode,
     sogxt_zip,
     lambda scene: decode_sogxt(sogxt_zip(scene, "")[0][".zip"]),
 )

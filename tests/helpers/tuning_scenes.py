@@ -31,7 +31,7 @@ def stopping_after(steps):
 
 def chosen(scene, preset="balanced", container=EVEN_LEVELS, **changes):
     """Return the plan that ``compress`` makes."""
-    settings = Settings.from_preset(preset, **changes).encode
+    settings = Settings.research(preset, **changes).encode
     sensitivity = None
     if settings.rate_distortion:
         cameras = [view.camera for view in around(4)]

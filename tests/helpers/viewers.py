@@ -12,7 +12,9 @@ from kissgs.core.splats import Splats
 from kissgs.rendering.camera import look_at
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
+QUIET = ["--no-sandbox", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
+SOFTWARE = [*QUIET, "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+NO_GPU = [*QUIET, "--disable-gpu"]
 SPARK = "vendor/spark/dist/spark.module.min.js"
 PLAYCANVAS = "node_modules/playcanvas/build/playcanvas.min.mjs"
 PAGE = f"""<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><body>
@@ -81,6 +83,10 @@ class Viewer:
 
     def _cameras(self, cameras, background):
         return {"cameras": list(map(pinhole, cameras)), "background": background}
+
+
+def psnr(a, b):
+    return -10 * np.log10(max(np.mean((a - b) ** 2), 1e-10))
 
 
 @contextlib.contextmanager

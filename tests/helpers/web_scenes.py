@@ -42,7 +42,7 @@ def scene_of(count, degree=0, seed=0, **replaced):
 @functools.cache
 def container(preset="fast", degree=3, count=65):
     """Return a container as files by name."""
-    settings = kissgs.Settings.from_preset(preset, sensitivity_views=4, sensitivity_view_size=48)
+    settings = kissgs.Settings.research(preset, sensitivity_views=4, sensitivity_view_size=48)
     return dict(kissgs.compress(scene_of(count, degree), settings=settings).files)
 
 

@@ -47,6 +47,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
+@pytest.mark.quick(5)
 def test_a_hostile_header_takes_little_memory(name, tmp_path):
     """Sixteen GLBs of two million child indices once took a server from 76 to 2,443 MiB."""
     (tmp_path / name).write_bytes(FILES[name]())

@@ -16,7 +16,7 @@ GLANCE = {"sensitivity_views": 4, "sensitivity_view_size": 48}
 def compressed(cache, scene=SCENE, preset="balanced", views=None, **settings):
     """The files, and whether the scene was looked at."""
     stages = []
-    settings = Settings.from_preset(preset, **{**GLANCE, **settings})
+    settings = Settings.research(preset, **{**GLANCE, **settings})
     found = kissgs.compress(
         scene, settings=settings, cache=cache, views=views, progress=lambda stage, fraction: stages.append(stage)
     )

@@ -11,9 +11,10 @@ from helpers.splat_transform import convert, needs_splat_transform
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.splats import Splats, clean
 from kissgs.io import splat
-from kissgs.io.ksplat import KsplatInfo, is_ksplat, read_ksplat, read_ksplat_info
+from kissgs.io.ksplat import FORMAT, read_ksplat
 from kissgs.io.ply import read_ply
-from kissgs.io.splat import count_splat, read_splat
+from kissgs.io.scene_format import Match
+from kissgs.io.splat import read_splat
 
 
 def test_one_row_by_hand():
@@ -44,7 +45,7 @@ def test_splat_within_half_a_step(count, monkeypatch):
     monkeypatch.setattr(splat, "_BLOCK", 100)
     scene = made_scene(count, 0)
     found = read_splat(splat_bytes(scene))
-    assert count_splat(splat_bytes(scene)) == len(found) == count
+    assert splat.FORMAT.info(splat_bytes(scene), 0).count == len(found) == count
     np.testing.assert_array_equal(found.means, scene.means)
     np.testing.assert_allclose(found.scales, scene.scales, rtol=1e-5, atol=1e-6)
     visible = np.clip(scene.sh0 * SH_C0 + 0.5, 0, 1)
@@ -91,8 +92,10 @@ def test_ksplat_within_half_a_step(level, degree, counts):
     scenes = [inside(made_scene(count, degree)) for count in counts]
     data = ksplat_bytes(scenes, level, unused=2)
     found = read_ksplat(data)
-    assert read_ksplat_info(data) == KsplatInfo(count=sum(counts), sh_degree=degree, level=level, sections=len(counts))
-    assert is_ksplat(data[:512], len(data))
+    stated = FORMAT.info(data, 0)
+    assert (stated.count, stated.sh_degree) == (sum(counts), degree)
+    assert stated.details == {"compression_level": level, "sections": len(counts)}
+    assert FORMAT.sniff(data[:512], len(data)) == Match.LIKELY
     wanted = {name: np.concatenate([getattr(s, name) for s in scenes]) for name in ("means", "scales", "quats", "shN")}
     np.testing.assert_allclose(found.means, wanted["means"], atol=1e-6 if level == 0 else 2.5 / 32767)
     np.testing.assert_allclose(found.scales, wanted["scales"], atol=1e-6 if level == 0 else 1e-3)

@@ -15,7 +15,8 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.io.gltf import read_gltf
 from kissgs.io.ply import read_ply, write_ply
-from kissgs.io.spz import SpzInfo, is_spz, read_spz, read_spz_info
+from kissgs.io.scene_format import Match
+from kissgs.io.spz import FORMAT, SpzInfo, read_spz, read_spz_info
 
 
 def one(version, *, position=bytes(9), alpha=b"\0", color=bytes(3), scale=bytes(3), rotation=None, sh=b"", bits=12):
@@ -93,7 +94,7 @@ def test_within_half_a_step(version, degree, count):
         antialiased=True,
         extensions=False,
     )
-    assert is_spz(data[:512])
+    assert FORMAT.sniff(data[:512], len(data)) == Match.SURE
     np.testing.assert_allclose(found.means, scene.means, rtol=1e-3 if version == 1 else 0, atol=2**-13 * 1.01)
     np.testing.assert_allclose(found.scales, scene.scales, atol=1 / 32 * 1.01)
     np.testing.assert_allclose(found.sh0, scene.sh0, atol=0.5 / 255 / 0.15 * 1.01)

@@ -32,7 +32,7 @@ PRUNE = {
 
 
 def settings(attempts=3, preset="balanced", **goal):
-    return Settings.from_preset(preset, compact={**PRUNE, "max_compactions": attempts}, **FEW_VIEWS, **goal)
+    return Settings.research(preset, compact={**PRUNE, "max_compactions": attempts}, **FEW_VIEWS, **goal)
 
 
 def test_the_note_of_a_search_precedes_that_of_its_work():
@@ -48,7 +48,7 @@ def test_the_note_of_a_search_precedes_that_of_its_work():
 @pytest.mark.parametrize("allowed", [0.1, 1.0])  # 256 levels per value already lose 0.07 dB here
 @pytest.mark.quick(1)
 def test_a_drop_is_met(allowed):
-    chosen = Settings.from_preset("balanced", max_psnr_drop=allowed, **FEW_VIEWS)
+    chosen = Settings.research("balanced", max_psnr_drop=allowed, **FEW_VIEWS)
     found = kissgs.compress(SCENE, settings=chosen, evaluate=True)
     assert drop_of(found.report.evaluation) < 2 * allowed  # from other cameras
     (drop,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
@@ -62,7 +62,7 @@ def test_a_drop_is_met(allowed):
 @pytest.mark.parametrize("limits", [{"max_ssim_drop": 0.01}, {"max_ssim_drop": 0.01, "max_psnr_drop": 0.15}])
 @pytest.mark.quick(1)
 def test_a_drop_of_ssim_is_met(limits):
-    chosen = Settings.from_preset("balanced", **limits, **FEW_VIEWS)
+    chosen = Settings.research("balanced", **limits, **FEW_VIEWS)
     found = kissgs.compress(SCENE, settings=chosen, evaluate=True)
     assert 1 - found.report.evaluation.mean.candidate.ssim < 2 * 0.01  # from other cameras
     allowed_psnr = limits.get("max_psnr_drop", math.inf)
@@ -88,7 +88,7 @@ def test_a_drop_is_measured_to_photographs_if_there_are_any(tmp_path, goal, most
     """A scene with low PSNR to its photographs loses less by the same errors than the model of 30 dB predicts."""
     scene = cloud(200)
     views = capture_with_photographs(scene, tmp_path)
-    chosen = Settings.from_preset("balanced", **{goal: most}, **FEW_VIEWS)
+    chosen = Settings.research("balanced", **{goal: most}, **FEW_VIEWS)
     found = kissgs.compress(scene, settings=chosen, views=views, evaluate=True)
     mean = found.report.evaluation.mean
     lost = getattr(mean.reference, figure) - getattr(mean.candidate, figure)
@@ -102,33 +102,31 @@ def test_an_unreachable_drop_is_refused():
         UnsupportedError,
         match=r"^max_ssim_drop 1e-09 cannot be met: the finest container found loses 0\.\d+ of SSIM; allow",
     ):
-        kissgs.compress(
-            SCENE, settings=Settings.from_preset("balanced", max_psnr_drop=9, max_ssim_drop=1e-9, **FEW_VIEWS)
-        )
+        kissgs.compress(SCENE, settings=Settings.research("balanced", max_psnr_drop=9, max_ssim_drop=1e-9, **FEW_VIEWS))
     with pytest.raises(UnsupportedError, match=r"max_psnr_drop 1e-09 dB cannot be met: .* loses \d\.\d+ dB; allow"):
-        kissgs.compress(SCENE, settings=Settings.from_preset("balanced", max_psnr_drop=1e-9, **FEW_VIEWS))
+        kissgs.compress(SCENE, settings=Settings.research("balanced", max_psnr_drop=1e-9, **FEW_VIEWS))
 
 
 @pytest.mark.quick(0)
 def test_max_encodes_limits_the_trials():
-    plain = len(kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS)).to_zip())
-    chosen = Settings.from_preset("balanced", target_size=int(0.9 * plain), max_encodes=1, **FEW_VIEWS)
+    plain = len(kissgs.compress(SCENE, settings=Settings.research("balanced", **FEW_VIEWS)).to_zip())
+    chosen = Settings.research("balanced", target_size=int(0.9 * plain), max_encodes=1, **FEW_VIEWS)
     with pytest.raises(UnsupportedError, match="the smallest container found has"):
         kissgs.compress(SCENE, settings=chosen)
-    chosen = Settings.from_preset("balanced", target_size=int(1.5 * plain), max_encodes=1, **FEW_VIEWS)
+    chosen = Settings.research("balanced", target_size=int(1.5 * plain), max_encodes=1, **FEW_VIEWS)
     assert len(kissgs.compress(SCENE, settings=chosen).report.trials) == 1
-    finest = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", rd_lambda=2.0**-70, **FEW_VIEWS))
+    finest = kissgs.compress(SCENE, settings=Settings.research("balanced", rd_lambda=2.0**-70, **FEW_VIEWS))
     almost = int(0.97 * len(finest.to_zip()))
-    chosen = Settings.from_preset("balanced", target_size=almost, max_encodes=2, **FEW_VIEWS)
+    chosen = Settings.research("balanced", target_size=almost, max_encodes=2, **FEW_VIEWS)
     assert len(kissgs.compress(SCENE, settings=chosen).report.trials) <= 2
 
 
 @pytest.mark.quick(0)
 def test_fewer_gaussians_for_a_size_that_all_of_them_miss():
-    plain = len(kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS)).to_zip())
+    plain = len(kissgs.compress(SCENE, settings=Settings.research("balanced", **FEW_VIEWS)).to_zip())
     wanted = int(0.45 * plain)
     with pytest.raises(UnsupportedError, match="or for fewer Gaussians: compact with auto_count"):
-        kissgs.compress(SCENE, settings=Settings.from_preset("balanced", target_size=wanted, **FEW_VIEWS))
+        kissgs.compress(SCENE, settings=Settings.research("balanced", target_size=wanted, **FEW_VIEWS))
     found = kissgs.compress(SCENE, settings=settings(target_size=wanted))
     assert 0.85 * wanted <= len(found.to_zip()) <= wanted
     assert found.report.compaction.count < 600
@@ -141,7 +139,7 @@ def test_without_training_all_gaussians_stay_for_a_quality(goal):
     found = kissgs.compress(SCENE, settings=settings(**goal))
     assert found.report.compacted == 0
     assert "a smaller number would serve the goal less" in found.report.compaction.note
-    alone = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS, **goal))
+    alone = kissgs.compress(SCENE, settings=Settings.research("balanced", **FEW_VIEWS, **goal))
     assert [trial.bytes for trial in found.report.trials] == [trial.bytes for trial in alone.report.trials]
 
 
@@ -180,7 +178,7 @@ def test_a_stopped_search_returns_its_best(count):
             stopped.append(stage)
             raise kissgs.StopSearch
 
-    chosen = Settings.from_preset("balanced", max_psnr_drop=0.3, **FEW_VIEWS)
+    chosen = Settings.research("balanced", max_psnr_drop=0.3, **FEW_VIEWS)
     whole = kissgs.compress(SCENE, settings=chosen)
     if count > len(whole.report.trials):
         return
@@ -210,7 +208,7 @@ def test_a_stopped_search_returns_its_best(count):
 )
 def test_invalid_goals(goal, changes, message):
     with pytest.raises(UnsupportedError, match=message):
-        Settings.from_preset("balanced", compact={"auto_count": True, **changes}, **goal)
+        Settings.research("balanced", compact={"auto_count": True, **changes}, **goal)
 
 
 def test_no_checkpoint_of_a_search(tmp_path):

@@ -2,12 +2,13 @@
 
 import math
 from contextlib import suppress
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from kissgs.pipeline.curves import NoFurtherError, along_path, first_point
+from kissgs.pipeline.curves import LOG2_LAMBDA_RANGE, LambdaCurve, NoFurtherError, along_path, first_point
 from kissgs.pipeline.goal import Attempt, Goal
 from kissgs.pipeline.search import NEAR_HALVINGS
 from kissgs.pipeline.search_time import AIMING, MEETING, SearchPlan
@@ -244,3 +245,34 @@ def test_a_bound_is_kept_and_lambda_goes_beyond_it():
 def test_unknown_figures_end_the_search(figures):
     trials, _ = search({"max_psnr_drop": 0.2}, lambda number, x: figures)
     assert len(trials) == 1
+
+
+def lambda_search(target, entry_bytes=40, most=7):
+    """Return the attempts of a search for a size; the codebook has up to 4,000 entries and sides of multiples of 8."""
+    made = []
+
+    def encode(settings):
+        x = START if settings.rd_lambda is None else math.log2(settings.rd_lambda)
+        wanted = 4000 / settings.gaussians_per_codebook_entry * 2 ** (-0.3 * max(x - START, -3))
+        side = min(8 * math.ceil(math.sqrt(wanted) / 8), math.isqrt(settings.sh_codebook_size))
+        size = round(60_000 * 2 ** (-0.2 * max(x - START, -12))) + entry_bytes * side**2
+        container = SimpleNamespace(encoded=SimpleNamespace(codebook_side=side))
+        made.append(Attempt(1, 2.0**x, size, container=container))
+        return made[-1]
+
+    settings = EncodeSettings(target_size=target)
+    LambdaCurve(Goal.of(settings), encode, settings, most, sh_degree=3).search()
+    return made
+
+
+@pytest.mark.parametrize("target", [62_000, 84_000, 90_000, 99_000, 110_000, 140_000, 200_000])
+def test_a_size_is_met_by_lambda_also_between_two_sides_of_the_codebook(target):
+    made = lambda_search(target)
+    assert max(attempt.bytes for attempt in made if attempt.bytes <= target) > 0.95 * target
+    assert len(made) <= 8
+
+
+def test_the_finest_container_with_the_largest_codebook_is_tried_second_for_a_size_far_above():
+    made = lambda_search(10**7)
+    assert [math.log2(attempt.rd_lambda) for attempt in made] == [START, LOG2_LAMBDA_RANGE[0]]
+    assert made[1].made.encoded.codebook_side > made[0].made.encoded.codebook_side

@@ -88,7 +88,7 @@ def test_coarse_steps_are_named_and_an_origin_mends_them(offset, ending, tmp_pat
     kissgs.decompress(out, decoded)
     coarse = largest_error(wanted, positions_of(decoded)) > SIZE / 4
     assert coarse == ("positions have steps of" in plain.report.note)
-    assert coarse == ("origin=auto" in plain.report.note)
+    assert coarse == ('--origin auto (in Python origin="auto")' in plain.report.note)
     assert coarse or (ending == ".sog" and max(offset) < 1e5)  # it has a range of each axis
 
     moved = kissgs.compress(scene, out, settings=FAST, reading=AUTO, overwrite=True)
@@ -113,7 +113,7 @@ def test_small_gaussians_among_large_ones_are_no_matter_of_distance(tmp_path):
     scene = kissgs.load(write(tmp_path / "a.ply", around((0, 0, 0), 1000) / 4, size=sizes))
 
     def coarse(**settings):
-        found = kissgs.compress(scene, settings=kissgs.Settings.from_preset("fast", **settings))
+        found = kissgs.compress(scene, settings=kissgs.Settings.research("fast", **settings))
         assert found.report.note == ""
         errors = np.abs(kissgs.decompress(found.files).means - scene.means[found.order]).max(axis=1)
         return coarse_share(errors, scene.scales[found.order])
@@ -133,7 +133,7 @@ def test_the_remedy_that_is_named_helps(size, reading, tmp_path):
     scene = write(tmp_path / "a.ply", positions, size=sizes)
     note = kissgs.compress(scene, settings=FAST).report.note
     assert "compressing into FOLDER/lod-meta.json" in note
-    assert ("with origin=auto" in note) == (reading == AUTO)
+    assert ("with --origin auto" in note) == (reading == AUTO)
     report = kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST, reading=reading)
     assert "positions have steps of" not in report.note
 
@@ -333,7 +333,7 @@ def test_a_streamed_scene_records_its_origin(manifest, tmp_path):
 
 def test_a_goal_that_coarse_positions_prevent_names_them(tmp_path):
     scene = write(tmp_path / "a.ply", around(OFFSETS["one axis"]))
-    settings = kissgs.Settings.from_preset("balanced", psnr=60.0, sensitivity_views=4, sensitivity_view_size=64)
+    settings = kissgs.Settings.research("balanced", psnr=60.0, sensitivity_views=4, sensitivity_view_size=64)
     with pytest.raises(kissgs.UnsupportedError, match="positions have steps of"):
         kissgs.compress(scene, settings=settings)
 

@@ -12,7 +12,7 @@ from kissgs.pipeline.goal import Attempt, Goal
 
 
 def goal_of(**limits):
-    return Goal.of(Settings.from_preset("balanced", **limits).encode)
+    return Goal.of(Settings.research("balanced", **limits).encode)
 
 
 def test_infinity_and_nan_in_json():

@@ -42,7 +42,7 @@ def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal
     assert np.median(moved) < 0.2 * np.median(np.linalg.norm(decoded.means[::-1] - scene.means[found.order], axis=1))
     plain = {"compact": {"ratio": 1}, "finetune": {"enabled": False}}
     without = kissgs.compress(
-        scene, settings=Settings.from_preset("balanced", **plain, **FEW_VIEWS, **goal), views=views, evaluate=True
+        scene, settings=Settings.research("balanced", **plain, **FEW_VIEWS, **goal), views=views, evaluate=True
     )
     if "target_size" in goal:
         assert mean.candidate.psnr > without.report.evaluation.mean.candidate.psnr
@@ -100,7 +100,7 @@ def test_the_order_leads_to_the_input(tmp_path):
     ],
 )
 def test_what_settings_leave_open(given, compacts, tunes):
-    goal = Settings.from_preset("balanced", max_psnr_drop=0.1, **given)
+    goal = Settings.research("balanced", max_psnr_drop=0.1, **given)
     chosen = goal.decided(photographs=True, torch=True)
     assert (chosen.compact.auto_count, chosen.finetune.enabled) == (compacts, tunes)
     bare = goal.decided(photographs=None, torch=True)
@@ -125,9 +125,9 @@ def test_what_settings_leave_open(given, compacts, tunes):
     ],
 )
 def test_towards_a_goal_of_ssim_training_gives_it_more_weight(goal, given, weights):
-    chosen = Settings.from_preset("balanced", **goal, **given).decided(photographs=True, torch=True)
+    chosen = Settings.research("balanced", **goal, **given).decided(photographs=True, torch=True)
     assert chosen.decided(photographs=True, torch=True) == chosen
-    assert (chosen.compact.used_ssim_weight, chosen.finetune.used_ssim_weight) == weights
+    assert (chosen.compact.ssim_weight, chosen.finetune.ssim_weight) == weights
 
 
 def test_without_torch_the_report_says_what_is_missing(tmp_path, monkeypatch):

@@ -35,7 +35,7 @@ SMALL, LARGE = with_faint(NEEDED), with_faint(kissgs.sample_scene(3000, sh_degre
 
 def settings(tunes=True, steps=200, **goal):
     finetune = {"enabled": tunes, "steps": steps, **VIEWS}
-    return Settings.from_preset("balanced", compact=VIEWS, finetune=finetune, **FEW_VIEWS, **goal)
+    return Settings.research("balanced", compact=VIEWS, finetune=finetune, **FEW_VIEWS, **goal)
 
 
 def psnr(found, scene):
@@ -83,7 +83,7 @@ def test_a_loss_that_is_estimated_is_called_so_once():
     alone = {"compact": {"auto_count": False}, "finetune": {"enabled": False}}
     few = {"sensitivity_views": 16, "sensitivity_view_size": 96}
     for changes in (alone, {"finetune": {"enabled": False}}):
-        chosen = kissgs.Settings.from_preset("balanced", max_psnr_drop=0.5, **changes, **few)
+        chosen = kissgs.Settings.research("balanced", max_psnr_drop=0.5, **changes, **few)
         report = kissgs.compress(SMALL, settings=chosen).report
         notes = report.note + ("" if report.compaction is None else report.compaction.note)
         assert notes.count("the drop of PSNR is estimated for a scene that has 30 dB") == 1
@@ -107,7 +107,7 @@ def test_ctrl_c_keeps_the_container_of_the_encoder():
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 @pytest.mark.parametrize("goal", [{"max_psnr_drop": 1.0}, {"max_ssim_drop": 0.05}, {"target_size": "6kB"}])
-@pytest.mark.quick(3)
+@pytest.mark.quick(1)
 def test_few_gaussians(count, goal):
     few = SMALL.select(np.arange(count))
     found = kissgs.compress(few, settings=settings(steps=3, **goal))

@@ -13,7 +13,7 @@ VIEWS = 6
 
 
 def kept(scene: Splats, preset: str, **settings: object) -> Splats:
-    return decompress(compress(scene, settings=Settings.from_preset(preset, **settings)).to_zip())
+    return decompress(compress(scene, settings=Settings.research(preset, **settings)).to_zip())
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -340,7 +340,7 @@ def test_given_sensitivity_is_used():
             color_weight=measured.color_weight * less[:, 0],
         )
         result = kissgs.compress(
-            SCENE, sensitivity=one, settings=Settings.from_preset("balanced", prune_threshold_bits=0, rd_lambda=1e-8)
+            SCENE, sensitivity=one, settings=Settings.research("balanced", prune_threshold_bits=0, rd_lambda=1e-8)
         )
         found = kissgs.decompress(result.files)
         errors.append(np.abs(found.opacities - SCENE.opacities[result.order])[halves[result.order]].mean())
@@ -355,6 +355,7 @@ def test_given_sensitivity_is_used():
 
 @pytest.mark.parametrize("changes", [{"preset": "fast"}, {"preset": "balanced", "sensitivity_views": 2}])
 @pytest.mark.parametrize("needed", [False, True])
+@pytest.mark.quick(2)
 def test_a_scene_from_a_file_is_dropped_before_its_images_are_compressed(tmp_path, changes, needed):
     count = 1234
     kissgs.save(kissgs.sample_scene(count, sh_degree=1), tmp_path / "scene.ply")
@@ -365,7 +366,7 @@ def test_a_scene_from_a_file_is_dropped_before_its_images_are_compressed(tmp_pat
             scenes = [thing for thing in gc.get_objects() if type(thing) is Splats]
             alive.append(sum(len(scene) == count for scene in scenes))
 
-    settings = kissgs.Settings.from_preset(**changes)
+    settings = kissgs.Settings.research(**changes)
     kissgs.compress(tmp_path / "scene.ply", settings=settings, evaluate=needed, progress=progress)
     assert alive
     assert (min(alive) > 0) if needed else (max(alive) == 0)

@@ -17,8 +17,9 @@ from helpers.web_tools import DECODER
 import kissgs
 from kissgs import InvalidContainerError, InvalidSceneError, KissgsError, Settings, UnsupportedError
 from kissgs.core.splats import clean
+from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline.inspect import describe
-from kissgs.pipeline.scene_files import ReadOptions, open_scene, read_scene, recognise, stored_bytes
+from kissgs.pipeline.scene_files import open_scene, read_scene, recognise, stored_bytes
 
 SCENE = made_scene(30, 1, extremes=False)
 ROOT, BUFFER = document(attributes(SCENE))
@@ -211,7 +212,7 @@ def test_a_limit_that_is_given_holds_for_every_format(name, tmp_path):
 
 
 def test_the_default_limit_is_for_formats_that_can_declare_more_than_they_hold(tmp_path, monkeypatch):
-    monkeypatch.setattr("kissgs.pipeline.scene_files.MAX_GAUSSIANS", 3)
+    monkeypatch.setattr("kissgs.io.scene_format.MAX_GAUSSIANS", 3)
     refused = set()
     for name, (_, data) in FILES.items():
         (tmp_path / name).write_bytes(data)

@@ -11,7 +11,7 @@ from helpers.format_scenes import made_scene
 
 import kissgs
 from kissgs import OutputError, UnsupportedError
-from kissgs.pipeline.scene_files import OUTPUT_FORMATS, output_format
+from kissgs.formats import OUTPUT_FORMATS, output_format
 
 ENDINGS = [*OUTPUT_FORMATS, "SPZ", "Compressed.PLY"]
 

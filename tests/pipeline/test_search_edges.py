@@ -21,7 +21,7 @@ TUNE = {"enabled": True, "steps": 4, "views": 16, "view_size": 48}
 
 def settings(compact=None, finetune=None, **goal):
     finetune = finetune or {"enabled": False}
-    return Settings.from_preset("balanced", compact=compact, finetune=finetune, **FEW_VIEWS, **goal)
+    return Settings.research("balanced", compact=compact, finetune=finetune, **FEW_VIEWS, **goal)
 
 
 def stop_at(wanted, number=1):
@@ -89,7 +89,7 @@ def test_no_goal_is_met_if_an_object_is_lost(goal):
     """One of two objects is missing: the mean over views hid that, as views of the other object lose nothing."""
     away = Splats(**{name: getattr(SCENE, name) + np.float32(1000 * (name == "means")) for name in ATTRIBUTES})
     both = Splats(**{name: np.concatenate([getattr(SCENE, name), getattr(away, name)]) for name in ATTRIBUTES})
-    one = encode(SCENE, Settings.from_preset("fast", quality_offset_db=12).encode, threads=1)
+    one = encode(SCENE, Settings.research("fast", quality_offset_db=12).encode, threads=1)
     found = SearchEvaluation(both, None, 1)(kissgs.decompress(one.files))
     limits = Goal.of(settings(**goal).encode)
     attempt = limits.measured(Attempt(len(SCENE), None, 0), found)
@@ -106,7 +106,7 @@ def test_the_reported_settings_reproduce_the_container(goal):
     report = found.report.settings["encode"]
     assert {name: report[name] for name in goal} == goal
     again = {**report, "psnr": None, "max_psnr_drop": None, "rd_lambda": found.report.rd_lambda}
-    assert kissgs.compress(SCENE, settings=Settings(encode=again)).to_zip() == found.to_zip()
+    assert kissgs.compress(SCENE, settings=Settings.research(**again)).to_zip() == found.to_zip()
 
 
 def test_infinity_is_null_in_json():

@@ -16,9 +16,9 @@ MORE_VIEWS = {"sensitivity_views": 16, "sensitivity_view_size": 96}  # their PSN
 @pytest.mark.parametrize("share", [0.7, 1.15])
 @pytest.mark.quick(1)
 def test_a_target_size_is_met(share):
-    plain = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS))
+    plain = kissgs.compress(SCENE, settings=Settings.research("balanced", **FEW_VIEWS))
     wanted = round(share * len(plain.to_zip()))
-    found = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", target_size=wanted, **FEW_VIEWS))
+    found = kissgs.compress(SCENE, settings=Settings.research("balanced", target_size=wanted, **FEW_VIEWS))
     assert 0.97 * wanted <= len(found.to_zip()) <= wanted
     assert found.report.trials[0].bytes == pytest.approx(len(plain.to_zip()), rel=0.01)
     assert len(found.to_zip()) in [trial.bytes for trial in found.report.trials]
@@ -28,9 +28,9 @@ def test_a_target_size_is_met(share):
 @pytest.mark.quick(1)
 def test_a_psnr_is_met(change):
     """The search has other cameras than the evaluation, so that their PSNR may differ."""
-    plain = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **MORE_VIEWS), evaluate=True)
+    plain = kissgs.compress(SCENE, settings=Settings.research("balanced", **MORE_VIEWS), evaluate=True)
     wanted = plain.report.evaluation.mean.candidate_vs_reference.psnr + change
-    settings = Settings.from_preset("balanced", psnr=wanted, **MORE_VIEWS)
+    settings = Settings.research("balanced", psnr=wanted, **MORE_VIEWS)
     found = kissgs.compress(SCENE, settings=settings, evaluate=True)
     made = max((trial for trial in found.report.trials if trial.bytes == len(found.to_zip())), key=lambda t: t.psnr)
     assert made.psnr >= wanted
@@ -45,13 +45,13 @@ def test_a_psnr_is_met(change):
 
 @pytest.mark.quick(0)
 def test_the_reported_lambda_and_codebook_reproduce_the_container():
-    found = kissgs.compress(SCENE, settings=Settings.from_preset("small", target_size="40 kB", **FEW_VIEWS))
+    found = kissgs.compress(SCENE, settings=Settings.research("small", target_size="40 kB", **FEW_VIEWS))
     made = found.report.settings["encode"]
     same = {
         "rd_lambda": found.report.rd_lambda,
         **{name: made[name] for name in ("gaussians_per_codebook_entry", "sh_codebook_size")},
     }
-    again = kissgs.compress(SCENE, settings=Settings.from_preset("small", **same, **FEW_VIEWS))
+    again = kissgs.compress(SCENE, settings=Settings.research("small", **same, **FEW_VIEWS))
     assert again.files == found.files
 
 
@@ -61,14 +61,14 @@ FIXED = kissgs.sample_scene(4000, sh_degree=3, seed=4)
 @pytest.mark.quick(0)
 def test_a_size_is_met_between_two_sides_of_the_codebook():
     """Sides are multiples of 8; one step of the side is some kB for this scene."""
-    found = kissgs.compress(FIXED, settings=Settings.from_preset("balanced", target_size=61_500, **UNTRAINED))
+    found = kissgs.compress(FIXED, settings=Settings.research("balanced", target_size=61_500, **UNTRAINED))
     assert 0.97 * 61_500 <= len(found.to_zip()) <= 61_500
 
 
 @pytest.mark.quick(0)
 def test_the_codebook_grows_for_a_large_target_size():
     """The finest container of this scene with seven Gaussians per entry has 96 kB."""
-    found = kissgs.compress(FIXED, settings=Settings.from_preset("balanced", target_size=140_000, **UNTRAINED))
+    found = kissgs.compress(FIXED, settings=Settings.research("balanced", target_size=140_000, **UNTRAINED))
     assert 0.97 * 140_000 <= len(found.to_zip()) <= 140_000
     assert found.report.settings["encode"]["gaussians_per_codebook_entry"] == 1
 
@@ -78,11 +78,11 @@ def test_the_codebook_grows_for_a_large_target_size():
 def test_a_target_size_above_every_container_takes_two_encodings(degree):
     """Regression: it searched seven sizes, up to the same finest container."""
     scene = kissgs.sample_scene(600, sh_degree=degree, seed=5)
-    found = kissgs.compress(scene, settings=Settings.from_preset("balanced", target_size="3MB", **FEW_VIEWS))
+    found = kissgs.compress(scene, settings=Settings.research("balanced", target_size="3MB", **FEW_VIEWS))
     assert [trial.rd_lambda for trial in found.report.trials][1:] == [2.0**-70]
     made = found.report.settings["encode"]["gaussians_per_codebook_entry"]
     finest = {"rd_lambda": 2.0**-70, "gaussians_per_codebook_entry": made}
-    again = kissgs.compress(scene, settings=Settings.from_preset("balanced", **finest, **FEW_VIEWS))
+    again = kissgs.compress(scene, settings=Settings.research("balanced", **finest, **FEW_VIEWS))
     assert again.files == found.files
     assert made == (1 if degree else 7)
     size = len(found.to_zip())
@@ -94,9 +94,9 @@ def test_a_target_size_above_every_container_takes_two_encodings(degree):
 def test_a_target_size_just_above_the_finest_container_is_searched_for():
     """It is below the bound of all containers, so the search itself must find that the finest is the best."""
     few = kissgs.sample_scene(600, sh_degree=0, seed=5)
-    finest = kissgs.compress(few, settings=Settings.from_preset("balanced", rd_lambda=2.0**-70, **FEW_VIEWS))
+    finest = kissgs.compress(few, settings=Settings.research("balanced", rd_lambda=2.0**-70, **FEW_VIEWS))
     wanted = round(1.05 * len(finest.to_zip()))
-    found = kissgs.compress(few, settings=Settings.from_preset("balanced", target_size=wanted, **FEW_VIEWS))
+    found = kissgs.compress(few, settings=Settings.research("balanced", target_size=wanted, **FEW_VIEWS))
     assert found.files == finest.files
     assert len(found.report.trials) > 2
     assert "is above the finest container" in found.report.note
@@ -107,7 +107,7 @@ def test_the_psnr_in_the_error_message_can_be_met():
     few = kissgs.sample_scene(1000, sh_degree=1, seed=2)
 
     def search(psnr):
-        return kissgs.compress(few, settings=Settings.from_preset("balanced", psnr=psnr, **FEW_VIEWS))
+        return kissgs.compress(few, settings=Settings.research("balanced", psnr=psnr, **FEW_VIEWS))
 
     with pytest.raises(UnsupportedError) as refused:
         search(150)
@@ -116,10 +116,11 @@ def test_the_psnr_in_the_error_message_can_be_met():
     assert max(trial.psnr for trial in search(highest - 0.3).report.trials) >= highest - 0.3
 
 
+@pytest.mark.quick(0)
 def test_equal_gaussians_can_meet_a_psnr():
     """The PSNR over lambda is a staircase: the goal is met only after several attempts without gain."""
     equal = kissgs.sample_scene(400, sh_degree=1, seed=3).select([5] * 400)
-    found = kissgs.compress(equal, settings=Settings.from_preset("balanced", psnr=30, **FEW_VIEWS))
+    found = kissgs.compress(equal, settings=Settings.research("balanced", psnr=30, **FEW_VIEWS))
     assert max(trial.psnr for trial in found.report.trials) >= 30
 
 
@@ -139,7 +140,7 @@ def test_equal_gaussians_can_meet_a_psnr():
 @pytest.mark.quick(0)
 def test_unreachable_goals_are_refused_and_nothing_is_written(tmp_path, goal, message):
     with pytest.raises(UnsupportedError, match=message):
-        kissgs.compress(SCENE, tmp_path / "a.zip", settings=Settings.from_preset("balanced", **goal, **FEW_VIEWS))
+        kissgs.compress(SCENE, tmp_path / "a.zip", settings=Settings.research("balanced", **goal, **FEW_VIEWS))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -148,7 +149,7 @@ def test_unreachable_goals_are_refused_and_nothing_is_written(tmp_path, goal, me
 def test_goals_of_scenes_of_few_gaussians(count):
     few = SCENE.select(range(count))
     for goal in ({"psnr": 20}, {"target_size": "9kB"}):
-        found = kissgs.compress(few, settings=Settings.from_preset("balanced", **goal, **FEW_VIEWS))
+        found = kissgs.compress(few, settings=Settings.research("balanced", **goal, **FEW_VIEWS))
         assert len(found.to_zip()) < 9000
         assert len(kissgs.decompress(found.files)) <= count
 
@@ -178,7 +179,7 @@ def test_goals_of_scenes_of_few_gaussians(count):
 )
 def test_invalid_goals_are_refused(preset, goal, message):
     with pytest.raises(UnsupportedError, match=message):
-        Settings.from_preset(preset, **goal)
+        Settings.research(preset, **goal)
 
 
 def test_a_search_can_be_cancelled(tmp_path):
@@ -190,7 +191,7 @@ def test_a_search_can_be_cancelled(tmp_path):
         if encodings == 2:
             raise kissgs.Cancelled
 
-    settings = Settings.from_preset("balanced", target_size="20kB", **FEW_VIEWS)
+    settings = Settings.research("balanced", target_size="20kB", **FEW_VIEWS)
     with pytest.raises(kissgs.Cancelled):
         kissgs.compress(SCENE, tmp_path / "a.zip", settings=settings, progress=stop)
     assert list(tmp_path.iterdir()) == []

@@ -27,7 +27,7 @@ def no_saved_speed(monkeypatch, tmp_path):
 
 
 def plan_of(seconds, count=100_000, *, photographs=True, **changes):
-    requested = Settings.from_preset(changes.pop("preset", "balanced"), time_limit=seconds, **changes)
+    requested = Settings.research(changes.pop("preset", "balanced"), time_limit=seconds, **changes)
     decided = requested.decided(photographs=photographs or None, torch=True)
     time = SearchTime(Deadline.after(seconds), encode_seconds(decided.preset, count, 2))
     return in_time(requested, decided, time, count=count, captured=photographs, torch=True)
@@ -240,7 +240,7 @@ def test_a_goal_that_training_does_not_recover_is_met_by_the_encoder(tmp_path, m
 @pytest.mark.quick(0)
 def test_much_time_makes_twice_the_usual_steps_on_renderings():
     tuning = {"steps": 6, "views": 24, "view_size": 40}
-    settings = Settings.from_preset("balanced", finetune=tuning, time_limit=LONG, **FEW_VIEWS)
+    settings = Settings.research("balanced", finetune=tuning, time_limit=LONG, **FEW_VIEWS)
     tuned = kissgs.compress(cloud(200), settings=settings).report.finetuning
     assert (tuned.steps, tuned.target_source) == (12, "renderings")
 
@@ -313,7 +313,7 @@ def test_the_note_says_what_torch_would_have_bought(tmp_path, monkeypatch):
     views = photographs(scene, tmp_path)
     monkeypatch.setattr("kissgs.pipeline.training_choice.has_torch", lambda: False)
     for capture in (views, None):
-        plenty, little = (Settings.from_preset("balanced", time_limit=t, **FEW_VIEWS) for t in (LONG, 1e-3))
+        plenty, little = (Settings.research("balanced", time_limit=t, **FEW_VIEWS) for t in (LONG, 1e-3))
         assert "torch is missing" in kissgs.compress(scene, settings=plenty, views=capture).report.note
         assert "torch is missing" not in kissgs.compress(scene, settings=little, views=capture).report.note
 
@@ -330,17 +330,17 @@ def test_captures_without_held_out_photographs_are_not_trained_on(tmp_path):
 def test_a_size_and_a_quality_come_before_the_time():
     scene = kissgs.sample_scene(1500, sh_degree=1, seed=5)
     views = {"sensitivity_views": 4, "sensitivity_view_size": 48}
-    alone = kissgs.compress(scene, settings=Settings.from_preset("balanced", psnr=36, **views))
-    both = Settings.from_preset("balanced", psnr=36, target_size=len(alone.to_zip()), time_limit=1e-3, **views)
+    alone = kissgs.compress(scene, settings=Settings.research("balanced", psnr=36, **views))
+    both = Settings.research("balanced", psnr=36, target_size=len(alone.to_zip()), time_limit=1e-3, **views)
     assert len(kissgs.compress(scene, settings=both).to_zip()) <= len(alone.to_zip())
 
 
 @pytest.mark.quick(1)
 def test_a_goal_comes_before_the_time():
     scene = cloud(400)
-    plain = kissgs.compress(scene, settings=Settings.from_preset("balanced", **FEW_VIEWS))
+    plain = kissgs.compress(scene, settings=Settings.research("balanced", **FEW_VIEWS))
     wanted = round(0.8 * len(plain.to_zip()))
-    settings = Settings.from_preset("balanced", time_limit=1e-3, target_size=wanted, **FEW_VIEWS)
+    settings = Settings.research("balanced", time_limit=1e-3, target_size=wanted, **FEW_VIEWS)
     found = kissgs.compress(scene, settings=settings)
     assert len(found.to_zip()) <= wanted
     assert found.report.trials[-1].bytes == len(found.to_zip())  # the search ended with the first that fits
@@ -376,7 +376,7 @@ def test_times_have_units(text, seconds):
 )
 def test_impossible_times_are_refused(settings, message):
     with pytest.raises(UnsupportedError) as failed:
-        Settings.from_preset("balanced", **settings)
+        Settings.research("balanced", **settings)
     assert message in str(failed.value)
 
 
@@ -384,10 +384,10 @@ def test_impossible_times_are_refused(settings, message):
 def test_size_and_quality_must_both_hold():
     scene = kissgs.sample_scene(1500, sh_degree=1, seed=5)
     views = {"sensitivity_views": 4, "sensitivity_view_size": 48}
-    alone = kissgs.compress(scene, settings=Settings.from_preset("balanced", psnr=36, **views))
-    both = Settings.from_preset("balanced", psnr=36, target_size=len(alone.to_zip()), **views)
+    alone = kissgs.compress(scene, settings=Settings.research("balanced", psnr=36, **views))
+    both = Settings.research("balanced", psnr=36, target_size=len(alone.to_zip()), **views)
     assert kissgs.compress(scene, settings=both).files == alone.files
     with pytest.raises(
         UnsupportedError, match=f"target_size and psnr cannot be met together.*{len(alone.to_zip()):,} bytes"
     ):
-        kissgs.compress(scene, settings=Settings.from_preset("balanced", psnr=36, target_size=900, **views))
+        kissgs.compress(scene, settings=Settings.research("balanced", psnr=36, target_size=900, **views))

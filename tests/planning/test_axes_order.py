@@ -24,15 +24,6 @@ def test_bands_blocks_rows_and_columns_follow_the_axes():
             assert (np.diff(block[..., 3], axis=1) >= 0).all()
 
 
-def test_neighbours_are_more_alike_than_before():
-    vectors = np.random.default_rng(1).normal(size=(64 * 64, 9)) * np.geomspace(1, 0.1, 9)
-    vectors = vectors.astype(np.float32)
-    table = vectors[axes_order(principal_axes(vectors, 4))].reshape(64, 64, 9)
-    shuffled = vectors.reshape(64, 64, 9)
-    rough, before = (np.abs(np.diff(image, axis=1)).sum() for image in (table, shuffled))
-    assert rough < 0.6 * before
-
-
 @pytest.mark.parametrize("dimensions", [1, 3])
 def test_few_dimensions_still_give_a_permutation(dimensions):
     vectors = np.random.default_rng(2).normal(size=(256, dimensions)).astype(np.float32)

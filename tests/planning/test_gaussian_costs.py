@@ -44,19 +44,6 @@ def test_what_is_dropped_is_worth_least_and_never_more_than_half():
         assert sorted(np.flatnonzero(dropped)) == sorted(ranked[:count])
 
 
-def test_classes_are_of_like_sensitivity_and_size():
-    splats = random_scene(1000, 0)
-    costs = Costs.of(random_sensitivity(splats), splats).take(np.arange(0, 1000, 2))
-    places = splats.means[::2]
-    classes = costs.classes(5, places)
-    assert np.bincount(classes).tolist() == [100] * 5
-    worth = costs.scale * costs.rotation * costs.color
-    assert all(worth[classes == c].min() >= worth[classes == c + 1].max() for c in range(4))
-    assert (costs.classes(1, places) == 0).all()
-    for few in range(1, 10):
-        assert (np.bincount(costs.take(np.arange(few)).classes(32, places[:few])) == 1).all()
-
-
 def test_gaussians_in_one_place_keep_their_order():
     """The stored order decides which of them is in front."""
     splats = random_scene(600, 0)

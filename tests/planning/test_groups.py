@@ -26,9 +26,9 @@ def order_of(settings, sensitivity, groups):
 @pytest.mark.parametrize("classes", [None, 1, 3])
 def test_groups_follow_one_another(classes, order):
     """Without sensitivity, and with one or several classes of steps inside each group."""
-    settings, sensitivity = Settings.from_preset("fast", order=order).encode, None
+    settings, sensitivity = Settings.research("fast", order=order).encode, None
     if classes is not None:
-        settings = Settings.from_preset("balanced", order=order, step_classes=classes, prune_threshold_bits=0).encode
+        settings = Settings.research("balanced", order=order, step_classes=classes, prune_threshold_bits=0).encode
         sensitivity = random_sensitivity(SCENE)
     encoded = order_of(settings, sensitivity, GROUPS)
     assert (np.diff(GROUPS[encoded.order].astype(int)) >= 0).all()
@@ -42,7 +42,7 @@ def test_groups_follow_one_another(classes, order):
 
 
 def test_other_orders_and_too_many_groups_are_refused():
-    plas = Settings.from_preset("fast", order="plas").encode
+    plas = Settings.research("fast", order="plas").encode
     with pytest.raises(UnsupportedError, match="order=hilbert"):
         order_of(plas, None, GROUPS)
     many = GROUPS.copy()

@@ -210,11 +210,6 @@ def test_codebook_sides_follow_the_formula(count, ratio):
     assert side == 256 or (side + 8) ** 2 * ratio > count
 
 
-def test_codebook_sides_of_the_published_containers():
-    known = {8: 24, 32: 56, 128: 120, 256: 176, 512: 248, 1024: 256, 2048: 256}
-    assert {thousands: codebook_side(1000 * thousands / 8) for thousands in known} == known
-
-
 @pytest.mark.parametrize(
     "vectors",
     [

@@ -39,14 +39,6 @@ def test_the_curve_steps_to_neighbours_on_the_finest_level(corner):
     assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
 
 
-def test_near_in_space_is_near_on_the_curve():
-    """Far better than the order of one axis: the mean distance of consecutive points, by brute force."""
-    levels = np.random.default_rng(1).integers(0, 65536, (5000, 3)).astype(np.uint16)
-    hilbert = np.linalg.norm(np.diff(walk(levels), axis=0), axis=1).mean()
-    by_x = np.linalg.norm(np.diff(levels[np.argsort(levels[:, 0])].astype(int), axis=0), axis=1).mean()
-    assert hilbert < by_x / 5
-
-
 def test_gaussians_in_one_cell_keep_their_order():
     levels = np.repeat(np.array([[9, 9, 9], [1, 2, 3], [9, 9, 9]], np.uint16), 50, axis=0)
     order = hilbert_order(levels)
@@ -95,12 +87,6 @@ def test_every_gaussian_gets_one_cell_and_padding_repeats_some(count, order):
     if count:
         assert set(grid.cells[~grid.mask]) <= set(kept)
         assert (grid.cells[grid.mask][grid.cell_to_gaussian] == grid.cells).all()
-
-
-def test_hilbert_padding_repeats_the_last_gaussian():
-    grid = placed(random_scene(100, 0), np.arange(100), "hilbert")
-    assert grid.mask[:100].all()
-    assert (grid.cells[100:] == grid.cells[99]).all()
 
 
 @pytest.mark.parametrize("order", ["hilbert", "plas"])

@@ -111,7 +111,7 @@ def test_the_scene_is_the_same_in_fewer_bytes(with_sensitivity):
     sensitivity = random_sensitivity(splats) if with_sensitivity else None
     decoded, sizes = [], []
     for order in ("hilbert", "refined"):
-        result = encode(splats, Settings.from_preset("balanced", order=order).encode, sensitivity=sensitivity)
+        result = encode(splats, Settings.research("balanced", order=order).encode, sensitivity=sensitivity)
         scene = kissgs.decompress(result.files)
         assert len(np.unique(result.order)) == len(result.order) == len(scene)
         columns = [

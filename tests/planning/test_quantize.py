@@ -14,6 +14,7 @@ from kissgs.core.signed_log import signed_exp, signed_log
 from kissgs.planning.quantize import (
     MEANS_TOP,
     Quantized,
+    even_table,
     means_bits,
     observed_range,
     quantize,
@@ -147,13 +148,13 @@ def test_ranges_are_right_after_extremes_were_removed(values, removed, shared):
     whole = quantize(values, step=0.5, shared=shared)
     keep = np.argsort(whole.levels.max(axis=1), kind="stable")[: len(values) - min(removed, len(values) - 1)]
     keep = keep[whole.levels[keep].min(axis=1).argsort(kind="stable")][len(keep) // 3 :]
-    part = Quantized(whole.levels[keep], whole.low, whole.high, whole.top)
+    part = whole.take(keep)
     wanted = dequantize(whole)[keep]
     np.testing.assert_allclose(decoded(part), wanted, rtol=1e-6, atol=1e-6 * np.abs(values).max())
 
 
 def test_anchor_of_one_level_throughout_is_its_value():
-    part = Quantized(np.full((4, 2), 3, np.uint8), np.float32([0, 10]), np.float32([10, 10]), 10)
+    part = Quantized(np.full((4, 2), 3, np.uint8), even_table(np.float32([0, 10]), np.float32([10, 10]), 10))
     low, high = observed_range(part)
     assert (low == [3, 10]).all()
     assert (high == low).all()

@@ -19,14 +19,12 @@ RD_PRESETS = ["balanced", "small"]
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 65, 2000])
-@pytest.mark.quick(6)
+@pytest.mark.quick(3)
 def test_round_trips(count, degree):
     splats = clean(random_scene(count, degree, seed=count))[0]
     result = compress(
         splats,
-        settings=Settings.from_preset(
-            "balanced", prune_threshold_bits=0, sensitivity_views=4, sensitivity_view_size=64
-        ),
+        settings=Settings.research("balanced", prune_threshold_bits=0, sensitivity_views=4, sensitivity_view_size=64),
     )
     assert_round_trip(splats, result)
     reference_decoder.assert_equal_scenes(
@@ -115,7 +113,7 @@ def test_colours_are_asked_for_once_the_rest_is_known():
         asked.append((decoded, order))
         return np.full((len(order), 3), 0.25, np.float32)
 
-    settings = Settings.from_preset("balanced", order="hilbert").encode
+    settings = Settings.research("balanced", order="hilbert").encode
     result = encode(splats, settings, sensitivity=random_sensitivity(splats), recolor=recolor)
     ((decoded, order),) = asked
     found = decompress(result.files)
@@ -162,7 +160,7 @@ def test_many_gaussians_that_were_dropped_are_noted_in_the_report(superfluous, m
         scene = kissgs.Splats(
             **{name: np.concatenate([getattr(scene, name), getattr(more, name)]) for name in ATTRIBUTES}
         )
-    settings = kissgs.Settings.from_preset("balanced", sensitivity_views=8, sensitivity_view_size=96)
+    settings = kissgs.Settings.research("balanced", sensitivity_views=8, sensitivity_view_size=96)
     report = kissgs.compress(scene, settings=settings).report
     assert (report.pruned_by_rd > 0.2 * len(scene)) == many
     assert bool(report.note) == many
@@ -178,7 +176,7 @@ def test_an_enormous_coefficient_does_not_change_what_is_kept():
     plain = kissgs.sample_scene(4000, seed=3)
     shN = plain.shN.copy()
     shN[::800, 4, 1] = 1e5
-    settings = kissgs.Settings.from_preset("balanced", sensitivity_views=12, sensitivity_view_size=128)
+    settings = kissgs.Settings.research("balanced", sensitivity_views=12, sensitivity_view_size=128)
     usual, found = (
         set(kissgs.compress(scene, settings=settings).order.tolist()) for scene in (plain, replace(plain, shN=shN))
     )

@@ -19,7 +19,7 @@ def cameras(count=12):
 
 @functools.cache
 def compressed(preset, **changes):
-    return kissgs.compress(SCENE, settings=kissgs.Settings.from_preset(preset, **changes))
+    return kissgs.compress(SCENE, settings=kissgs.Settings.research(preset, **changes))
 
 
 def psnrs(scene, found, views, background=(0, 0, 0)):
@@ -83,7 +83,7 @@ def test_a_wall_is_kept_however_opaque(logit):
     scene = kissgs.Splats(**{name: np.concatenate([getattr(SCENE, name), getattr(wall, name)]) for name in names})
     assert np.argmax(removal_scores(scene, cameras())) == len(SCENE)
     for preset in ("balanced", "small"):
-        settings = kissgs.Settings.from_preset(preset, sensitivity_views=8, sensitivity_view_size=100)
+        settings = kissgs.Settings.research(preset, sensitivity_views=8, sensitivity_view_size=100)
         assert len(SCENE) in kissgs.compress(scene, settings=settings).order
 
 

@@ -16,7 +16,7 @@ from kissgs.planning.rdo_quantize import (
     VIRTUAL,
     largest_changes,
     quantize_by_class,
-    rdo_quantize_shapes,
+    rdo_quantize,
 )
 
 
@@ -25,8 +25,9 @@ def anything(count):
     return {name: np.full(count, change) for name, change in CAPTURED.items()}
 
 
-def parts_of(values, steps=(0.4, 0.3, 0.1)):
-    return tuple(quantize(values[:, a:b], step=s) for (a, b), s in zip(((0, 1), (1, 4), (4, 8)), steps, strict=True))
+def parts_of(values):
+    columns = {"opacities": (0, 1, 0.4), "scales": (1, 4, 0.3), "quaternions": (4, 8, 0.1)}
+    return {name: quantize(values[:, a:b], step=step) for name, (a, b, step) in columns.items()}
 
 
 def test_a_step_costs_what_a_bit_does():
@@ -67,7 +68,7 @@ def test_without_a_rate_cost_levels_are_the_nearest_along_each_axis():
     splats = random_scene(count, 0)
     costs = Costs.of(random_sensitivity(splats), splats)
     with Workers(1) as pool:
-        found = rdo_quantize_shapes(
+        found = rdo_quantize(
             values,
             parts,
             np.tile(packed_hessian(np.diag([1.0] * 4 + [0] * 3)), (count, 1)),
@@ -76,13 +77,11 @@ def test_without_a_rate_cost_levels_are_the_nearest_along_each_axis():
             anything(count),
             pool,
         )
-    for part, chosen, (a, b) in list(zip(parts, found, ((0, 1), (1, 4), (4, 8)), strict=True))[:2]:
+    for name, wanted in (("opacities", values[:, :1]), ("scales", values[:, 1:4])):
+        part = parts[name]
         each = (part.high.astype(float) - part.low) / part.top
-        np.testing.assert_allclose(
-            chosen.low + chosen.levels * ((chosen.high.astype(float) - chosen.low) / chosen.top),
-            np.rint((values[:, a:b] - part.low) / each) * each + part.low,
-            atol=1e-4,
-        )
+        nearest = np.rint((wanted - part.low) / each) * each + part.low
+        np.testing.assert_allclose(found[name].from_zero().values(), nearest, atol=1e-4)
 
 
 def test_rdo_quantisation_never_costs_more_than_the_nearest_level():
@@ -100,7 +99,7 @@ def test_rdo_quantisation_never_costs_more_than_the_nearest_level():
         **{name: np.full(count, 1e-9) for name in ("opacity", "scale", "rotation")},
     )
     with Workers(1) as pool:
-        found = rdo_quantize_shapes(
+        found = rdo_quantize(
             values,
             parts,
             np.tile(packed_hessian(form), (count, 1)),
@@ -111,12 +110,12 @@ def test_rdo_quantisation_never_costs_more_than_the_nearest_level():
         )
 
     def decoded(chosen):
-        return np.concatenate([p.low + p.levels * ((p.high.astype(float) - p.low) / p.top) for p in chosen], axis=1)
+        return np.concatenate([part.values() for part in chosen.values()], axis=1)
 
     def total(chosen):
         off = (decoded(chosen) - values)[:, :4]
         bits = 0.0
-        for column in np.concatenate([part.levels for part in chosen], axis=1).T:
+        for column in np.concatenate([part.levels for part in chosen.values()], axis=1).T:
             counts = np.bincount(column)
             bits -= (counts[counts > 0] * np.log2(counts[counts > 0] / count)).sum()
         return np.einsum("ni,ij,nj->", off, form[:4, :4], off) + rd_lambda * bits

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from helpers.codec_scenes import random_scene
 
+from kissgs.core.progress import silent
 from kissgs.core.resources import Workers
-from kissgs.planning.container_model import EVEN_LEVELS
+from kissgs.planning.container_model import EVEN_LEVELS, Planning
 from kissgs.planning.quantize import means_bits, quantize, quantize_means
 from kissgs.planning.rd_criterion import Costs
 from kissgs.planning.rdo_quantize import level_bits
-from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS, StoredShapes, choose_forms
-from kissgs.planning.rows import BLOCK, for_each_block, row_range, selected, sorted_order
+from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS, choose_forms
+from kissgs.planning.rows import BLOCK, for_each_block, selected, sorted_order
 from kissgs.settings import Settings
 from kissgs.sog.encode import SOG
 
@@ -23,15 +24,6 @@ def test_blocks_cover_every_row_once_and_in_order(count):
         found = for_each_block(count, lambda rows: np.arange(count)[rows], pool)
     np.testing.assert_array_equal(np.concatenate([*found, np.empty(0, int)]), np.arange(count))
     assert all(0 < len(rows) <= BLOCK for rows in found)
-
-
-@pytest.mark.parametrize("count", BORDERS)
-def test_the_range_is_that_of_all_rows(count):
-    values = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
-    index = np.random.default_rng(0).permutation(count).astype(np.int32)
-    low, high = row_range(selected(values, index))
-    np.testing.assert_array_equal(low, values.min(axis=0))
-    np.testing.assert_array_equal(high, values.max(axis=0))
 
 
 @pytest.mark.parametrize("count", [0, *BORDERS])
@@ -81,8 +73,8 @@ def test_the_stored_form_is_the_largest_w_of_the_24_rotations(count):
     splats = random_scene(count, 0, seed=count)
     cells = np.random.default_rng(count).permutation(count).astype(np.int32)
     with Workers(2) as pool:
-        shapes, error = choose_forms(splats, cells, 8, Settings().encode, pool, lambda fraction: None, SOG)
-        free, _ = choose_forms(splats, cells, 8, Settings().encode, pool, lambda fraction: None, EVEN_LEVELS)
+        shapes, error = choose_forms(splats, cells, 8, Planning(Settings().encode, SOG, pool, silent))
+        free, _ = choose_forms(splats, cells, 8, Planning(Settings().encode, EVEN_LEVELS, pool, silent))
     quats = splats.quats[cells].astype(float)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     w = quats @ (ROTATIONS * (1, -1, -1, -1)).T
@@ -96,16 +88,6 @@ def test_the_stored_form_is_the_largest_w_of_the_24_rotations(count):
     assert (free[:][:, 4] == 1).all(), "decoders normalise, so w takes no bits"
     np.testing.assert_allclose(free[:][:, 5:], stored[:, 5:] / stored[:, 4:5], atol=1e-12)
     np.testing.assert_array_equal(free[:][:, :4], stored[:, :4])
-
-
-def test_parts_of_the_stored_form_agree():
-    splats = random_scene(500, 0)
-    rng = np.random.default_rng(0)
-    shapes = StoredShapes(splats, rng.permutation(500), rng.integers(0, 48, 500).astype(np.uint8))
-    whole, rows = shapes[:], slice(100, 333)
-    for part, columns in ((shapes.opacities, slice(0, 1)), (shapes.scales, slice(1, 4)), (shapes.quats, slice(4, 8))):
-        np.testing.assert_array_equal(part[rows], whole[rows, columns])
-    np.testing.assert_array_equal(shapes.take(np.arange(rows.start, rows.stop))[:], whole[rows])
 
 
 @pytest.mark.parametrize("count", BORDERS)

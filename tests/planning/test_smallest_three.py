@@ -24,7 +24,7 @@ def test_decoded_rotations_are_near_and_of_length_one(quats):
     omitted = three.omitted_components(quats)
     signed = three.with_sign(quats, omitted)
     levels = three.lattice_levels(three.stored_components(signed, omitted), 1)
-    found = three.quaternions(levels, omitted)
+    found = three.whole(three.TABLE[levels], omitted)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-12)
     assert np.degrees(angles(found, quats)).max() < 2
     missing = np.take_along_axis(found, omitted[:, None].astype(np.int64), axis=1)

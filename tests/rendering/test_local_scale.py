@@ -10,16 +10,15 @@ from hypothesis import strategies as st
 
 from kissgs import sample_scene
 from kissgs.rendering.coverage import local_scale
-from kissgs.rendering.cpu.neighbours import split_into_leaves
+from kissgs.rendering.cpu.neighbours import leaves_of
 
 
 @given(st.lists(st.integers(-3, 3), min_size=0, max_size=60), st.integers(1, 8))
 def test_a_part_is_split_at_its_median_and_the_first_of_equal_values_are_below_it(values, leaf):
     """The choice among equal values is the same on every processor."""
-    columns = np.zeros((3, len(values)), np.float32)
-    columns[1] = values
-    order, edges = np.arange(len(values), dtype=np.int32), np.empty(4 * len(values) + 2, np.int64)
-    found = split_into_leaves(columns, leaf, order, edges)
+    points = np.zeros((len(values), 3), np.float32)
+    points[:, 1] = values
+    order, edges = leaves_of(points, leaf)
 
     def parts(members):
         if len(members) <= leaf:
@@ -27,7 +26,7 @@ def test_a_part_is_split_at_its_median_and_the_first_of_equal_values_are_below_i
         ascending = sorted(members, key=lambda n: (values[n], n))
         return parts(ascending[: len(members) // 2]) + parts(ascending[len(members) // 2 :])
 
-    assert [sorted(order[a:b].tolist()) for a, b in itertools.pairwise(edges[: found + 1])] == parts(range(len(values)))
+    assert [sorted(order[a:b].tolist()) for a, b in itertools.pairwise(edges)] == parts(range(len(values)))
 
 
 @pytest.mark.parametrize("spacing", [1e-3, 1.0, 1e4])

@@ -4,8 +4,6 @@ Reference: the textbook formulas in float64, for each window or by convolutions 
 """
 
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -74,7 +72,8 @@ def image_pair(height, width, seed=0):
 
 
 @pytest.mark.parametrize(
-    ("height", "width"), [(1, 1), (1, 2), (3, 5), (11, 11), (12, 40), (40, 12), (131, 3), (2, 163), (130, 161)]
+    ("height", "width"),
+    [(1, 1), (1, 2), (3, 5), (11, 11), (12, 40), (131, 3), (2, 163), (130, 161), (1, 700)],
 )
 def test_ssim_is_that_of_the_textbook(height, width):
     """Smaller than the window, and with one or several tiles in either direction."""
@@ -82,16 +81,8 @@ def test_ssim_is_that_of_the_textbook(height, width):
     assert ssim(image, reference) == pytest.approx(naive_ssim(image, reference), abs=1e-6)
 
 
-@pytest.mark.parametrize(("height", "width"), [(1, 4096), (4096, 1)])
-def test_ssim_of_a_line(height, width):
-    image, reference = image_pair(height, width)
-    assert ssim(image, reference) == pytest.approx(naive_ssim(image, reference), abs=1e-6)
-
-
 @pytest.mark.quick(3)
-@pytest.mark.parametrize(
-    ("height", "width"), [(177, 195), (11, 11), (22, 57), (12, 300), (21, 90), (87, 99), (175, 200), (400, 176)]
-)
+@pytest.mark.parametrize(("height", "width"), [(177, 195), (11, 11), (22, 57), (21, 300), (87, 99), (400, 176)])
 def test_ms_ssim_is_that_of_the_textbook(height, width):
     """All numbers of scales, sizes at their limits and odd ones, and several tiles in either direction."""
     image, reference = image_pair(height, width)
@@ -111,39 +102,12 @@ def test_ms_ssim_of_an_inverted_image_is_zero(side):
     assert ms_ssim(image, 1 - image) == 0
 
 
-def test_ms_ssim_separates_scales():
-    """A difference of single pixels disappears at coarse scales; one of the same energy over 16 pixels does not."""
-    noise = 0.1 * np.random.default_rng(0).choice([-1, 1], (192, 192, 3)).astype(np.float32)
-    image = 0.2 + 0.6 * smooth_image(np.random.default_rng(1), 192, 192)
-    coarse = np.kron(noise[:12, :12], np.ones((16, 16, 1), dtype=np.float32))
-    assert psnr(image + noise, image) == pytest.approx(psnr(image + coarse, image), abs=1e-4)
-    assert ssim(image + noise, image) < ssim(image + coarse, image)
-    assert ms_ssim(image + noise, image) > ssim(image + noise, image)
-
-
 def test_ssim_of_bright_and_uniform_images_is_accurate():
     """The variance is a small difference of large numbers: computed in float32, it would have no correct digit."""
     rng = np.random.default_rng(3)
     image = np.float32(0.9) + np.float32(0.001) * rng.standard_normal((30, 30, 3), dtype=np.float32)
     reference = image + np.float32(0.01) * rng.standard_normal((30, 30, 3), dtype=np.float32)
     assert ssim(image, reference) == pytest.approx(naive_ssim(image, reference), abs=2e-6)
-
-
-@pytest.mark.parametrize("value", [0.0, 0.3, 1.0, 7.0, -3.0])
-def test_ssim_of_equal_constant_images_is_exactly_one(value):
-    image = np.full((20, 33, 3), value, dtype=np.float32)
-    assert ssim(image, image.copy()) == 1
-    assert psnr(image, image.copy()) == math.inf
-
-
-def test_one_pixel_in_closed_form():
-    """It is surrounded by zeros, so that the means are w x and w y, and the moments w x² and so on."""
-    x, y, w = 0.8, 0.5, (1 / np.exp(-(np.arange(-5.0, 6.0) ** 2) / 4.5).sum()) ** 2
-    luminance = (2 * w * w * x * y + C1) / (w * w * (x * x + y * y) + C1)
-    v = w - w * w
-    expected = luminance * (2 * v * x * y + C2) / (v * (x * x + y * y) + C2)
-    images = (np.full((1, 1, 3), value, dtype=np.float32) for value in (x, y))
-    assert ssim(*images) == pytest.approx(expected, abs=1e-6)
 
 
 def test_psnr_of_a_known_offset():
@@ -178,6 +142,7 @@ def test_properties_of_the_metrics(data, shape, limit):
     """Both are exactly symmetric, in [-1, 1], and 1 for equal images, for any values that a renderer may produce."""
     values = st.floats(-limit, limit, width=32, allow_nan=False)
     image, reference = (data.draw(arrays(np.float32, shape, elements=values)) for _ in range(2))
+    before = image.copy(), reference.copy()
     score = ssim(image, reference)
     assert -1 - 1e-6 <= score <= 1 + 1e-6
     assert score == ssim(reference, image)
@@ -185,9 +150,12 @@ def test_properties_of_the_metrics(data, shape, limit):
     assert 0 <= ms_ssim(image, reference) == ms_ssim(reference, image) <= 1 + 1e-6
     assert ms_ssim(image, image.copy()) == 1
     assert psnr(image, reference) == psnr(reference, image)
+    assert psnr(image, image.copy()) == math.inf
+    assert np.array_equal(image, before[0])
+    assert np.array_equal(reference, before[1])
 
 
-@pytest.mark.parametrize("extreme", [math.inf, -math.inf, 3e38, 1e9, -1e20, 1e-40])
+@pytest.mark.parametrize("extreme", [math.inf, -math.inf, 3e38, -1e20, 1e-40])
 def test_extreme_values_give_a_finite_value(extreme):
     image, reference = image_pair(25, 25)
     image[12, 12] = extreme
@@ -213,11 +181,8 @@ def test_nan_is_not_hidden(where):
 def test_images_of_different_or_invalid_shapes_are_refused(metric, first, second):
     with pytest.raises(InvalidViewsError, match=r"must have one shape, \(height, width, 3\), not \("):
         metric(np.zeros(first, dtype=np.float32), np.zeros(second, dtype=np.float32))
-
-
-def test_integers_other_than_bytes_are_refused():
     with pytest.raises(InvalidViewsError, match="uint8 or floats in \\[0, 1\\], not int64"):
-        psnr(np.zeros((2, 2, 3), dtype=np.int64), np.zeros((2, 2, 3), dtype=np.int64))
+        metric(np.zeros((2, 2, 3), dtype=np.int64), np.zeros((2, 2, 3), dtype=np.int64))
 
 
 def test_the_result_does_not_depend_on_threads():
@@ -232,18 +197,3 @@ def test_the_result_does_not_depend_on_threads():
         results.append((sums.tobytes(), gradient.tobytes()))
         assert np.isfinite(gradient).all()
     assert results[0] == results[1] == results[2]
-
-
-def test_the_inputs_are_not_changed():
-    pair = image_pair(20, 20)
-    before = [image.copy() for image in pair]
-    ssim(*pair)
-    ms_ssim(*pair)
-    psnr(*pair)
-    assert all((after == image).all() for after, image in zip(pair, before, strict=True))
-
-
-def test_metrics_do_not_import_torch():
-    code = "import numpy, sys; from kissgs.rendering.metrics import ssim; " \
-        "ssim(*numpy.zeros((2, 4, 4, 3), numpy.float32)); sys.exit('torch' in sys.modules)"  # fmt: skip
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -17,7 +17,6 @@ from kissgs.core.progress import load_kernels
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.differentiable import rasterize
-from kissgs.rendering.gsplat_backend import alpha_max
 from kissgs.rendering.rasterizer import BLACK, render
 from kissgs.rendering.tensors import tensors_of
 
@@ -37,7 +36,14 @@ devices = pytest.mark.parametrize("device", ["cpu", CUDA])
 
 
 def clamp_of(device):
-    return alpha_max() if device == "cuda" else 0.99
+    """Return the largest alpha; releases of gsplat up to 1.5.3 have 0.999, and do not export it."""
+    if device == "cpu":
+        return 0.99
+    try:
+        from gsplat.cuda import _constants
+    except ImportError:
+        return 0.999
+    return float(_constants.MAX_ALPHA)
 
 
 def check_image(splats, view, background, device="cpu", tolerance=1e-4):
@@ -56,7 +62,7 @@ def check_image(splats, view, background, device="cpu", tolerance=1e-4):
 
 @devices
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 60])
+@pytest.mark.parametrize("count", [0, 1, 130])
 def test_images_agree_with_the_reference(count, degree, device):
     check_image(blobs(count, degree, seed=count), camera(seed=count), (0.2, 0.5, 0.9), device)
 

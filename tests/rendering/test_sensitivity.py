@@ -70,7 +70,8 @@ def differences(splats, view, n):
     return np.array(shape), np.array(position)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.quick(2)
 def test_shape_hessians_agree_with_derivatives_of_the_image(seed):
     splats, view = clean(blobs(6, seed % 3, seed=seed, log_scale=-1.5))[0], camera(seed=seed)
     found = measure_sensitivity(splats, weighted(view))
@@ -107,7 +108,8 @@ def test_shape_hessians_of_antialiased_scenes_agree_with_derivatives_of_the_imag
         np.testing.assert_allclose(found.shape_hessian[n], expected, rtol=3e-3, atol=3e-3 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.quick(1)
 def test_position_hessians_of_small_gaussians_agree_with_derivatives(seed):
     """The change of a footprint's shape by position is neglected; it is small for small Gaussians."""
     splats, view = clean(blobs(6, 0, seed=seed, log_scale=-3.5))[0], camera(90, 70, seed=seed)
@@ -143,7 +145,7 @@ def test_removal_agrees_with_removal_scores(monkeypatch, end, tolerance):
     np.testing.assert_allclose(found, scores, rtol=tolerance, atol=0.1 * tolerance * scores.max())
 
 
-@pytest.mark.parametrize("spread", [0.1, 0.5])
+@pytest.mark.parametrize("spread", [0.5])
 def test_an_unknown_background_is_the_mean_over_backgrounds(spread):
     splats, view = clean(blobs(12, 1, seed=6))[0], camera(seed=3)
     found = measure_sensitivity(splats, weighted(view, spread=spread))
@@ -202,7 +204,7 @@ def test_sensitivity_does_not_depend_on_threads():
         np.testing.assert_array_equal(getattr(one_thread, name), getattr(three, name))
 
 
-@pytest.mark.parametrize("band", [64, 1000])
+@pytest.mark.parametrize("band", [64])
 def test_sensitivity_does_not_depend_on_bands_of_tiles(monkeypatch, band):
     scene, views = kissgs.sample_scene(3000, sh_degree=1), weighted(camera(96, 64), camera(64, 96))
     whole = measure_sensitivity(scene, views)
@@ -276,7 +278,7 @@ def measured(colors, splats):
     )
 
 
-@pytest.mark.parametrize("view_uncertainty", [0.1, 0.55, 1.0])
+@pytest.mark.parametrize("view_uncertainty", [0.1, 1.0])
 def test_unseen_gaussians_take_the_prior(view_uncertainty):
     """The prior is 2e-6 per unit of ``close_up``, the median of the seen Gaussians."""
     splats = together(*[one()] * 6)
@@ -297,7 +299,7 @@ def test_unseen_gaussians_take_the_prior(view_uncertainty):
     found.check(splats)
 
 
-@pytest.mark.parametrize("view_uncertainty", [0.1, 0.55, 0.9])
+@pytest.mark.parametrize("view_uncertainty", [0.1, 0.9])
 def test_logarithms_are_shrunk_towards_the_prior_by_view_uncertainty(view_uncertainty):
     splats = together(*[one()] * 5)
     close_up, prior = np.ones(5), 1e-6

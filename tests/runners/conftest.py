@@ -1,11 +1,10 @@
 """Fixtures: a runner on this machine, and one on a Ray cluster of two nodes."""
 
 import pytest
-from helpers.ray_cluster import NODE_MEMORY, PATHS
-from helpers.running import wait_until
+from helpers.ray_cluster import PATHS
+from helpers.running import processors, wait_until
 
-from kissgs.runners.contract import Resources
-from kissgs.runners.local import LocalRunner
+from kissgs.runners import LocalRunner
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -18,7 +17,7 @@ def _find_helpers():
 
 @pytest.fixture(scope="session")
 def ray_runner(ray_cluster):
-    from kissgs.runners.ray_runner import RayRunner
+    from kissgs.runners import RayRunner
 
     runner = RayRunner(ray_cluster.address)
     yield runner
@@ -28,22 +27,22 @@ def ray_runner(ray_cluster):
 @pytest.fixture
 def whole_cluster(ray_cluster, ray_runner):
     """The cluster, with both nodes before and after the test."""
-    wait_until(lambda: ray_runner.stats().cpus == 2)
+    wait_until(lambda: processors(ray_runner) == 2)
     yield ray_cluster
     ray_cluster.restore()
-    wait_until(lambda: ray_runner.stats().cpus == 2)
+    wait_until(lambda: processors(ray_runner) == 2)
 
 
 @pytest.fixture(scope="session")
 def local_runner(_find_helpers):
-    runner = LocalRunner(Resources(cpus=2, memory=NODE_MEMORY))
+    runner = LocalRunner()
     yield runner
     runner.close()
 
 
 @pytest.fixture(params=["local", "ray"])
 def runner(request):
-    """Each runner, with two processors in all, when all of its nodes can run items."""
+    """Each runner, on Ray when all of its nodes can run items."""
     found = request.getfixturevalue(f"{request.param}_runner")
-    wait_until(lambda: found.stats().cpus == 2)
+    wait_until(lambda: request.param == "local" or processors(found) == 2)
     return found

@@ -11,39 +11,28 @@ from helpers.running import item
 import kissgs
 from kissgs.cli.compress_cluster import ClusterCompression
 from kissgs.runners import Resources, WorkItem
-from kissgs.runners.contract import NodeResources, RunnerStats, refusal_of
+from kissgs.runners.contract import refusal_of
 from kissgs.runners.process import ItemProcess, json_lines
 
 
 @pytest.mark.parametrize(
-    "output",
+    ("status", "used", "output", "expected"),
     [
-        "LLVM ERROR: out of memory\nBuffer allocation failed",
-        "OpenBLAS error: Memory allocation still failed after 10 retries, giving up.",
-        "terminate called after throwing an instance of 'std::bad_alloc'",
-        "numpy._core._exceptions._ArrayMemoryError: Unable to allocate 17 MiB",
+        (-signal.SIGABRT, 0.1, "LLVM ERROR: out of memory\nBuffer allocation failed", "memory-limit"),
+        (-signal.SIGABRT, 0.1, "OpenBLAS error: Memory allocation still failed after 10 retries", "memory-limit"),
+        (-signal.SIGABRT, 0.1, "terminate called after throwing an instance of 'std::bad_alloc'", "memory-limit"),
+        (-signal.SIGABRT, 0.1, "numpy._core._exceptions._ArrayMemoryError: Unable to allocate", "memory-limit"),
+        (-signal.SIGSEGV, 0.7, "Segmentation fault", "crashed"),
+        (-signal.SIGSEGV, 0.9, "", "memory-limit"),
+        (-signal.SIGKILL, 0.9, "", "crashed"),  # killed from outside: by the system or by a person
+        (1, 0.9, "", "memory-limit"),
+        (1, 0.7, "", "internal"),
     ],
 )
-def test_messages_of_libraries_at_the_memory_limit(output):
-    process = ItemProcess(item("count", memory_limit=1 << 30))
-    assert process._explain(None, -signal.SIGABRT, io.BytesIO(output.encode())).code == "memory-limit"
-    assert process._explain(None, -signal.SIGSEGV, io.BytesIO(b"Segmentation fault")).kind == "crashed"
-
-
-@pytest.mark.parametrize(
-    ("status", "used", "expected"),
-    [
-        (-signal.SIGSEGV, 0.9, "memory-limit"),
-        (-signal.SIGSEGV, 0.7, "crashed"),
-        (-signal.SIGKILL, 0.9, "crashed"),  # killed from outside: by the system or by a person
-        (1, 0.9, "memory-limit"),
-        (1, 0.7, "internal"),
-    ],
-)
-def test_a_crash_without_a_message_near_the_memory_limit(status, used, expected):
+def test_what_a_crash_is_attributed_to(status, used, output, expected):
     process = ItemProcess(item("count", memory_limit=1 << 30))
     process._peak_data = int(used * (1 << 30))
-    assert process._explain(None, status, io.BytesIO()).code == expected
+    assert process._explain(None, status, io.BytesIO(output.encode())).code == expected
 
 
 def test_a_folder_that_this_machine_does_not_see(tmp_path):
@@ -84,10 +73,7 @@ def test_a_request_is_that_of_a_node_which_has_all_of_it():
     """The largest memory of a cluster may be that of a node without a GPU."""
 
     class Cluster:
-        nodes = (NodeResources("a", Resources(8, 20, 1)), NodeResources("b", Resources(16, 200, 0)))
-
-        def stats(self):
-            return RunnerStats(0, 0, self.nodes)
+        nodes = (Resources(8, 20, 1), Resources(16, 200, 0))
 
         def refusal(self, resources):
             return refusal_of(resources, self.nodes)

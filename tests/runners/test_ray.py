@@ -4,21 +4,23 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from helpers.ray_cluster import kill_tree, tree
-from helpers.running import is_alive, item, outcome_of, pid_in, wait_until
+from helpers.ray_cluster import NODE_MEMORY
+from helpers.running import MB, is_alive, item, outcome_of, pid_in, processors, wait_until
 
 from kissgs.core.errors import RunnerError
-from kissgs.runners import open_runner
+from kissgs.runners import RayRunner, Resources
 from kissgs.runners import ray_runner as ray_runner_module
 
 DRIVER = """
 import sys
 from helpers.running import item
-from kissgs.runners import open_runner
-runner = open_runner("ray", sys.argv[1])
+from kissgs.runners import RayRunner
+runner = RayRunner(sys.argv[1])
 handle = runner.submit(item("write_slowly", starts=sys.argv[2], output=sys.argv[3], text="text"))
 print(handle.outcome.result())
 """
@@ -30,10 +32,9 @@ def test_an_item_whose_node_is_killed_runs_elsewhere(whole_cluster, ray_runner, 
     handle = ray_runner.submit(work, lambda stage, fraction, note: notes.append(note))
     first = pid_in(starts)
     wait_until(lambda: notes == ["first"])
-    (node,) = [node for node in whole_cluster.nodes if first in tree(node.pid)]
-    kill_tree(node)
+    whole_cluster.kill_node_of(first)
     outcome = handle.outcome.result(120)
-    assert (outcome.kind, outcome.starts) == ("done", 2)
+    assert outcome.kind == "done"
     assert notes == ["first", "again"]
     assert output.read_text() == "the same bytes"
     assert len(starts.read_text().splitlines()) == 2
@@ -45,9 +46,9 @@ def test_an_item_that_loses_all_of_its_nodes_is_lost(whole_cluster, ray_runner, 
     work = item("write_slowly", starts=str(tmp_path / "starts"), output=str(tmp_path / "output"), text="", retries=0)
     handle = ray_runner.submit(work)
     first = pid_in(tmp_path / "starts")
-    kill_tree(next(node for node in whole_cluster.nodes if first in tree(node.pid)))
+    whole_cluster.kill_node_of(first)
     outcome = handle.outcome.result(120)
-    assert (outcome.kind, outcome.code, outcome.starts) == ("lost", "node-lost", 1)
+    assert (outcome.kind, outcome.code) == ("lost", "node-lost")
     assert "was lost" in outcome.message
 
 
@@ -57,7 +58,8 @@ def test_a_killed_worker_of_ray_takes_its_item_along(whole_cluster, ray_runner, 
     first = pid_in(starts)
     os.kill(int(Path(f"/proc/{first}/stat").read_text().rpartition(")")[2].split()[1]), signal.SIGKILL)
     outcome = handle.outcome.result(120)
-    assert (outcome.kind, outcome.starts) == ("done", 2)
+    assert outcome.kind == "done"
+    assert len(starts.read_text().splitlines()) == 2
     assert not is_alive(first)
 
 
@@ -68,7 +70,7 @@ def test_items_end_with_whoever_submitted_them_and_run_again(ray_cluster, ray_ru
         first = pid_in(starts)
         killed.kill()
     wait_until(lambda: not is_alive(first), seconds=30)
-    wait_until(lambda: ray_runner.stats().cpus == 2)
+    wait_until(lambda: processors(ray_runner) == 2)
     again = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
     assert "kind='done'" in again.stdout
     assert output.read_text() == "text"
@@ -77,7 +79,7 @@ def test_items_end_with_whoever_submitted_them_and_run_again(ray_cluster, ray_ru
 
 def test_a_lost_connection_is_an_outcome_and_is_made_again(ray_cluster, tmp_path, monkeypatch):
     monkeypatch.setattr(ray_runner_module, "RECONNECT_SECONDS", 0.5)
-    runner = open_runner("ray", ray_cluster.address)
+    runner = RayRunner(ray_cluster.address)
     try:
         handle = runner.submit(item("count", numbers=1, seconds_between=600, pid=str(tmp_path / "pid")))
         pid = pid_in(tmp_path / "pid")
@@ -93,13 +95,46 @@ def test_a_lost_connection_is_an_outcome_and_is_made_again(ray_cluster, tmp_path
 
 
 def test_closing_ends_all_items(ray_cluster, tmp_path):
-    runner = open_runner("ray", ray_cluster.address)
+    runner = RayRunner(ray_cluster.address)
     running = runner.submit(item("count", numbers=1, seconds_between=600, pid=str(tmp_path / "pid")))
     pid = pid_in(tmp_path / "pid")
     waiting = [runner.submit(item("count", numbers=1, seconds_between=600)) for _ in range(3)]
     runner.close()
     assert {handle.outcome.result(0).kind for handle in [running, *waiting]} == {"cancelled"}
     wait_until(lambda: not is_alive(pid), seconds=5)
+
+
+def test_a_waiting_item_is_cancelled_before_it_starts(whole_cluster, ray_runner, tmp_path):
+    pids = [tmp_path / str(n) for n in range(3)]
+    handles = [ray_runner.submit(item("count", numbers=1, seconds_between=600, pid=str(pid))) for pid in pids[:2]]
+    wait_until(lambda: all(pid.exists() for pid in pids[:2]))
+    handles.insert(0, ray_runner.submit(item("count", numbers=1, pid=str(pids[2]))))
+    for handle in handles:
+        ray_runner.cancel(handle.id)
+        assert handle.outcome.result(30).kind == "cancelled"
+    assert outcome_of(ray_runner, item("count", numbers=1)).kind == "done"
+    assert not pids[2].exists()
+
+
+@pytest.mark.parametrize("request_of_each", [Resources(1), Resources(0.25, int(0.6 * NODE_MEMORY))])
+def test_no_more_items_run_than_their_requests_allow(whole_cluster, ray_runner, tmp_path, request_of_each):
+    work = item("record", request_of_each, times=str(tmp_path), seconds_between=0.4)
+    handles = [ray_runner.submit(work) for _ in range(5)]
+    assert [handle.outcome.result(120).kind for handle in handles] == ["done"] * 5
+    spans = [tuple(map(float, path.read_text().split())) for path in tmp_path.iterdir()]
+    assert len(spans) == 5
+    assert max(sum(start <= moment < end for start, end in spans) for moment, _ in spans) == 2
+
+
+@pytest.mark.parametrize("large", [Resources(64), Resources(1, 1 << 40), Resources(1, 0, 1)])
+def test_an_item_that_fits_nowhere_is_refused_beforehand_and_waits(whole_cluster, ray_runner, large):
+    assert str(large) in ray_runner.refusal(large)
+    assert ray_runner.refusal(Resources(1, 100 * MB)) is None
+    handle = ray_runner.submit(item("count", large, numbers=1))
+    time.sleep(0.3)
+    assert not handle.outcome.done()
+    ray_runner.cancel(handle.id)
+    assert handle.outcome.result(30).kind == "cancelled"
 
 
 @pytest.mark.quick(1)
@@ -113,7 +148,7 @@ def test_closing_ends_all_items(ray_cluster, tmp_path):
 )
 def test_a_cluster_that_cannot_be_reached(ray_cluster, address, expected):
     with pytest.raises(RunnerError) as raised:
-        open_runner("ray", address)
+        RayRunner(address)
     assert expected in str(raised.value)
 
 
@@ -121,18 +156,18 @@ def test_a_cluster_that_cannot_be_reached(ray_cluster, address, expected):
 def test_a_cluster_with_another_token(ray_cluster, monkeypatch):
     monkeypatch.setenv("RAY_AUTH_TOKEN", "0" * 64)
     with pytest.raises(RunnerError, match="have its token"):
-        open_runner("ray", ray_cluster.address)
+        RayRunner(ray_cluster.address)
 
 
 def test_ray_is_not_installed(monkeypatch):
     monkeypatch.setattr(ray_runner_module, "find_spec", lambda name: None)
     with pytest.raises(RunnerError, match=r"pip install 'kissgs\[ray\]'"):
-        open_runner("ray")
+        RayRunner()
 
 
 def test_a_node_with_another_version(ray_cluster):
-    from kissgs.runners.ray_driver import function_for_nodes
+    from kissgs.runners.ray_driver import run_on_node
 
-    (event,) = function_for_nodes()(item("count", numbers=1).as_dict(), "0.0.0", None)
+    (event,) = run_on_node(asdict(item("count", numbers=1)), "0.0.0", None)
     assert (event["outcome"]["kind"], event["outcome"]["code"]) == ("error", "node-unusable")
     assert "this machine 0.0.0; install one version" in event["outcome"]["message"]

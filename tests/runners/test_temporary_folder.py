@@ -1,5 +1,6 @@
 """Temporary folders of items. Oracle: what lies in the system's folder for temporary files."""
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -35,10 +36,9 @@ def temporary(tmp_path, monkeypatch):
 
 def test_an_item_works_in_a_folder_of_its_own_that_is_gone_at_its_end(temporary):
     process = ItemProcess(item("leave_a_file", text="scene"))
-    (_, during), (outcome, after) = [(event, [path.name for path in temporary.iterdir()]) for event in process.events()]
+    (_, during), (outcome, after) = [(event, sorted(temporary.iterdir())) for event in process.events()]
     assert (outcome.kind, after) == ("done", [])
-    assert len(during) == 1
-    assert Path(outcome.result["folder"]).parent == temporary / during[0]
+    assert during == [Path(outcome.result["folder"]), Path(f"{outcome.result['folder']}.lock")]
 
 
 def test_a_killed_item_leaves_nothing(temporary):
@@ -59,25 +59,62 @@ def test_what_a_killed_supervisor_leaves_is_removed_by_the_next_item(temporary, 
         assert not other.exists()
         supervisor.send_signal(signal.SIGKILL)
     assert working.is_dir()
-    wait_until(lambda: list(ItemProcess(item("count", numbers=0)).events()) and not working.parent.exists())
+    wait_until(lambda: list(ItemProcess(item("count", numbers=0)).events()) and not working.exists())
+    assert list(temporary.iterdir()) == []
+
+
+@pytest.mark.parametrize("function", ["fcntl.flock", "os.mkdir", "shutil.rmtree"])
+def test_what_is_left_by_a_kill_at_any_step_is_removed(temporary, function):
+    """Regression: a process killed before it had locked its folder left that for ever."""
+    code = f"""
+import fcntl, os, shutil
+from kissgs.runners.temporary_folder import temporary_folder
+{function} = lambda *words, **options: os.kill(os.getpid(), 9)
+with temporary_folder() as folder:
+    (folder / "file").touch()
+"""
+    killed = subprocess.run([sys.executable, "-c", code], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert list(temporary.iterdir())
+    with temporary_folder() as folder:
+        assert sorted(temporary.iterdir()) == [folder, folder.with_suffix(".lock")]
+
+
+def test_a_folder_that_is_being_made_survives_the_removal_of_remains(temporary, monkeypatch):
+    """The other process looks for remains when the lock is there, but not taken yet."""
+    lock, others = fcntl.flock, []
+
+    def slow(file, how):
+        if not others:
+            others.append(True)
+            with temporary_folder():
+                pass
+        lock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", slow)
+    with temporary_folder() as folder, temporary_folder() as other:
+        assert folder.is_dir()
+        assert other != folder
     assert list(temporary.iterdir()) == []
 
 
 def test_folders_of_others_and_links_stay(temporary, tmp_path):
-    (tmp_path / "precious" / "work").mkdir(parents=True)
-    (tmp_path / "precious" / "lock").touch()
+    (tmp_path / "precious.lock").touch()
+    (tmp_path / "precious").mkdir()
+    (temporary / "kissgs-item-link.lock").symlink_to(tmp_path / "precious.lock")
     (temporary / "kissgs-item-link").symlink_to(tmp_path / "precious")
-    (temporary / "kissgs-item-without-a-lock" / "work").mkdir(parents=True)
+    (temporary / "kissgs-item-without-a-lock").mkdir()
     with temporary_folder():
-        assert (tmp_path / "precious" / "work").is_dir()
-        assert len(list(temporary.iterdir())) == 3
+        assert (tmp_path / "precious").is_dir()
+        assert len(list(temporary.iterdir())) == 5
 
 
 def test_no_folder_can_be_made(temporary, monkeypatch):
-    def refuse(**options):
+    def refuse(*words, **options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(tempfile, "mkdtemp", refuse)
+    monkeypatch.setattr(Path, "mkdir", refuse)
     (outcome,) = ItemProcess(item("count", numbers=1)).events()
     assert (outcome.kind, outcome.code) == ("lost", "not-started")
     assert "could not start a process: no space left on device" in outcome.message
+    assert list(temporary.iterdir()) == []

@@ -2,14 +2,14 @@
 
 import asyncio
 import time
-import uuid
 
 import pytest
+from helpers.data_folders import add_a_job
 from helpers.running import wait_until
 from helpers.service import SMALL, problem
 
 import kissgs
-from service.core.models import Job, State
+from service.core.models import State
 from service.core.settings import ServiceSettings
 from service.http.app import build
 from service.jobs.expiry import ExpiryTask
@@ -32,42 +32,20 @@ def test_clock_jumps(tmp_path, monkeypatch):
     """A jump of the clock by a year neither expires jobs early nor makes durations negative."""
     monkeypatch.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
     context = build(ServiceSettings.from_environment())
-    upload = context.storage.new_upload()
-    upload.write_bytes(SMALL)
-    job = make_job(upload, context)
+    job_id = add_a_job(context, SMALL)
     real = time.time
     for jump in (365 * 86400, -365 * 86400):
         monkeypatch.setattr(time, "time", lambda jump=jump: real() + jump)
         asyncio.run(run_one(context))
         ExpiryTask(context, 0.0).sweep()
-        found = context.store.get(job.id)
+        found = context.store.get(job_id)
         assert found.state == State.SUCCEEDED
         assert 0 <= found.finished_at - found.started_at < 60
         assert 0 <= found.started_at - found.created_at < 60
-    context.store.close()
-    context.storage.close()
+    context.close()
     restarted = build(ServiceSettings.from_environment())  # a year back: the time continues
     assert 0 <= restarted.clock() - found.finished_at < 60
-    restarted.storage.close()
-
-
-def make_job(upload, context):
-    job = Job(
-        id=uuid.uuid4().hex,
-        owner="",
-        name="scene",
-        options={"preset": "fast", "evaluate": False},
-        preset="fast",
-        evaluate=False,
-        gaussians=300,
-        sh_degree=1,
-        upload_bytes=len(SMALL),
-        upload_sha256="0" * 64,
-        fingerprint="0",
-        disk_bytes=0,
-    )
-    context.storage.adopt(upload, job.id)
-    return context.admission.add(job)
+    restarted.close()
 
 
 async def run_one(context):

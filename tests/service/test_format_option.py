@@ -10,7 +10,7 @@ from helpers.service import FAST, SMALL, problem
 
 import kissgs
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.io.containers import CONTAINERS, ENDINGS
+from kissgs.formats import CONTAINERS, ENDINGS
 from service.core.files import CONTAINER_FILES, Format
 from service.core.schemas import JobOptions
 from service.http.submission import Submission
@@ -71,7 +71,6 @@ def test_the_files_and_the_decoded_scene(service, job, local, tmp_path):
     ("options", "ending", "media_type"),
     [
         (FAST, ".zip", "application/zip"),
-        (json.dumps({"preset": "fast", "format": "sogxt"}), ".zip", "application/zip"),
         (SOG, ".sog", "application/octet-stream"),
     ],
 )
@@ -107,14 +106,3 @@ def test_other_formats_are_refused(service, value):
     found = problem(answer, 422, "invalid-request")
     assert "format" in found["detail"]
     assert "'sogxt' or 'sog'" in str(found["errors"])
-
-
-def test_jobs_of_both_formats_survive_a_restart(start):
-    service = start()
-    jobs = [service.ended(service.submit(options=options)) for options in (FAST, SOG)]
-    service.kill(9)
-    service.restart()
-    for job, container in zip(jobs, CONTAINERS, strict=True):
-        status = service.status(job)
-        assert (status["state"], status["options"]["format"]) == ("succeeded", container)
-        assert service.http.get(status["links"]["result"]).content == compressed(container).to_zip()

@@ -8,6 +8,7 @@ from helpers.service import FAST, SMALL, problem, scene_bytes
 import kissgs
 from service.core.problems import ProblemError
 from service.http.submission import parse_options
+from service.http.uploads import scene_name
 
 
 def test_submitting_a_raw_body(service):
@@ -25,19 +26,19 @@ def test_submitting_a_raw_body(service):
 @pytest.mark.parametrize("first", ["file", "options"])
 @pytest.mark.quick(1)
 def test_submitting_a_form(service, first):
-    parts = {"file": ("Schloß.ply", SMALL), "options": (None, '{"preset": "small", "encode": {"seed": 3}}')}
+    parts = {"file": ("Schloß.ply", SMALL), "options": (None, '{"preset": "fast", "encode": {"seed": 3}}')}
     parts = dict(sorted(parts.items(), reverse=first == "options"))
     answer = service.http.post("/v1/jobs", files=parts)
     assert answer.status_code == 202, answer.text
     status = answer.json()
-    assert (status["name"], status["options"]["preset"], status["options"]["encode"]["seed"]) == ("Schloß", "small", 3)
+    assert (status["name"], status["options"]["preset"], status["options"]["encode"]["seed"]) == ("Schloß", "fast", 3)
     status = service.ended(status)
-    expected = kissgs.compress(SMALL, settings=kissgs.Settings.from_preset("small", seed=3)).to_zip()
+    expected = kissgs.compress(SMALL, settings=kissgs.Settings.from_preset("fast", seed=3)).to_zip()
     assert service.http.get(status["links"]["result"]).content == expected
 
 
 def test_fewer_gaussians(service):
-    options = {"preset": "fast", "compact": {"ratio": 0.5, "views": 24, "view_size": 48}}
+    options = {"preset": "fast", "compact": {"ratio": 0.5, "views": 24, "view_size": 48}, "for_research": True}
     status = service.ended(service.submit(options=json.dumps(options)))
     expected = kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(options))
     assert (status["compacted"], status["kept"]) == (150, expected.report.count)
@@ -48,7 +49,8 @@ def test_fewer_gaussians(service):
 
 def test_training_in_a_job(service):
     changes = {"count": 100, "sparsify_steps": 4, "refine_steps": 4, "views": 24, "view_size": 48}
-    status = service.ended(service.submit(options=json.dumps({"preset": "fast", "compact": changes})))
+    options = {"preset": "fast", "compact": changes, "for_research": True}
+    status = service.ended(service.submit(options=json.dumps(options)))
     assert (status["state"], status["compacted"]) == ("succeeded", 200)
     assert status["timings"]["stages"].keys() >= {"score", "targets", "sparsify", "refine"}
 
@@ -91,7 +93,7 @@ def test_goals_and_count_search(service):
         "view_size": 48,
     }
     options = {"encode": {"target_size": "6kB", "sensitivity_views": 4, "sensitivity_view_size": 48}, "compact": prune}
-    options["finetune"] = {"enabled": False}
+    options |= {"finetune": {"enabled": False}, "for_research": True}
     assert not parse_options(json.dumps(options)).resumable
     status = service.ended(service.submit(options=json.dumps(options)))
     assert status["state"] == "succeeded", status
@@ -103,6 +105,7 @@ def test_goals_and_count_search(service):
         "encode": {"max_psnr_drop": 0.5, "sensitivity_views": 4},
         "compact": few,
         "finetune": {"steps": 4, **few},
+        "for_research": True,
     }
     assert parse_options(json.dumps(options)).kind == "balanced+compact+finetune+search"
     lost = service.ended(service.submit(options=json.dumps(options)))
@@ -116,6 +119,7 @@ def test_limits_say_if_training_is_possible(service):
 def test_the_options_are_optional(service):
     status = service.http.post("/v1/jobs", files={"file": ("x.ply", SMALL)}).json()
     assert (status["options"]["preset"], status["options"]["evaluate"]) == ("balanced", False)
+    service.cancel(status)
 
 
 def test_a_body_without_a_length(service):
@@ -138,7 +142,9 @@ def test_an_idempotency_key_makes_one_job(service):
     first = service.submit(**{"Idempotency-Key": "key-1"})
     again = service.submit(**{"Idempotency-Key": "key-1"})
     assert first["id"] == again["id"]
-    assert service.submit(**{"Idempotency-Key": "key-2"})["id"] != first["id"]
+    other = service.submit(**{"Idempotency-Key": "key-2"})
+    assert other["id"] != first["id"]
+    service.cancel(other)
     for data, options in ((SMALL, "{}"), (scene_bytes(seed=1), FAST)):
         answer = service.http.post(
             "/v1/jobs", content=data, params={"options": options}, headers={"Idempotency-Key": "key-1"}
@@ -147,17 +153,18 @@ def test_an_idempotency_key_makes_one_job(service):
     assert service.uploads() == []
 
 
-def test_names_are_sanitised(service):
-    for name, kept in {
-        "../../x.ply": "x",
-        "a\\b.ply": "b",
-        "c.compressed.ply": "c",
-        "d.spz.glb": "d",
-        "e.ply.spz": "e.ply",
-        "…": "…",
-        "\u202etxt": "txt",
-        "": "scene",
-        ".ply": "scene",
-    }.items():
-        answer = service.http.post("/v1/jobs", content=SMALL, params={"options": FAST, "name": name})
-        assert answer.json()["name"] == kept
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        *(
+            ("../../x.ply", "x"),
+            ("a\\b.ply", "b"),
+            ("c.compressed.ply", "c"),
+            ("d.spz.glb", "d"),
+            ("e.ply.spz", "e.ply"),
+        ),
+        *(("…", "…"), ("\u202etxt", "txt"), ("", "scene"), (".ply", "scene")),
+    ],
+)
+def test_names_are_sanitised(given, kept):
+    assert scene_name(given) == kept

@@ -7,7 +7,7 @@ from concurrent.futures import Future
 import pytest
 from helpers.data_folders import add_a_job, service
 
-from kissgs.runners import NOT_STARTED, Outcome, Resources, RunHandle, RunnerStats
+from kissgs.runners import NOT_STARTED, Outcome, Resources, RunHandle
 from service.core.models import State
 from service.core.settings import ServiceSettings
 from service.jobs import worker as worker_module
@@ -24,6 +24,8 @@ LOST = Outcome("lost", code="crashed", message="the machine was lost")
 class Cluster:
     """A runner whose items all have one outcome, and whose state a test chooses; ``None`` stands for no problem."""
 
+    nodes = ()
+
     def __init__(self, outcome=None, problem=None, largest=None):
         self.outcome, self.problem, self.largest = outcome, problem, largest
 
@@ -34,9 +36,6 @@ class Cluster:
 
     def cancel(self, item_id):
         pass
-
-    def stats(self):
-        return RunnerStats(0, 0, ())
 
     def health_problem(self):
         return self.problem

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.service import ROOT, Service
+from helpers.service import ROOT, ServiceProcess
 
 
 def test_the_document_equals_the_snapshot(service):
@@ -42,7 +42,7 @@ def test_keys_are_documented(start):
 @pytest.mark.quick(0)
 def test_schemathesis(tmp_path, seed):
     """Run its examples, boundary values, fuzzing and stateful tests along the links between responses and requests."""
-    with Service(tmp_path / "data") as service:
+    with ServiceProcess(tmp_path / "data") as service:
         found = subprocess.run(
             [
                 *(Path(sys.executable).with_name("schemathesis"), "--config-file", ROOT / "schemathesis.toml", "run"),

@@ -1,18 +1,22 @@
 """Settings, health, metrics and commands for operators; oracles: the Prometheus parser and the settings model."""
 
+import asyncio
 import hashlib
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
 
 import pytest
-from helpers.service import SLOW, SMALL, Service, scene_bytes
+from helpers.service import SLOW, SMALL, scene_bytes
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
+from service import cli
+from service.core.schemas import Health
 from service.core.settings import ServiceSettings, SettingsError
+from service.http.app import build
+from service.jobs import container
 
 COMMAND = [sys.executable, "-P", "-m", "service"]
 
@@ -83,27 +87,6 @@ def test_invalid_settings_end_in_a_message(tmp_path):
         assert "Traceback" not in ended.stderr
 
 
-def test_a_database_of_another_version_is_refused(tmp_path):
-    import sqlite3
-
-    with Service(tmp_path / "data") as service:
-        service.kill(signal.SIGTERM)
-    with sqlite3.connect(tmp_path / "data" / "jobs.sqlite") as database:
-        database.execute("UPDATE meta SET value = 99 WHERE name = 'schema'")
-    database.close()
-    ended = command(KISSGS_DATA_DIR=str(tmp_path / "data"))
-    assert ended.returncode == 2
-    assert "version 99" in ended.stderr
-
-
-def test_a_second_service_on_a_data_folder_is_refused(service):
-    ended = command(KISSGS_DATA_DIR=str(service.folder))
-    assert (ended.returncode, ended.stdout) == (2, "")
-    expected = f"KISSGS_DATA_DIR: another service is using {service.folder}; use a separate folder"
-    assert ended.stderr == f"kissgs-serve: {expected}\n"
-    assert service.ended(service.submit())["state"] == "succeeded"
-
-
 def test_a_port_in_use(service, tmp_path):
     ended = command(KISSGS_PORT=str(service.port), KISSGS_DATA_DIR=str(tmp_path / "data"))
     assert ended.returncode != 0
@@ -111,23 +94,40 @@ def test_a_port_in_use(service, tmp_path):
     assert "Traceback" not in ended.stderr
 
 
-def test_the_key_command():
-    ended = command("key", "alice")
-    key = re.search(r"kissgs_[A-Za-z0-9_-]{43}", ended.stdout)[0]
-    assert f"alice:{hashlib.sha256(key.encode()).hexdigest()}" in ended.stdout
-    assert command("key", "not an owner").returncode == 2
+@pytest.fixture
+def run(environment, capsys):
+    """``run(words, KISSGS_X=…)`` runs the command in this process, and returns exit code and output."""
+
+    def begin(*words, **settings):
+        environment.setattr(sys, "argv", ["kissgs-serve", *words])
+        for name, value in settings.items():
+            environment.setenv(name, value)
+        try:
+            cli.run()
+        except SystemExit as end:
+            return end.code, capsys.readouterr().out
+        return 0, capsys.readouterr().out
+
+    return begin
 
 
-def test_every_setting_is_listed():
-    listed = command("settings").stdout
+def test_the_key_command(run):
+    _, said = run("key", "alice")
+    key = re.search(r"kissgs_[A-Za-z0-9_-]{43}", said)[0]
+    assert f"alice:{hashlib.sha256(key.encode()).hexdigest()}" in said
+    assert run("key", "not an owner")[0] == 2
+
+
+def test_every_setting_is_listed(run):
+    _, listed = run("settings")
     for name in ServiceSettings.model_fields:
         assert f"KISSGS_{name.upper()}\n" in listed
 
 
-def test_the_health_command(service):
-    healthy = command("health", KISSGS_PORT=str(service.port))
-    assert (healthy.returncode, '"ready":true' in healthy.stdout) == (0, True)
-    assert command("health", KISSGS_PORT="1").returncode == 1
+def test_the_health_command(run, service):
+    code, said = run("health", KISSGS_PORT=str(service.port))
+    assert (code, '"ready":true' in said) == (0, True)
+    assert run("health", KISSGS_PORT="1")[0] == 1
 
 
 def test_health(service):
@@ -139,11 +139,6 @@ def test_health(service):
 
 def test_readiness_is_checked_every_two_seconds(monkeypatch):
     """Every request once wrote to the disk, and strangers slowed submissions down with it."""
-    import asyncio
-
-    from service.core.schemas import Health
-    from service.jobs import container
-
     running = checks = 0
 
     async def check():
@@ -169,10 +164,6 @@ def test_readiness_is_checked_every_two_seconds(monkeypatch):
 
 
 def test_an_ended_worker_is_not_ready(tmp_path, environment):
-    import asyncio
-
-    from service.http.app import build
-
     async def scenario():
         context.worker.start()
         await asyncio.sleep(0.1)
@@ -184,7 +175,7 @@ def test_an_ended_worker_is_not_ready(tmp_path, environment):
     environment.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
     context = build(ServiceSettings.from_environment())
     assert asyncio.run(scenario()) == "worker 0 has ended"
-    context.storage.close()
+    context.close()
 
 
 def test_metrics(start):

@@ -1,4 +1,4 @@
-"""The service under both of its names, and its command; reference: docs/decisions/0010-top-level-packages.md."""
+"""The service under both of its names, and its command; reference: docs/decisions.md."""
 
 import io
 import re

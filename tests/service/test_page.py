@@ -5,23 +5,15 @@ import json
 
 import pytest
 from helpers.preview_browser import VENDOR
-from helpers.service import SLOW, SMALL, scene_bytes
-from helpers.viewers import chromium
+from helpers.service import FAST, SLOW, SMALL, scene_bytes
+from helpers.viewers import NO_GPU, chromium
 
 import kissgs
-
-QUIET = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 
 
 @pytest.fixture(scope="module")
 def browser():
-    with chromium(QUIET) as browser:
+    with chromium(NO_GPU) as browser:
         yield browser
 
 
@@ -138,11 +130,11 @@ def test_goals(visit, service):
     goal.select_option("Maximum size")
     page.locator("#amount").fill("0.008")
     page.get_by_role("button", name="Compress").click()
-    page.get_by_text("smaller").first.wait_for()
+    page.locator("#job-title").wait_for()
     job = newest(service)
+    service.cancel(job)
     assert job["options"]["encode"]["target_size"] == 8000
     assert (job["options"]["compact"]["auto_count"], job["options"]["finetune"]["enabled"]) == (False, False)
-    assert 0.9 * 8000 <= job["sizes"]["container"] <= 8000
 
 
 def facts_of(page):
@@ -292,7 +284,7 @@ def test_training_notes_are_shown(visit, start):
     service = start()
     page = visit(service)
     changes = {"count": 100, "sparsify_steps": 1000, "refine_steps": 1000, "views": 24, "view_size": 48}
-    job = service.submit(options=json.dumps({"preset": "fast", "compact": changes}))
+    job = service.submit(options=json.dumps({"preset": "fast", "compact": changes, "for_research": True}))
     page.goto(f"{service.url}/#{job['id']}")
     page.locator("#job .note", has_text="Gaussians, loss").wait_for()
     page.locator("#live", has_text="Training").wait_for(state="attached")
@@ -314,7 +306,9 @@ def test_deletion_must_be_confirmed(visit, start):
 
 def test_names_are_inserted_as_text(visit, start):
     service = start()
-    answer = service.http.post("/v1/jobs", content=SMALL, params={"name": "<img src=x onerror=alert(1)>"})
+    answer = service.http.post(
+        "/v1/jobs", content=SMALL, params={"name": "<img src=x onerror=alert(1)>", "options": FAST}
+    )
     service.ended(answer.json())
     page = visit(service)
     page.locator("#recent-list li").first.wait_for()
@@ -340,16 +334,13 @@ def test_key_form(visit, start):
     assert download.value.suggested_filename == "my scene.zip"
 
 
-@pytest.mark.parametrize("width", [360, 768, 1400])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.quick(2)
-def test_no_horizontal_overflow(visit, service, width, scheme):
-    job = service.ended(service.submit())
-    page = visit(viewport={"width": width, "height": 800}, color_scheme=scheme)
-    for address in ("", f"#{job['id']}"):
-        page.goto(f"{service.url}/{address}")
-        page.locator("#recent-list li").first.wait_for()
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
+def test_no_horizontal_overflow(visit, service, job):
+    for width, scheme in ((360, "light"), (768, "dark"), (1400, "light")):
+        page = visit(viewport={"width": width, "height": 800}, color_scheme=scheme)
+        for address in ("", f"#{job['id']}"):
+            page.goto(f"{service.url}/{address}")
+            page.locator("#recent-list li").first.wait_for()
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
 @pytest.mark.skipif(not VENDOR.exists(), reason="scripts/vendor has not run")

@@ -68,9 +68,7 @@ def test_dropping_files(preview, service, tmp_path):
     ("name", "data", "words"),
     [
         ("letter.txt", b"Dear reader,\n" * 99, ["zip"]),
-        ("nothing.zip", b"", ["zip"]),
         ("half.zip", ZIP[: len(ZIP) // 2], ["zip"]),
-        ("letter.ply", b"Dear reader,\n" * 99, ["letter.ply"]),
         ("half.ply", PLY[: len(PLY) // 2], ["half.ply"]),
         ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", ["mesh.ply"]),
     ],
@@ -204,7 +202,7 @@ def test_every_control_gets_a_visible_focus(preview, service):
     assert "file" not in seen
 
 
-@pytest.mark.parametrize("width", [360, 768, 1400])
+@pytest.mark.parametrize("width", [360, 1400])
 @pytest.mark.quick(1)
 def test_no_horizontal_overflow_of_the_preview(preview, service, width):
     tab = preview(viewport={"width": width, "height": 500}).open(service)
@@ -244,11 +242,11 @@ def test_an_address_and_a_file_have_the_same_statistics(preview, service):
     assert statistics(tab) == remote
 
 
-@pytest.mark.parametrize("address", ["%25E0%25A4%25A.zip", "http://[bad"])
-def test_invalid_addresses(preview, service, address):
-    tab = preview().open(service, f"?src={address}")
-    tab.error_message("not an address")
-    assert tab.page.locator("#empty").is_visible()
+def test_invalid_addresses(preview, service):
+    tab = preview()
+    for address in ("%25E0%25A4%25A.zip", "http://[bad"):
+        tab.open(service, f"?src={address}").error_message("not an address")
+        assert tab.page.locator("#empty").is_visible()
 
 
 def test_an_empty_scene(preview, service):

@@ -148,6 +148,7 @@ def as_png(files):
     return {"meta.json": meta.encode(), **changed}
 
 
+@pytest.mark.quick(0)
 def test_files_of_other_encoders(preview, service):
     """Version 1, and PNG under other names, give the same image as version 2 does."""
     tab = preview().open(service)

@@ -5,16 +5,18 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from helpers.service import FAST, Service, problem, scene_bytes
+from helpers.service import FAST, problem, scene_bytes
 
 import kissgs
+from service.core.settings import ServiceSettings, SettingsError
+from service.http.app import create_app
 
 
 @pytest.mark.quick(0)
-def test_many_simultaneous_jobs(start):
-    """No job of 200 is lost or runs twice, and the server's memory hardly grows."""
-    service = start(KISSGS_MAX_QUEUE=500, KISSGS_MAX_UPLOADS=32, KISSGS_WORKERS=2, KISSGS_JOB_THREADS=1)
-    scenes = [scene_bytes(20, 0, seed=i) for i in range(200)]
+def test_many_simultaneous_jobs(start_process):
+    """No job of 60 is lost or runs twice, and the server's memory hardly grows."""
+    service = start_process(KISSGS_MAX_QUEUE=500, KISSGS_MAX_UPLOADS=32, KISSGS_WORKERS=2, KISSGS_JOB_THREADS=1)
+    scenes = [scene_bytes(20, 0, seed=i) for i in range(60)]
     service.only_result(service.submit(scenes[0]))
     before = service.memory()
 
@@ -28,14 +30,14 @@ def test_many_simultaneous_jobs(start):
         raise AssertionError("never accepted")
 
     with ThreadPoolExecutor(50) as pool:
-        jobs = list(pool.map(send, range(200)))
-    assert len({job["id"] for job in jobs}) == 200
+        jobs = list(pool.map(send, range(60)))
+    assert len({job["id"] for job in jobs}) == 60
     assert service.memory() - before < 64 << 20
-    for i in random.Random(0).sample(range(200), 190):
+    for i in random.Random(0).sample(range(60), 52):
         service.http.post(f"/v1/jobs/{jobs[i]['id']}/cancel")
     states = [service.ended(job, seconds=120) for job in jobs]
     assert {status["state"] for status in states} <= {"succeeded", "cancelled"}
-    assert sum(status["state"] == "succeeded" for status in states) >= 10
+    assert sum(status["state"] == "succeeded" for status in states) >= 8
     for i, status in enumerate(states):
         assert status["name"] == str(i)
         assert status["starts"] <= 1
@@ -56,8 +58,8 @@ def test_simultaneous_requests_with_one_idempotency_key(start):
     assert service.leftovers() == []
 
 
-def test_two_services_cannot_share_a_folder(start, tmp_path):
+def test_two_services_cannot_share_a_folder(start):
     service = start()
-    with pytest.raises(AssertionError, match="another service is using"):
-        Service(service.folder).start()
+    with pytest.raises(SettingsError, match="another service is using"):
+        create_app(ServiceSettings(data_dir=service.folder))
     assert service.http.get("/livez").status_code == 200

@@ -1,11 +1,15 @@
 """Starts with the jobs of a data folder, and folders that move to the orphaned one; oracle: the files before."""
 
+import asyncio
 import shutil
 
 import pytest
+from fastapi import Response
 from helpers.data_folders import database, finish_a_job, listing, names, service
 
 from service.core.models import State
+from service.http.routes import facts
+from service.jobs.expiry import ExpiryTask
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 
@@ -40,7 +44,7 @@ def test_a_start_after_the_jobs_were_moved_away(jobs_folder):
         finish_a_job(context)
     with service(jobs_folder) as context:
         assert len(context.store.ids()) == 1
-    assert len(list((jobs_folder / "old").iterdir())) == 120
+    assert len(list((jobs_folder / "old").iterdir())) == 40
 
 
 def test_no_jobs_and_a_new_database(tmp_path):
@@ -74,6 +78,8 @@ def test_folders_of_unknown_jobs_are_moved(jobs_folder, caplog):
     caplog.clear()
     with service(jobs_folder) as context:
         assert context.storage.count_orphaned() == 2
+        health = asyncio.run(facts.get_readyz(context, Response()))
+        assert health.checks["orphaned"] == "folders without a job in jobs/.orphaned of the data folder: 2"
     assert caplog.text == ""
 
 
@@ -99,8 +105,6 @@ def test_other_files_are_not_removed(jobs_folder):
         assert not (jobs_folder / "incoming" / "0123456789abcdef.part").exists()
         assert not (jobs_folder / "jobs" / job / "work-0123456789abcdef").exists()
         assert {name: (jobs_folder / name).read_text() for name in others} == dict.fromkeys(others, "mine")
-        from service.jobs.expiry import ExpiryTask
-
         context.clock._offset += 10**6
         ExpiryTask(context, 0.0).sweep()
         assert context.storage.job_ids() == set()

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 from dataclasses import asdict
 
@@ -23,7 +22,7 @@ pytest.importorskip("torch")
 
 def options(steps):
     changes = {"count": 100, "sparsify_steps": steps, "refine_steps": steps, "views": 24, "view_size": 48}
-    return {"preset": "fast", "compact": changes}
+    return {"preset": "fast", "compact": changes, "for_research": True}
 
 
 STEPS = 8
@@ -42,13 +41,13 @@ def expected():
 
 
 @pytest.fixture
-def start_held(start, tmp_path):
+def start_held(start_process, tmp_path):
     """Start a service and return it with the training of its jobs, which waits after so many checkpoints."""
 
-    def begin(stage, pause=0.0, **settings):
-        training = HeldTraining(tmp_path, SAVES[stage], pause=pause)
+    def begin(stage, **settings):
+        training = HeldTraining(tmp_path, SAVES[stage])
         (tmp_path / "sitecustomize.py").write_text(training.program)
-        return start(PYTHONPATH=f"{ROOT}{os.pathsep}{tmp_path}", **settings), training
+        return start_process(PYTHONPATH=f"{ROOT}{os.pathsep}{tmp_path}", **settings), training
 
     return begin
 
@@ -93,7 +92,7 @@ def kill_the_job(service, training):
 )
 @pytest.mark.quick(0)
 def test_training_continues_after_an_interruption(start_held, expected, stage, interrupt):
-    service, training = start_held(stage, KISSGS_DRAIN_SECONDS=0)
+    service, training = start_held(stage, drain_seconds=0)
     job = service.submit(options=json.dumps(BRIEF))
     training.wait()
     service.running(job, stage)
@@ -117,8 +116,8 @@ def of_another_version(path):
 
 @pytest.mark.parametrize("damage", [damaged, of_another_version])
 @pytest.mark.quick(0)
-def test_unusable_checkpoints_are_replaced(start, damage):
-    service = start()
+def test_unusable_checkpoints_are_replaced(start_process, damage):
+    service = start_process()
     job = service.submit(options=json.dumps(BRIEF))
     service.running(job)
     service.kill(signal.SIGKILL)
@@ -190,26 +189,13 @@ def test_the_largest_record_of_steps():
     assert len(json.dumps([step] * (2 * most + 3))) < STEPS_BYTES
 
 
-@pytest.mark.quick(0)
-def test_training_notes(start_held):
-    service, training = start_held("refine", pause=0.4)  # progress is sent a few times per second
-    job = service.submit(options=json.dumps(BRIEF))
-    training.wait()
-    note = service.running(job, "refine")["progress"]["note"]
-    assert re.fullmatch(r"1\d\d Gaussians, loss 0\.\d{4}, PSNR \d\d\.\d\d", note)
-    training.release()
-    assert service.ended(job)["state"] == "succeeded"
-    sent = [data for _, kind, data in events(service.http.get(job["links"]["events"]).text) if kind == "progress"]
-    assert {data["stage"] for data in sent if "note" in data} == {"sparsify", "refine"}
-    assert any(data.get("note") == note for data in sent)
-
-
-FINETUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": STEPS, "views": 24, "view_size": 48}}
+TUNING = {"enabled": True, "steps": STEPS, "views": 24, "view_size": 48}
+FINETUNED = {"preset": "fast", "finetune": TUNING, "for_research": True}
 
 
 @pytest.mark.quick(0)
 def test_fine_tuning_continues_and_its_gain_is_reported(start_held):
-    service, training = start_held("finetune", KISSGS_DRAIN_SECONDS=0)
+    service, training = start_held("finetune", drain_seconds=0)
     job = service.submit(options=json.dumps(FINETUNED))
     training.wait()
     kept = folder_of(service, job) / "checkpoint-finetune.npz"

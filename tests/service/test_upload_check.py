@@ -17,7 +17,8 @@ SCRIPT = """
 import { readFile } from "node:fs/promises";
 import { basename } from "node:path";
 const { inspect } = await import(process.argv[2]);
-const limits = { max_upload_bytes: 1e9, max_header_bytes: 65536, max_gaussians: 1000 };
+const limits = { max_upload_bytes: 1e9, max_header_bytes: 65536, max_gaussians: 1000,
+  formats: ["ply", "sog", "spz", "splat", "ksplat", "glb", "compressed.ply"] };
 for (const path of process.argv.slice(3)) {
   const file = new File([await readFile(path)], basename(path));
   console.log(JSON.stringify(await inspect(file, limits).catch((error) => error.message)));
@@ -39,6 +40,7 @@ FILES = {
         splat_bytes(SCENE)[:-1],
         "half.splat is not a scene: send a .ply, .sog, .spz, .splat, .ksplat or .glb.",
     ),
+    "unknown.spz": (b"hello", {"gaussians": None, "shDegree": None, "packed": False}),
     "a.txt": (b"hello", "a.txt is not a scene: send a .ply, .sog, .spz, .splat, .ksplat or .glb."),
 }
 

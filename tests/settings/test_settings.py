@@ -6,10 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from kissgs import EncodeSettings, KissgsError, Preset, Settings, UnsupportedError
+from kissgs import CompactSettings, EncodeSettings, FinetuneSettings, KissgsError, Preset, Settings, UnsupportedError
 from kissgs.settings import PRESETS
 
 NUMBERS = [name for name, field in EncodeSettings.model_fields.items() if field.annotation in (int, float)]
+GROUPS = {"compact": CompactSettings, "encode": EncodeSettings, "finetune": FinetuneSettings}
+OF_PRESET = [
+    (group, name) for group, model in GROUPS.items() for name in model.model_fields if name not in model.public()
+]
+SCHEMA = Settings.model_json_schema()["$defs"]
 
 
 @pytest.mark.parametrize("preset", list(Preset))
@@ -33,27 +38,82 @@ def test_presets_differ():
 
 @pytest.mark.parametrize("preset", list(Preset))
 def test_single_settings_replace_those_of_the_preset(preset):
-    changed = Settings.from_preset(preset, gaussians_per_codebook_entry=33, sh_step=2)
-    plain = Settings.from_preset(preset)
-    assert (changed.encode.gaussians_per_codebook_entry, changed.encode.sh_step) == (33, 2)
-    assert changed.encode == plain.encode.model_copy(update={"gaussians_per_codebook_entry": 33, "sh_step": 2})
-    assert changed == Settings.model_validate(
-        {"preset": preset, "encode": {"gaussians_per_codebook_entry": 33, "sh_step": 2}}
-    )
+    plain, changed = Settings.from_preset(preset), Settings.from_preset(preset, max_encodes=3, seed=2)
+    assert changed.encode == plain.encode.model_copy(update={"max_encodes": 3, "seed": 2})
+    assert changed == Settings.model_validate({"preset": preset, "encode": {"max_encodes": 3, "seed": 2}})
+    assert changed == Settings(preset=preset, encode=EncodeSettings(max_encodes=3, seed=2))
+
+
+@pytest.mark.parametrize("made", [Settings.from_preset, Settings.research])
+@pytest.mark.parametrize("preset", list(Preset))
+def test_settings_survive_json(preset, made):
+    """Reports, jobs and work items carry them; they must give the same settings again."""
+    changes = {"sh_step": 2, "compact": {"views": 5}} if made == Settings.research else {"compact": {"ratio": 0.5}}
+    chosen = made(preset, seed=7, **changes)
+    for again in (chosen.model_dump(mode="json"), chosen.model_dump(mode="json", exclude_unset=True)):
+        assert Settings.model_validate(again) == chosen
+    if preset != "paper" and made == Settings.from_preset:
+        chosen = made("balanced", max_ssim_drop=0.1).decided(photographs=True, torch=True)
+        assert Settings.model_validate_json(chosen.model_dump_json()) == chosen
+
+
+def test_what_a_search_has_changed_is_valid_again():
+    """A report states the values of the last container, such as another threshold for pruning."""
+    plain = Settings()
+    used = plain.model_copy(update={"encode": plain.encode.model_copy(update={"prune_threshold_bits": 50.0})})
+    assert Settings.model_validate(used.as_json()).encode == used.encode
+    assert plain.as_json() == plain.model_dump(mode="json")
+
+
+def test_one_seed_is_for_everything():
+    chosen = Settings.from_preset("balanced", seed=7)
+    assert (chosen.encode.seed, chosen.compact.seed, chosen.finetune.seed) == (7, 7, 7)
+    assert Settings.research("balanced", seed=7, compact={"seed": 3}).compact.seed == 3
 
 
 @pytest.mark.parametrize("preset", list(Preset))
-def test_settings_survive_json(preset):
-    """Reports and containers carry them; they must give the same settings again."""
-    chosen = Settings.from_preset(preset, seed=7)
-    assert Settings.model_validate_json(chosen.model_dump_json()) == chosen
-    assert Settings.model_validate(chosen.model_dump()) == chosen
+def test_the_loss_of_trainings_follows_the_goal(preset):
+    """A limit of SSIM gives it more weight, unless the preset says how much."""
+    wanted = {"paper": 0.2}.get(preset, 0.4)
+    goal = {} if preset in ("fast", "paper") else {"max_ssim_drop": 0.1}
+    chosen = Settings.from_preset(preset, **goal)
+    assert {chosen.compact.ssim_weight, chosen.finetune.ssim_weight} == {wanted if goal or preset == "paper" else 0.3}
 
 
-def test_a_group_changes_only_what_was_given_to_it():
-    """Unset values come from the given preset, not from the default one."""
-    settings = Settings(preset="paper", encode=EncodeSettings(gaussians_per_codebook_entry=99))
-    assert settings == Settings.from_preset("paper", gaussians_per_codebook_entry=99)
+OTHER = {
+    "order": "hilbert",
+    "rotation_form": "pras",
+    "codebook_order": "axes",
+    "plas_radius_decay": 0.9,
+    "means_bits": 9,
+    "plas_start_radius": 9,
+    "sensitivity_views": 9,
+    "view_uncertainty": 0.3,
+}
+"""Another value where half of the preset's is none."""
+
+
+@pytest.mark.parametrize(("group", "name"), OF_PRESET)
+def test_what_belongs_to_a_preset_changes_only_by_research(group, name):
+    """Otherwise it is refused, hidden from the schema, and yet may be repeated as the preset has it."""
+    own = getattr(getattr(Settings(), group), name)
+    if isinstance(own, bool):
+        values = {name: not own}
+    else:
+        values = {name: OTHER.get(name) or (own // 2 or 2 if isinstance(own, int) else own / 2 or 1)}
+    if group == "encode":
+        values["rate_distortion"] = False
+    given = values if group == "encode" else {group: values}
+    with pytest.raises(UnsupportedError, match=rf"{'|'.join(values)} of {group} belongs to the preset; .*research"):
+        Settings.from_preset("balanced", **given)
+    assert Settings.model_validate({group: {name: own}}) == Settings()
+    assert getattr(getattr(Settings.research("balanced", **given), group), name) == values[name]
+    assert name not in SCHEMA[GROUPS[group].__name__]["properties"]
+
+
+def test_at_most_twenty_settings_are_public():
+    others = [name for name in Settings.public() if name not in GROUPS]
+    assert len(others) + sum(len(model.public()) for model in GROUPS.values()) <= 20
 
 
 def test_settings_cannot_be_changed_afterwards():
@@ -74,7 +134,7 @@ def test_an_unknown_preset_is_refused_with_the_list_of_presets(preset):
 def test_an_unknown_setting_is_refused_with_the_list_of_settings():
     with pytest.raises(UnsupportedError) as caught:
         Settings.from_preset("fast", speed=11)
-    known = ", ".join(EncodeSettings.model_fields)
+    known = ", ".join(EncodeSettings.public())
     assert str(caught.value) == f"there is no setting 'speed' of encode; there are {known}"
     with pytest.raises(ValidationError, match="speed"):
         Settings.model_validate({"encode": {"speed": 11}})
@@ -94,24 +154,16 @@ def test_an_unknown_setting_is_refused_with_the_list_of_settings():
 )
 def test_impossible_values_are_refused_by_name(name, value, sentence):
     with pytest.raises(UnsupportedError) as caught:
-        Settings.from_preset("fast", **{name: value})
+        Settings.research("fast", **{name: value})
     assert str(caught.value) == sentence
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1, 1e9, "much", None])
-def test_no_number_is_unbounded(name, value):
-    if name == "seed" and value == 1e9:
-        value = 2**31
-    if name == "quality_offset_db" and value == -1:
-        value = -31
-    with pytest.raises(UnsupportedError, match=f"setting {name}: "):
-        Settings.from_preset("balanced", **{name: value})
-
-
-@pytest.mark.parametrize("name", EncodeSettings.model_fields)
-def test_every_setting_has_a_description(name):
-    assert len(EncodeSettings.model_fields[name].description) > 20
+def test_no_number_is_unbounded(name):
+    low, high = {"seed": (-1, 2**31), "quality_offset_db": (-31, 31)}.get(name, (-1, 1e9))
+    for value in (float("nan"), float("inf"), low, high, "much", None):
+        with pytest.raises(UnsupportedError, match=f"setting {name}: "):
+            Settings.research("balanced", **{name: value})
 
 
 JSON = st.recursive(

@@ -32,7 +32,7 @@ from kissgs.io.ply import read_ply
 
 
 def encoded(splats, preset="balanced", **settings):
-    return compress(splats, settings=Settings.from_preset(preset, **{**GLANCE, **settings}), container="sog")
+    return compress(splats, settings=Settings.research(preset, **{**GLANCE, **settings}), container="sog")
 
 
 def pixels(result, name):
@@ -98,7 +98,7 @@ def test_splat_transform_reads_extreme_scenes(count, degree, tmp_path):
 @pytest.mark.quick(1)
 def test_threads_do_not_change_a_byte(preset):
     scene = sample_scene(400, sh_degree=2, seed=1)
-    settings = Settings.from_preset(preset, **GLANCE)
+    settings = Settings.research(preset, **GLANCE)
     one, more = (compress(scene, settings=settings, container="sog", threads=threads).to_zip() for threads in (1, 3))
     assert hashlib.sha256(one).hexdigest() == hashlib.sha256(more).hexdigest()
 
@@ -190,16 +190,17 @@ def test_constant_scenes(preset):
 
 def test_a_target_size_counts_the_bytes_of_the_file(tmp_path):
     scene = sample_scene(400, sh_degree=1, seed=4)
-    settings = Settings.from_preset("balanced", target_size=6500, max_encodes=4, finetune={"enabled": False}, **GLANCE)
+    settings = Settings.research("balanced", target_size=6500, max_encodes=4, finetune={"enabled": False}, **GLANCE)
     result = compress(scene, tmp_path / "scene.sog", settings=settings)
     assert result.container == "sog"
     assert (tmp_path / "scene.sog").stat().st_size == result.report.container_bytes <= 6500
     assert len(result.report.trials) > 1
 
 
+@pytest.mark.quick(0)
 def test_a_quality_goal_and_evaluation_decode_the_file():
     scene = sample_scene(250, sh_degree=0, seed=4)
-    settings = Settings.from_preset("balanced", psnr=32, max_encodes=3, **GLANCE)
+    settings = Settings.research("balanced", psnr=32, max_encodes=3, **GLANCE)
     result = compress(scene, settings=settings, container="sog", evaluate=True)
     assert max(trial.psnr for trial in result.report.trials) >= 32
     assert result.report.evaluation is not None

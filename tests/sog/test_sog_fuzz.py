@@ -10,7 +10,8 @@ from helpers.reference_sog import sog_files, zip_of
 from helpers.streamed_scenes import KINDS
 from PIL import Image
 
-from kissgs.pipeline.scene_files import ReadOptions, read_scene
+from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline.scene_files import read_scene
 from kissgs.sog.decode import decode
 
 LIMIT = 100_000
@@ -24,6 +25,7 @@ STREAMED = {
 
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("name", ["meta.json", "quats.webp", "means_u.webp", "shN_centroids.webp", "shN_labels.webp"])
+@pytest.mark.quick(5)
 def test_damaged_files(version, name):
     files = SOURCES[version]
     check_all(files[name], lambda damaged: decode({**files, name: damaged}, max_gaussians=LIMIT, threads=1))
@@ -37,6 +39,7 @@ def png(webp):
 
 
 @pytest.mark.parametrize("name", ["quats.webp", "sh0.webp", "means_u.webp", "shN_centroids.webp", "shN_labels.webp"])
+@pytest.mark.quick(2)
 def test_damaged_png(name):
     files = SOURCES[2]
     check_all(png(files[name]), lambda damaged: decode({**files, name: damaged}, max_gaussians=LIMIT, threads=1))
@@ -67,6 +70,7 @@ def test_damaged_zips(source):
 
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("name", STREAMED)
+@pytest.mark.quick(2)
 def test_damaged_trees(name, level):
     kind, files = KINDS[name], STREAMED[name]
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.io.ply import read_ply, write_ply
-from kissgs.sog import streamed
+from kissgs.sog.streamed import STREAMED
 
 
 @needs_splat_transform
@@ -21,7 +21,7 @@ def test_splat_transform_reads_the_reference_files_as_we_do(tmp_path):
     folder = write_folder(streamed_files(scenes), tmp_path / "folder")
     for level in (0, 1):
         target = convert(folder / "lod-meta.json", tmp_path / f"{level}.ply", "-L", str(level))
-        assert_alike(streamed.decode(folder, level=level), read_ply(target), rtol=1e-6, atol=1e-6)
+        assert_alike(STREAMED.decode(folder, level=level), read_ply(target), rtol=1e-6, atol=1e-6)
 
 
 @needs_splat_transform
@@ -33,7 +33,7 @@ def test_splat_transform_writes_what_we_read(count, degree, tmp_path):
         write_ply(file, made_scene(count, degree))
     packed = convert(tmp_path / "a.ply", tmp_path / "lod/lod-meta.json", "-i", "2")
     theirs = read_ply(convert(packed, tmp_path / "b.ply"))
-    assert_alike(streamed.decode(packed.parent), theirs, rtol=1e-6, atol=1e-6)
+    assert_alike(STREAMED.decode(packed.parent), theirs, rtol=1e-6, atol=1e-6)
 
 
 def real_rows(folder):
@@ -72,7 +72,7 @@ def real_rows(folder):
 @pytest.mark.parametrize(("level", "count"), [(3, 26_895), (2, 92_802)])
 def test_real_data(level, count, shared_data):
     folder = shared_data / "flowers"
-    found = streamed.decode(folder, level=level)
+    found = STREAMED.decode(folder, level=level)
     assert len(found) == count
     wanted = real_rows(folder / f"{level}_0")
     for name in ATTRIBUTES:

@@ -36,7 +36,7 @@ def digests(files):
 def test_threads_and_repetition_do_not_change_a_byte(scene, preset):
     # PLAS is slow: the paper's preset gets a part of the scene, still of several blocks per pass.
     splats = scene.select(slice(0, 550)) if preset == "paper" else scene
-    settings = Settings.from_preset(preset, **GLANCE)
+    settings = Settings.research(preset, **GLANCE)
     once, again, threaded = (compress(splats, settings=settings, threads=threads) for threads in (1, 1, 3))
     assert digests(once.files) == digests(again.files) == digests(threaded.files)
     assert once.to_zip() == again.to_zip() == threaded.to_zip()
@@ -72,7 +72,7 @@ def test_the_input_is_not_modified(preset):
     before = {name: getattr(splats, name).copy() for name in ATTRIBUTES}
     for name in ATTRIBUTES:
         getattr(splats, name).flags.writeable = False
-    compress(splats, settings=Settings.from_preset(preset, **GLANCE))
+    compress(splats, settings=Settings.research(preset, **GLANCE))
     assert all((getattr(splats, name) == before[name]).all() for name in ATTRIBUTES)
 
 
@@ -124,7 +124,7 @@ def golden_digests():
     """Hashes of all levels but the codebook's, which hang on the last bits of matrix products."""
     found = {}
     for title, changes in GOLDEN_SETTINGS.items():
-        given = Settings.from_preset("fast", **changes, plas_radius_decay=0.8, seed=0, prune_invisible=True)
+        given = Settings.research("fast", **changes, plas_radius_decay=0.8, seed=0, prune_invisible=True)
         files = compress(integer_scene(), settings=given).files
         names = [f"{name}.webp" for name in PLANES if not name.startswith("f_rest")]
         found[title] = {

@@ -34,7 +34,7 @@ IMAGES = [f"{name}.webp" for name in PLANES]
 
 
 def encoded(splats, preset="fast", **changes):
-    return compress(splats, settings=Settings.from_preset(preset, **GLANCE, **changes))
+    return compress(splats, settings=Settings.research(preset, **GLANCE, **changes))
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -118,27 +118,11 @@ def test_files_in_the_wrong_places(files):
     check(files)
 
 
-@examples(60)
-@given(st.sampled_from(["grid_side", "f_rest_centroids_side"]), st.integers(-(2**40), 2**40) | st.integers(0, 300))
-def test_any_side(key, side):
-    document = yaml.safe_load(FILES["container_meta.yaml"])
-    document["meta"][key] = side
-    check({**WITHOUT_JSON, "container_meta.yaml": yaml.safe_dump(document).encode()})
-
-
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
     max_leaves=12,
 )
-
-
-@examples(60)
-@given(JSON, st.sampled_from(["meta", "ops", "kissgs", None]))
-def test_any_yaml_of_the_right_outline(value, key):
-    document = yaml.safe_load(FILES["container_meta.yaml"])
-    document = value if key is None else {**document, key: value}
-    check({**WITHOUT_JSON, "container_meta.yaml": yaml.safe_dump(document).encode()})
 
 
 @examples(60)

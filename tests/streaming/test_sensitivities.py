@@ -90,20 +90,6 @@ def test_the_default_preset_spends_bits_by_sensitivity_and_goes_on_after_its_cam
         assert path.read_bytes() == (tmp_path / "city" / path.relative_to(tmp_path / "whole")).read_bytes()
 
 
-def test_the_time_left_follows_the_pace(monkeypatch):
-    clock, notes = [0.0], []
-    monkeypatch.setattr("time.monotonic", lambda: clock[0])
-    receive = with_time_left(lambda stage, fraction, note="": notes.append(note), rate_distortion=False)
-    for seconds, stage, fraction in ((0, "partition", 0.0), (60, "merge", 0.6), (100, "images", 1.0)):
-        clock[0] = float(seconds)
-        receive(stage, fraction, "level 0")
-    assert notes[0] == "level 0"
-    assert notes[1].startswith("level 0, ")
-    assert notes[1].endswith(" left")
-    assert notes[2] == "level 0, 0 s left"
-    assert [duration(seconds) for seconds in (40, 100, 3000, 12600)] == ["40 s", "2 min", "50 min", "3.5 h"]
-
-
 def test_the_clock_counts_the_time_left_down(monkeypatch):
     """Half of the work takes 60 s; until more of it is done, reports have the time that is left of the same again."""
     clock, notes = [0.0], {}
@@ -117,3 +103,4 @@ def test_the_clock_counts_the_time_left_down(monkeypatch):
     assert [notes[seconds] for seconds in (60, 61, 80, 119)] == ["60 s left", "59 s left", "40 s left", "1 s left"]
     assert notes[121] == ""  # it takes longer than the pace before said
     assert notes[125] == "2 min left"  # 125 s for 54 %
+    assert [duration(seconds) for seconds in (40, 100, 3000, 12600)] == ["40 s", "2 min", "50 min", "3.5 h"]

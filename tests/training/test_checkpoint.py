@@ -50,11 +50,8 @@ def test_damaged_checkpoints_are_rejected(tmp_path):
     path.write_bytes(data)
     with pytest.raises(OutputError, match=r"c\.npz is no checkpoint of kissgs"):
         Checkpoint(path, "key")
-
-
-def test_a_folder_is_rejected(tmp_path):
     with pytest.raises(OutputError, match="is a folder; name a file"):
-        Checkpoint(tmp_path, "key").load()
+        Checkpoint(tmp_path, "key")
 
 
 @pytest.mark.parametrize(("seconds", "due"), [(0.0, True), (1000.0, False)])

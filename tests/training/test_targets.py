@@ -39,22 +39,17 @@ def test_photographs_are_the_targets_if_there_are_any(tmp_path):
     np.testing.assert_array_equal(mixed.image(1), targets_of(cloud(), around(2)).image(1))
 
 
-@pytest.mark.parametrize("first", [0, 1, 3, 4, 9])
-def test_the_order_can_be_resumed_at_any_step(first):
-    found = targets_of(cloud())
-    whole = list(islice(found.order((7,)), 40))
-    assert list(islice(found.order((7,), first), 40 - first)) == whole[first:]
-
-
 def test_every_target_occurs_once_per_epoch():
     found = targets_of(cloud())
     steps = list(islice(found.order((0, 1)), 20))
     assert all(Counter(steps[n : n + 4]) == Counter(range(4)) for n in range(0, 20, 4))
     assert steps != list(islice(found.order((0, 2)), 20))
+    for first in (1, 3, 4, 9):
+        assert list(islice(found.order((0, 1), first), 20 - first)) == steps[first:]
     assert len({tuple(steps[n : n + 4]) for n in range(0, 20, 4)}) > 1
 
 
-@pytest.mark.parametrize(("synthetic", "some"), [(7, 2), (7, 1), (3, 3)])
+@pytest.mark.parametrize(("synthetic", "some"), [(7, 2), (3, 3)])
 def test_synthetic_cameras_take_turns(synthetic, some):
     """Each epoch has all other targets and so many of these, all of which occur equally often."""
     found = targets_of(cloud(), around(4 + synthetic), synthetic=synthetic, synthetic_per_epoch=some)

@@ -55,16 +55,16 @@ def flipped(data, bit):
     return bytes(new)
 
 
-@pytest.mark.parametrize("name", [name for name in FILES if name.endswith(".webp")])
-def test_a_damaged_image_is_named(name):
+def test_a_damaged_image_is_named():
     """Any flipped bit of the stream makes it undecodable, or changes the checksum of the pixels."""
-    data = FILES[name]
-    bits = np.random.default_rng(0).integers(25 * 8, (len(data) - 2) * 8, 12)
-    damaged = [{**FILES, name: flipped(data, int(bit))} for bit in bits]
-    same = [(pixels := pillow(some[name])) is not None and (pixels == pillow(data)).all() for some in damaged]
-    found = in_node(*map(job, damaged))
-    for report, harmless in zip(found, same, strict=True):
-        if not harmless:
+    cases = []
+    for name in (name for name in FILES if name.endswith(".webp")):
+        bits = np.random.default_rng(0).integers(25 * 8, (len(FILES[name]) - 2) * 8, 12)
+        cases += [(name, flipped(FILES[name], int(bit))) for bit in bits]
+    found = in_node(*(job({**FILES, name: data}) for name, data in cases))
+    for report, (name, data) in zip(found, cases, strict=True):
+        pixels = pillow(data)
+        if pixels is None or (pixels != pillow(FILES[name])).any():
             assert report["error"]["name"] == "SogxtError"
             assert report["error"]["message"].startswith(f"{name}: ")
 
@@ -207,39 +207,38 @@ def patched(data, at, form, value):
     return bytes(new)
 
 
-@pytest.mark.parametrize(
-    ("data", "why"),
-    [
-        (b"", "not a zip"),
-        (b"PK\5\6", "not a zip"),
-        (ZIP[:-1], "not a zip"),
-        (ZIP[: len(ZIP) // 2], "not a zip"),
-        (zipped({}), "has no meta.json"),
-        (patched(ZIP, central(ZIP) + 16, "<I", 1), "f_dc.webp is damaged: it does not match its checksum"),
-        (patched(ZIP, central(ZIP) + 8, "<H", 1), "f_dc.webp is encrypted"),
-        (patched(ZIP, central(ZIP) + 10, "<H", 12), "compression method 12"),
-        (patched(ZIP, central(ZIP) + 24, "<I", 99), "damaged"),
-        (patched(ZIP, central(ZIP) + 24, "<I", 2**32 - 1), "more than the"),
-        (patched(ZIP, central(ZIP) + 20, "<I", 2**32 - 1), "cut off"),
-        (patched(ZIP, central(ZIP) + 42, "<I", 2**32 - 1), "not where the zip says"),
-        (patched(ZIP, central(ZIP) + 42, "<I", 7), "not where the zip says"),
-        (patched(ZIP, central(ZIP), "<I", 7), "table of files is damaged"),
-        (patched(ZIP, central(ZIP) + 28, "<H", 65535), "table of files is damaged"),
-        (patched(ZIP, len(ZIP) - 6, "<I", 2**32 - 1), "a 64-bit zip"),
-        (patched(ZIP, len(ZIP) - 12, "<H", 13), "table of files is damaged"),
-        (patched(DEFLATED, central(DEFLATED) + 24, "<I", 99), "damaged"),
-        (patched(DEFLATED, central(DEFLATED) + 24, "<I", len(FILES["f_dc.webp"]) + 1), "damaged"),
-        (patched(DEFLATED, central(DEFLATED) + 24, "<I", len(FILES["f_dc.webp"]) - 1), "damaged"),
-        (patched(DEFLATED, central(DEFLATED) + 16, "<I", 1), "checksum"),
-        (patched(DEFLATED, central(DEFLATED) + 20, "<I", 20), "damaged"),
-        (patched(DEFLATED, local(DEFLATED) + 39, "<I", 0xFFFFFFFF), "damaged"),
-        (zipped({**FILES, "sub/f_dc.webp": b""}), "the zip has f_dc.webp twice"),
-        (zipped({f"{i}.txt": b"" for i in range(1001)}), "a zip of more than 1000 files"),
-    ],
-)
-def test_invalid_zips_are_refused(data, why):
-    (error,) = refusals(job(data))
-    assert why in error
+INVALID_ZIPS = [
+    (b"", "not a zip"),
+    (b"PK\5\6", "not a zip"),
+    (ZIP[:-1], "not a zip"),
+    (ZIP[: len(ZIP) // 2], "not a zip"),
+    (zipped({}), "has no meta.json"),
+    (patched(ZIP, central(ZIP) + 16, "<I", 1), "f_dc.webp is damaged: it does not match its checksum"),
+    (patched(ZIP, central(ZIP) + 8, "<H", 1), "f_dc.webp is encrypted"),
+    (patched(ZIP, central(ZIP) + 10, "<H", 12), "compression method 12"),
+    (patched(ZIP, central(ZIP) + 24, "<I", 99), "damaged"),
+    (patched(ZIP, central(ZIP) + 24, "<I", 2**32 - 1), "more than the"),
+    (patched(ZIP, central(ZIP) + 20, "<I", 2**32 - 1), "cut off"),
+    (patched(ZIP, central(ZIP) + 42, "<I", 2**32 - 1), "not where the zip says"),
+    (patched(ZIP, central(ZIP) + 42, "<I", 7), "not where the zip says"),
+    (patched(ZIP, central(ZIP), "<I", 7), "table of files is damaged"),
+    (patched(ZIP, central(ZIP) + 28, "<H", 65535), "table of files is damaged"),
+    (patched(ZIP, len(ZIP) - 6, "<I", 2**32 - 1), "a 64-bit zip"),
+    (patched(ZIP, len(ZIP) - 12, "<H", 13), "table of files is damaged"),
+    (patched(DEFLATED, central(DEFLATED) + 24, "<I", 99), "damaged"),
+    (patched(DEFLATED, central(DEFLATED) + 24, "<I", len(FILES["f_dc.webp"]) + 1), "damaged"),
+    (patched(DEFLATED, central(DEFLATED) + 24, "<I", len(FILES["f_dc.webp"]) - 1), "damaged"),
+    (patched(DEFLATED, central(DEFLATED) + 16, "<I", 1), "checksum"),
+    (patched(DEFLATED, central(DEFLATED) + 20, "<I", 20), "damaged"),
+    (patched(DEFLATED, local(DEFLATED) + 39, "<I", 0xFFFFFFFF), "damaged"),
+    (zipped({**FILES, "sub/f_dc.webp": b""}), "the zip has f_dc.webp twice"),
+    (zipped({f"{i}.txt": b"" for i in range(1001)}), "a zip of more than 1000 files"),
+]
+
+
+def test_invalid_zips_are_refused():
+    for error, (_, why) in zip(refusals(*(job(data) for data, _ in INVALID_ZIPS)), INVALID_ZIPS, strict=True):
+        assert why in error
 
 
 def test_a_zip_bomb_is_not_unpacked():
@@ -272,19 +271,6 @@ def test_damage_anywhere_in_a_zip():
     for report in found:
         if "error" in report:
             assert report["error"]["name"] == "SogxtError"
-        else:
-            assert report["arrays"] == expected["arrays"]
-
-
-def test_damage_anywhere_in_the_metadata():
-    """Any flipped bit of ``meta.json`` gives the same scene or an error of one sentence."""
-    rng = np.random.default_rng(1)
-    text = FILES["meta.json"]
-    jobs = [job({**FILES, "meta.json": flipped(text, int(bit))}) for bit in rng.integers(0, 8 * len(text), 400)]
-    expected, *found = in_node(job(FILES), *jobs)
-    for report in found:
-        if "error" in report:
-            assert report["error"]["name"] == "SogxtError", report["error"]
         else:
             assert report["arrays"] == expected["arrays"]
 

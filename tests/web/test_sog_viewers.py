@@ -9,7 +9,7 @@ import logging
 
 import numpy as np
 import pytest
-from helpers.viewers import chromium, opened, scattered, seen_from
+from helpers.viewers import chromium, opened, psnr, scattered, seen_from
 
 import kissgs
 from kissgs.io.ply import write_ply
@@ -51,10 +51,6 @@ def ply(splats):
     file = io.BytesIO()
     write_ply(file, splats)
     return file.getvalue()
-
-
-def psnr(a, b):
-    return -10 * np.log10(max(np.mean((a - b) ** 2), 1e-10))
 
 
 def reference(splats, camera):

@@ -6,7 +6,7 @@ import logging
 import numpy as np
 import pytest
 from helpers.streamed_scenes import FAST, small_sizes
-from helpers.viewers import chromium, image_of, opened, pinhole, scattered, seen_from
+from helpers.viewers import chromium, image_of, opened, pinhole, psnr, scattered, seen_from
 
 import kissgs
 from kissgs.core.splats import ATTRIBUTES, Splats
@@ -40,10 +40,6 @@ def draw(viewer, camera, **job):
     found = viewer[0].evaluate("job => draw(job)", {"camera": pinhole(camera), **job})
     found["image"] = image_of(found["image"], camera)
     return found
-
-
-def psnr(a, b):
-    return -10 * np.log10(max(np.mean((a - b) ** 2), 1e-10))
 
 
 def rendered(splats, camera=CAMERA):

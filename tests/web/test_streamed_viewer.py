@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 from helpers.streamed_scenes import small_sizes
-from helpers.viewers import chromium, opened, scattered, seen_from
+from helpers.viewers import chromium, opened, psnr, scattered, seen_from
 
 import kissgs
 from kissgs import Settings
@@ -32,10 +32,6 @@ def streamed(scene, folder, site):
     return folder / "city" / "lod-meta.json", site.put(folder.name, files) + "city/lod-meta.json"
 
 
-def psnr(a, b):
-    return -10 * np.log10(max(np.mean((a - b) ** 2), 1e-10))
-
-
 @pytest.mark.quick(0)
 def test_each_level_is_drawn_whole(playcanvas, tmp_path, monkeypatch):
     small_sizes(monkeypatch, chunk=400, leaf=80, coarsest=200)
@@ -59,6 +55,7 @@ def with_sky(scene):
     return concatenate([scene, sky])
 
 
+@pytest.mark.quick(0)
 def test_the_environment_is_drawn_at_every_level(playcanvas, tmp_path, monkeypatch):
     small_sizes(monkeypatch, chunk=400, leaf=80, coarsest=200)
     monkeypatch.setattr(environment, "FEWEST", 100)

@@ -5,12 +5,12 @@
 
 import base64
 import logging
-import shutil
 from dataclasses import replace
 from math import factorial
 
 import numpy as np
 import pytest
+from helpers.viewers import chromium, pinhole, psnr
 from helpers.web_tools import DECODER, Site
 from scipy.special import lpmv
 
@@ -18,14 +18,8 @@ import kissgs
 from kissgs.core.splats import ATTRIBUTES, SH_C0, SH_REST_COUNTS, Splats
 from kissgs.rendering.camera import Camera, look_at
 
-playwright = pytest.importorskip("playwright.sync_api")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed"),
-    pytest.mark.skipif(not (DECODER / "vendor").exists(), reason="scripts/vendor has not run"),
-]
+pytestmark = pytest.mark.skipif(not (DECODER / "vendor").exists(), reason="scripts/vendor has not run")
 
-SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
 UP = np.array([0, -1.0, 0])
 log = logging.getLogger(__name__)
 
@@ -84,14 +78,12 @@ def page():
     site = Site()
     site.files |= {"/": PAGE.encode(), "/page.js": PROGRAM.encode()}
     site.headers["/"] = {"Content-Type": "text/html"}
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+    with chromium() as browser:
         page = browser.new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
         page.goto(f"{site.url}/")
         yield page
-        browser.close()
     site.close()
     assert errors == []
 
@@ -116,11 +108,8 @@ def scene_of(splats):
 
 def draw(page, splats, cameras, **options):
     """Return images by the page, 0 to 1; with ``file``, also those of its viewer of originals and the count."""
-    pinholes = [
-        {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
-        for camera in cameras
-    ]
-    found = page.evaluate("job => draw(job)", {"scene": scene_of(splats), "cameras": pinholes, **options})
+    job = {"scene": scene_of(splats), "cameras": list(map(pinhole, cameras)), **options}
+    found = page.evaluate("job => draw(job)", job)
 
     def pixels(text, camera):
         return np.frombuffer(base64.b64decode(text), np.uint8).reshape(camera.height, camera.width, 4)[..., :3] / 255
@@ -130,10 +119,6 @@ def draw(page, splats, cameras, **options):
         for kind in ("drawn", "beside")
     )
     return (drawn, beside, found["read"]) if "file" in options else drawn
-
-
-def psnr(a, b):
-    return -10 * np.log10(np.mean((a - b) ** 2))
 
 
 def expected(splats, camera, background=(0, 0, 0)):
@@ -210,6 +195,7 @@ def test_a_file_read_by_spark_and_a_decoded_scene_agree(page, ending, beside, tm
 
 
 @pytest.mark.parametrize("ending", ["ply", "spz"])
+@pytest.mark.quick(1)
 def test_an_antialiased_scene_is_drawn_with_compensated_opacities(page, ending, tmp_path):
     """Decoded, and read from a marked file beside it; a classic scene after it is drawn as such."""
     scene = kissgs.sample_scene(5000, sh_degree=1)

@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import itertools
 
 import numpy as np
 import pytest
@@ -28,14 +29,14 @@ def argb(count, seed=0):
 def check_like_pillow(folder, *writers, channels=4):
     """Check that both decoders return the same pixels or refuse the file."""
     files = [writer.file() for writer in writers]
-    for data, got in zip(files, decode_all(folder, files, pixels=True), strict=True):
+    for number, (data, got) in enumerate(zip(files, decode_all(folder, files, pixels=True), strict=True)):
         wanted = pillow(data)
         if wanted is None:
-            assert got["name"] == "WebPError", got
+            assert got["name"] == "WebPError", (number, got)
             continue
-        assert "rgba" in got, got
+        assert "rgba" in got, (number, got)
         found = np.frombuffer(base64.b64decode(got["rgba"]), np.uint8).reshape(got["height"], got["width"], 4)
-        assert (found[:, :, :channels] == wanted[:, :, :channels]).all()
+        assert (found[:, :, :channels] == wanted[:, :, :channels]).all(), number
 
 
 def accepted(folder, *writers, channels=4):
@@ -73,26 +74,25 @@ def test_plain_noise(tmp_path):
     accepted(tmp_path, plain(1, 1), plain(5, 3), plain(33, 17))
 
 
-@pytest.mark.parametrize("mode", range(16))
-def test_every_predictor_of_noise(mode, tmp_path):
+def test_every_predictor_of_noise(tmp_path):
     """Modes 14 and 15 mean black; other bits of the tiles are ignored; narrow images have no pixel to the right."""
-    tile = 0xFF0000FF | mode << 8
-    accepted(
-        tmp_path,
-        *(with_tiles(PREDICTOR, 4, *size, lambda _: tile) for size in ((40, 19), (1, 9), (2, 9), (9, 1), (17, 33))),
-        with_tiles(PREDICTOR, 3, 30, 30, lambda i: (0xF0 | mode) << 8 | i),
-    )
+    sizes = (40, 19), (1, 9), (2, 9), (9, 1), (17, 33)
+    for mode in range(16):
+        tile = 0xFF0000FF | mode << 8
+        writers = [with_tiles(PREDICTOR, 4, *size, lambda _, tile=tile: tile) for size in sizes]
+        accepted(tmp_path, *writers, with_tiles(PREDICTOR, 3, 30, 30, lambda i, mode=mode: (0xF0 | mode) << 8 | i))
 
 
-@pytest.mark.parametrize("bits", range(2, 10))
-def test_every_size_of_tiles(bits, tmp_path):
-    side = (1 << bits) + 5 if bits < 8 else 40
-    accepted(
-        tmp_path,
-        with_tiles(PREDICTOR, bits, side, 21, lambda i: i % 14 << 8),
-        with_tiles(CROSS_COLOUR, bits, side, 21, lambda i: i * 2654435761 & 0xFFFFFFFF),
-        with_tiles(PREDICTOR, bits, 21, side, lambda i: i % 14 << 8),
-    )
+def test_every_size_of_tiles(tmp_path):
+    writers = []
+    for bits in range(2, 10):
+        side = (1 << bits) + 5 if bits < 8 else 40
+        writers += [
+            with_tiles(PREDICTOR, bits, side, 21, lambda i: i % 14 << 8),
+            with_tiles(CROSS_COLOUR, bits, side, 21, lambda i: i * 2654435761 & 0xFFFFFFFF),
+            with_tiles(PREDICTOR, bits, 21, side, lambda i: i % 14 << 8),
+        ]
+    accepted(tmp_path, *writers)
 
 
 def test_every_factor_of_cross_colour(tmp_path):
@@ -103,8 +103,7 @@ def test_every_factor_of_cross_colour(tmp_path):
     )
 
 
-@pytest.mark.parametrize("order", [(2, 0, 1), (1, 2, 0), (0, 1, 2), (0, 2), (1, 0), (2, 1)])
-def test_transforms_in_any_order(order, tmp_path):
+def made_transforms_in_any_order(order):
     writer = Writer(30, 20)
     for kind in order:
         writer.transform(kind, None if kind == SUBTRACT_GREEN else 3)
@@ -112,15 +111,14 @@ def test_transforms_in_any_order(order, tmp_path):
             writer.image(np.array(argb(4 * 3, seed=kind)) & (0xFFFFF5FF if kind == PREDICTOR else -1))
     writer.put(0, 1)
     writer.image(argb(600), main=True)
-    accepted(tmp_path, writer)
+    return writer
 
 
-@pytest.mark.parametrize("others", [(), (SUBTRACT_GREEN,), (PREDICTOR,), (CROSS_COLOUR, PREDICTOR)])
-@pytest.mark.parametrize("before", [True, False])
-@pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 15, 16, 17, 200, 256])
-@pytest.mark.quick(16)
-def test_palettes_with_indices_beyond_their_end(size, before, others, tmp_path):
-    """Transforms after a palette apply to packed pixels."""
+def test_transforms_in_any_order(tmp_path):
+    accepted(tmp_path, *map(made_transforms_in_any_order, [(2, 0, 1), (1, 2, 0), (0, 1, 2), (0, 2), (1, 0), (2, 1)]))
+
+
+def made_palette(size, before, others):
     width, height = 29, 11
     writer = Writer(width, height)
 
@@ -141,7 +139,16 @@ def test_palettes_with_indices_beyond_their_end(size, before, others, tmp_path):
         put_others()
     writer.put(0, 1)
     writer.image(argb(across * height), main=True)
-    accepted(tmp_path, writer)
+    return writer
+
+
+def test_palettes_with_indices_beyond_their_end(tmp_path):
+    """Transforms after a palette apply to packed pixels."""
+    sizes, others = (
+        (1, 2, 3, 4, 5, 15, 16, 17, 200, 256),
+        ((), (SUBTRACT_GREEN,), (PREDICTOR,), (CROSS_COLOUR, PREDICTOR)),
+    )
+    accepted(tmp_path, *(made_palette(*case) for case in itertools.product(sizes, (True, False), others)))
 
 
 def test_codes_of_one_and_two_symbols(tmp_path):
@@ -172,9 +179,7 @@ def test_codes_of_one_and_two_symbols(tmp_path):
     )
 
 
-@pytest.mark.parametrize("longest", range(1, 16))
-def test_codes_up_to_15_bits(longest, tmp_path):
-    """One symbol of each length gives the longest possible codes, with one or two tables."""
+def made_codes_up_to_15_bits(longest):
     lengths = [*range(1, longest + 1), longest]
     writer = Writer(32, 32)
     writer.put(0, 3)
@@ -184,7 +189,12 @@ def test_codes_up_to_15_bits(longest, tmp_path):
     for _ in range(1024):
         for code in codes[:4]:
             writer.symbol(code, int(RNG.integers(0, longest + 1)))
-    accepted(tmp_path, writer)
+    return writer
+
+
+def test_codes_up_to_15_bits(tmp_path):
+    """One symbol of each length gives the longest possible codes, with one or two tables."""
+    accepted(tmp_path, *map(made_codes_up_to_15_bits, range(1, 16)))
 
 
 def test_code_lengths_in_all_encodings(tmp_path):
@@ -221,9 +231,7 @@ def test_code_lengths_in_all_encodings(tmp_path):
     accepted(tmp_path, writer)
 
 
-@pytest.mark.parametrize("bits", range(1, 12))
-def test_colour_caches(bits, tmp_path):
-    """Caches of all sizes, with pixels from filled and from empty slots, which are transparent black."""
+def made_colour_caches(bits):
     writer = Writer(40, 30)
     writer.put(0, 1)
     writer.put(1, 1)
@@ -243,8 +251,12 @@ def test_colour_caches(bits, tmp_path):
         else:
             writer.pixel(codes, int(rng.integers(0, 1 << 32)))
             count += 1
-    if count == 1200:
-        accepted(tmp_path, writer)
+    return writer
+
+
+def test_colour_caches(tmp_path):
+    """Caches of all sizes, with pixels from filled and from empty slots, which are transparent black."""
+    accepted(tmp_path, *map(made_colour_caches, range(1, 12)))
 
 
 def test_a_colour_from_an_empty_slot_is_put_into_the_cache(tmp_path):
@@ -263,9 +275,7 @@ def test_a_colour_from_an_empty_slot_is_put_into_the_cache(tmp_path):
     accepted(tmp_path, writer)
 
 
-@pytest.mark.parametrize("width", [1, 2, 5, 9, 40])
-def test_every_distance_and_length(width, tmp_path):
-    """Includes the 120 near distances; those that are not positive mean the previous pixel."""
+def made_every_distance_and_length(width):
     height = 400 // width + 30
     near = [*range(1, 121), 121, 125, 200, 300]
     writer = Writer(width, height)
@@ -301,12 +311,15 @@ def test_every_distance_and_length(width, tmp_path):
         writer.symbol(codes[4], symbol)
         writer.put(value, extra)
         at += length
-    accepted(tmp_path, writer)
+    return writer
 
 
-@pytest.mark.parametrize("bits", range(2, 10))
-def test_groups_of_codes(bits, tmp_path):
-    """Each tile has a group, whose number takes both bytes; some groups are never used."""
+def test_every_distance_and_length(tmp_path):
+    """Includes the 120 near distances; those that are not positive mean the previous pixel."""
+    accepted(tmp_path, *map(made_every_distance_and_length, [1, 2, 5, 9, 40]))
+
+
+def made_groups_of_codes(bits):
     width, height = (70, 9) if bits < 7 else (2 * (1 << bits) + 3, 2)
     writer = Writer(width, height)
     writer.put(0, 2)
@@ -320,7 +333,12 @@ def test_groups_of_codes(bits, tmp_path):
     for red, green, blue, alpha in values.tolist():
         for symbol in (green, red, blue, alpha, 0):
             writer.simple(symbol)
-    accepted(tmp_path, writer)
+    return writer
+
+
+def test_groups_of_codes(tmp_path):
+    """Each tile has a group, whose number takes both bytes; some groups are never used."""
+    accepted(tmp_path, *map(made_groups_of_codes, range(2, 10)))
 
 
 def test_groups_of_codes_that_are_not_used(tmp_path):
@@ -352,8 +370,7 @@ def test_alpha_does_not_depend_on_the_hint(hint, tmp_path):
 # --- Files that both decoders refuse ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", range(4))
-def test_a_transform_twice(kind, tmp_path):
+def made_a_transform_twice(kind):
     writer = Writer(4, 4)
     for _ in range(2):
         writer.transform(kind, None if kind in (SUBTRACT_GREEN, INDEXING) else 2)
@@ -363,19 +380,25 @@ def test_a_transform_twice(kind, tmp_path):
             writer.image([0xFF000000] * (200 if kind == INDEXING else 1))
     writer.put(0, 1)
     writer.image(argb(16), main=True)
-    refused(tmp_path, writer, why="a transform that occurs twice")
+    return writer
 
 
-@pytest.mark.parametrize("version", range(1, 8))
-def test_other_versions(version, tmp_path):
+def test_a_transform_twice(tmp_path):
+    refused(tmp_path, *map(made_a_transform_twice, range(4)), why="a transform that occurs twice")
+
+
+def made_other_versions(version):
     writer = Writer(4, 4, version=version)
     writer.put(0, 1)
     writer.image(argb(16), main=True)
-    refused(tmp_path, writer, why="version")
+    return writer
 
 
-@pytest.mark.parametrize("bits", [0, 12, 13, 14, 15])
-def test_caches_of_invalid_size(bits, tmp_path):
+def test_other_versions(tmp_path):
+    refused(tmp_path, *map(made_other_versions, range(1, 8)), why="version")
+
+
+def made_caches_of_invalid_size(bits):
     writer = Writer(4, 4)
     writer.put(0, 1)
     writer.put(1, 1)
@@ -384,29 +407,31 @@ def test_caches_of_invalid_size(bits, tmp_path):
     codes = writer.literal_codes(cache=bits)
     for value in argb(16):
         writer.pixel(codes, value)
-    refused(tmp_path, writer, why="cache")
+    return writer
 
 
-@pytest.mark.parametrize(
-    "lengths", [[], [2], [1, 2], [1, 1, 1], [1, 2, 2, 2], [3] * 7, [3] * 9, [15] * 2, [1, *[15] * 200]]
-)
-@pytest.mark.parametrize("which", range(5))
-@pytest.mark.quick(5)
-def test_incomplete_and_oversubscribed_codes(lengths, which, tmp_path):
+def test_caches_of_invalid_size(tmp_path):
+    refused(tmp_path, *map(made_caches_of_invalid_size, [0, 12, 13, 14, 15]), why="cache")
+
+
+def made_code(lengths, which):
     writer = Writer(4, 4)
     writer.put(0, 3)
     for i, size in enumerate((280, 256, 256, 256, 40)):
         writer.code((lengths if i == which else [1, 1])[:size], size)
     writer.put(0, 200)
-    if lengths == [2]:
-        accepted(tmp_path, writer)
-    else:
-        refused(tmp_path, writer, why="prefix code")
+    return writer
 
 
-@pytest.mark.parametrize("at", [0, 1, 5])
-def test_copies_from_outside_the_image(at, tmp_path):
-    for length, distance in ((0, 5 - 1), (3, 1)):
+def test_incomplete_and_oversubscribed_codes(tmp_path):
+    wrong = [], [1, 2], [1, 1, 1], [1, 2, 2, 2], [3] * 7, [3] * 9, [15] * 2, [1, *[15] * 200]
+    accepted(tmp_path, *(made_code([2], which) for which in range(5)))
+    refused(tmp_path, *itertools.starmap(made_code, itertools.product(wrong, range(5))), why="prefix code")
+
+
+def test_copies_from_outside_the_image(tmp_path):
+    writers = []
+    for at, (length, distance) in itertools.product((0, 1, 5), ((0, 5 - 1), (3, 1))):
         writer = Writer(3, 2 if at < 5 else 3)
         writer.put(0, 3)
         codes = writer.literal_codes(lengths=True)
@@ -415,7 +440,8 @@ def test_copies_from_outside_the_image(at, tmp_path):
         writer.symbol(codes[0], 256 + length)
         writer.symbol(codes[4], distance)
         writer.put(0, 200)
-        check_like_pillow(tmp_path, writer)
+        writers.append(writer)
+    check_like_pillow(tmp_path, *writers)
 
 
 def test_more_code_lengths_than_symbols(tmp_path):

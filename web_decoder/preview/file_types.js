@@ -14,7 +14,7 @@ export const fileTypeOf = (name) => FILE_TYPES.find((type) => name.toLowerCase()
 /** Return the type of a format by the service's name of it; of a container, none. @param {string} format */
 export const fileTypeOfFormat = (format) => FILE_TYPES.find((type) => type === format);
 
-/** Comments in a `.ply` that say whether the scene is antialiased, as in kissgs/io/ply_header.py. */
+/** Comments in a `.ply` that say whether the scene is antialiased, as in kissgs/io/ply_rows.py. */
 const MARK =
   /^(?:comment|obj_info)\s+(?:(?:splat_?render_?mode|rasteri[sz]e[-_ ]?mode)\s*[:=]?\s*([\w-]+)|(?:trained with )?(?:anti[-_ ]?alias(?:ed|ing)?|mip[-_ ]?splatting)\s*(?:[:=]?\s*([\w.]+))?)\s*$/i;
 /** Largest header that is searched for a mark. */

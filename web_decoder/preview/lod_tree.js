@@ -1,5 +1,6 @@
 /** The manifest of a streamed scene: its leaves, and the files that hold their levels. */
 
+import { parseMeta } from "../container.js";
 import { UserError } from "./problem.js";
 
 /** @typedef {import("./choice.js").Level} Level */
@@ -78,7 +79,7 @@ export function parseTree(json) {
 /** @param {Uint8Array} json */
 function parse(json) {
   try {
-    return JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
+    return parseMeta(json);
   } catch {
     return fail("it is not readable JSON");
   }

@@ -23,15 +23,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StrictInt, ValidationError
 
-from kissgs.cameras.captures.posed_image import MAX_SIDE, composed, open_file, quoted
+from kissgs.cameras.captures.posed_image import MAX_SIDE, composed, invalid, quoted, read_json
 from kissgs.cameras.views import View
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
 from kissgs.io.files import atomic_file
 from kissgs.rendering.camera import Camera
-
-MAX_JSON_BYTES = 1 << 28
-"""Maximum bytes of a camera file; ten thousand cameras take about 5 MB."""
 
 _Side = Annotated[StrictInt, Field(ge=1, le=MAX_SIDE)]
 _Focal = Annotated[FiniteFloat, Field(gt=0)]
@@ -61,11 +58,7 @@ class _TrainerCamera(BaseModel):
 
 
 def read_cameras(path: Path) -> tuple[View, ...]:
-    """Read the cameras of a file, in its order; a camera without a name is named after the file.
-
-    Raises:
-        InvalidViewsError: the file cannot be read, is not JSON, or is of neither format.
-    """
+    """Read the cameras of a file, in its order; a camera without a name is named after the file."""
     document = _parse(path)
     if not isinstance(document, list):
         return (_view(document, f"{path}", path.stem),)
@@ -87,25 +80,15 @@ def camera_as_dict(camera: Camera) -> dict[str, object]:
 
 
 def write_camera(path: Path, camera: Camera, *, overwrite: bool = False) -> None:
-    """Write a camera in the JSON format of kissgs, atomically.
-
-    Raises:
-        OutputError: the file exists and ``overwrite`` is false, or it cannot be written.
-    """
+    """Write a camera in the JSON format of kissgs, atomically."""
     entries = (f'  "{name}": {json.dumps(value)}' for name, value in camera_as_dict(camera).items())
     with atomic_file(path, overwrite=overwrite) as file:
         file.write(("{\n" + ",\n".join(entries) + "\n}\n").encode())
 
 
 def _parse(path: Path) -> object:
-    with open_file(path) as (file, size):
-        if size > MAX_JSON_BYTES:
-            raise InvalidViewsError(
-                f"{path} has {size:,} bytes; at most {MAX_JSON_BYTES:,} are read; is it a camera file?"
-            )
-        data = file.read()
     try:
-        return json.loads(data.removeprefix(b"\xef\xbb\xbf"))
+        return json.loads(read_json(path))
     except (ValueError, RecursionError) as error:
         raise InvalidViewsError(f"{path} is not JSON: {str(error).lower()}") from error
 
@@ -123,9 +106,7 @@ def _view(entry: object, where: str, name: str) -> View:
         found = _TrainerCamera.model_validate(entry)
         return View(found.img_name or name, _from_trainer(found))
     except ValidationError as error:
-        problem = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        field = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in problem["loc"]).lstrip(".")
-        raise InvalidViewsError(f"{where}, {field}: {problem['msg'][0].lower()}{problem['msg'][1:]}") from error
+        raise invalid(where, error) from error
     except InvalidViewsError as error:
         raise InvalidViewsError(f"{where}: {error}") from error
 
@@ -165,11 +146,7 @@ def is_camera_file(which: str) -> bool:
 
 
 def view_of_file(which: str) -> View:
-    """Return the camera of FILE.json, or the one that FILE.json:N or FILE.json:NAME selects.
-
-    Raises:
-        InvalidViewsError: there is no such file or camera, or the file has several cameras and none is selected.
-    """
+    """Return the camera of FILE.json, or the one that FILE.json:N or FILE.json:NAME selects."""
     name, selected = _split(which) or (which, "")
     views = read_cameras(Path(name))
     if selected:
@@ -184,14 +161,6 @@ def pick_view(views: Sequence[View], which: str, source: str) -> View:
     """Return the view with this name, else the one with this index, else the one with this file name or stem.
 
     For example, ``a.png`` and ``a`` select ``images/a.png`` if no other view matches.
-
-    Args:
-        views: at least one view.
-        which: name, index from 0, file name or stem.
-        source: description of ``views``, for error messages.
-
-    Raises:
-        InvalidViewsError: no view matches, or several do.
     """
     found = [view for view in views if view.name == which]
     if not found and which.isascii() and which.isdigit() and len(which) < 10:

@@ -71,12 +71,7 @@ class ImageRecord:
 
 
 def read_binary_cameras(path: Path) -> dict[int, CameraRecord]:
-    """Return all cameras of a ``cameras.bin`` by number.
-
-    Raises:
-        InvalidViewsError: the file cannot be read, is truncated, or continues after its last camera.
-        UnsupportedError: a camera has an unknown model number.
-    """
+    """Return all cameras of a ``cameras.bin`` by number."""
     cameras: dict[int, CameraRecord] = {}
     with open_file(path) as (file, size):
         reader = _Reader(path, file, size)
@@ -96,11 +91,7 @@ def read_binary_cameras(path: Path) -> dict[int, CameraRecord]:
 
 
 def read_binary_images(path: Path) -> Iterator[ImageRecord]:
-    """Yield all images of an ``images.bin``, in order; their points are skipped.
-
-    Raises:
-        InvalidViewsError: the file cannot be read, is truncated, or continues after its last image.
-    """
+    """Yield all images of an ``images.bin``, in order; their points are skipped."""
     with open_file(path) as (file, size):
         reader = _Reader(path, file, size)
         for _ in range(reader.count("images", _MIN_IMAGE_BYTES)):
@@ -112,11 +103,7 @@ def read_binary_images(path: Path) -> Iterator[ImageRecord]:
 
 
 def read_text_cameras(path: Path) -> dict[int, CameraRecord]:
-    """Return all cameras of a ``cameras.txt`` by number.
-
-    Raises:
-        InvalidViewsError: the file cannot be read, or a line does not describe a camera.
-    """
+    """Return all cameras of a ``cameras.txt`` by number."""
     cameras: dict[int, CameraRecord] = {}
     for number, line in _lines(path):
         if _is_comment(line):
@@ -136,11 +123,7 @@ def read_text_cameras(path: Path) -> dict[int, CameraRecord]:
 
 
 def read_text_images(path: Path) -> Iterator[ImageRecord]:
-    """Yield all images of an ``images.txt``, in order.
-
-    Raises:
-        InvalidViewsError: the file cannot be read, a line does not describe an image, or its line of points is missing.
-    """
+    """Yield all images of an ``images.txt``, in order."""
     lines = _lines(path)
     for number, line in lines:
         if _is_comment(line):
@@ -295,10 +278,6 @@ def read_colmap(folder: Path) -> Capture:
 
     Photographs are expected in ``images`` next to the model, or next to the topmost of folders such as ``sparse/0``,
     unless the model names them by absolute paths.
-
-    Raises:
-        InvalidViewsError: the files are missing, damaged, truncated, or contradict each other.
-        UnsupportedError: the camera of an image is a fisheye or of another unsupported model.
     """
     binary = _is_model(folder, "bin")
     images_path = folder / ("images.bin" if binary else "images.txt")

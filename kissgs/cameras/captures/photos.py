@@ -29,34 +29,26 @@ MAX_LISTED_FOLDERS = 4
 
 @dataclass(frozen=True, slots=True)
 class FoundPhoto:
-    """File of a photograph.
-
-    Attributes:
-        path: the file.
-        factor: original size divided by this photograph's size, according to the folder's name.
-        folder: folder of photographs that contains the file, perhaps in a subfolder.
-    """
+    """File of a photograph."""
 
     path: Path
     factor: int
+    """Original size divided by this photograph's size, according to the folder's name."""
     folder: Path
+    """Folder of photographs that contains the file, perhaps in a subfolder."""
 
 
 @dataclass(frozen=True, slots=True)
 class _SearchFolder:
-    """Folder in which a photograph is searched for.
-
-    Attributes:
-        folder: the folder.
-        factor: original size divided by the size of its photographs.
-        names: names to try, in order, relative to the folder.
-        has_photos: whether the folder exists and is certainly for photographs, unlike the capture's own folder.
-    """
+    """Folder in which a photograph is searched for."""
 
     folder: Path
     factor: int
+    """Original size divided by the size of its photographs."""
     names: tuple[str, ...]
+    """Names to try, in order, relative to the folder."""
     has_photos: bool
+    """Whether the folder exists and is certainly for photographs, unlike the capture's own folder."""
 
 
 def find_photos(
@@ -70,18 +62,8 @@ def find_photos(
     not exist is searched for in the capture's folder: first in a folder with the name of the path's own folder, then in
     ``images``.
 
-    Args:
-        names: paths of photographs, relative to ``root`` or absolute, with or without extension.
-        root: folder of the capture.
-        scale: use the folder whose name ends with this number, such as ``images_4``; 1 is the full-size folder.
-        images: use this folder instead of those in ``names``, and try each name with and without its own folders.
-            Relative to the working directory, else to ``root``.
-
     Returns:
         One file per name, in order; None if there is no folder of photographs.
-
-    Raises:
-        InvalidViewsError: the requested folder does not exist, or some photographs are missing.
     """
     if images is not None and scale is not None:
         raise InvalidViewsError("--images and --scale exclude each other; give only one of them")

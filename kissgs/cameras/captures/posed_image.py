@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import io
 import math
@@ -12,21 +13,19 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from pydantic import ValidationError
 
 from kissgs.cameras.photographs import NO_DISTORTION, Distortion, Lens
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
 
-# Opening of camera files, with errors as one sentence.
+MAX_JSON_BYTES = 1 << 28
+"""Maximum bytes of a JSON file; ten thousand cameras take about 10 MB."""
 
 
 @contextlib.contextmanager
 def open_file(path: Path) -> Iterator[tuple[io.BufferedReader, int]]:
-    """Open a regular file for reading; yield it and its size in bytes.
-
-    Raises:
-        InvalidViewsError: it is missing or no regular file, or it cannot be read.
-    """
+    """Open a regular file for reading; yield it and its size in bytes."""
     try:
         if not path.is_file():  # opening a named pipe would wait for its writer
             reason = "it is a folder or a device" if path.exists() else "there is no such file"
@@ -37,6 +36,24 @@ def open_file(path: Path) -> Iterator[tuple[io.BufferedReader, int]]:
             yield file, size
     except OSError as error:
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
+
+
+def read_json(path: Path) -> bytes:
+    """Return the bytes of a JSON file without a byte order mark, at most :data:`MAX_JSON_BYTES`."""
+    with open_file(path) as (file, size):
+        if size > MAX_JSON_BYTES:
+            raise InvalidViewsError(
+                f"{path} has {size:,} bytes; at most {MAX_JSON_BYTES:,} are read; is it a camera file?"
+            )
+        return file.read().removeprefix(codecs.BOM_UTF8)
+
+
+def invalid(where: str, error: ValidationError) -> InvalidViewsError:
+    """Return the first problem of a document as an error of one sentence."""
+    problem = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    field = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in problem["loc"]).lstrip(".")
+    message = f"{problem['msg'][0].lower()}{problem['msg'][1:]}"
+    return InvalidViewsError(f"{where}, {field}: {message}" if field else f"{where}: {message}")
 
 
 def quoted(text: str) -> str:
@@ -72,15 +89,7 @@ class Intrinsics:
     distortion: Distortion = NO_DISTORTION
 
     def lens(self, nominal: tuple[int, int], size: tuple[int, int]) -> Lens:
-        """Return the lens for a photograph of another size, with all defaults filled in.
-
-        Args:
-            nominal: (width, height) that the intrinsics refer to, pixels.
-            size: (width, height) of the photograph, pixels.
-
-        Raises:
-            InvalidViewsError: there is neither a focal length nor an angle of view.
-        """
+        """Return the lens for a photograph of another size, with all defaults filled in."""
         across, down = size[0] / nominal[0], size[1] / nominal[1]
         fx, fy = _focal(self.fx, self.angle_x, nominal[0]), _focal(self.fy, self.angle_y, nominal[1])
         fx = fy if fx is None else fx
@@ -94,43 +103,35 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedImage:
-    """A photograph with its pose and intrinsics.
-
-    Attributes:
-        name: name of the view, unique in most captures.
-        photo: path of the photograph according to the camera file; absolute, or relative to the capture's root.
-        where: camera file and entry, for error messages.
-        viewmat: ``(4, 4)`` float64, rigid transform from world to camera, with the axes of ``Camera``.
-        intrinsics: intrinsics of its camera.
-        split: whether it is for training or held out; None if the capture does not define it.
-    """
+    """A photograph with its pose and intrinsics."""
 
     name: str
+    """Unique in most captures."""
     photo: str
+    """According to the camera file; absolute, or relative to the capture's root."""
     where: str
+    """Camera file and entry, for error messages."""
     viewmat: Float64[np.ndarray, "4 4"]
+    """Rigid transform from world to camera, with the axes of ``Camera``."""
     intrinsics: Intrinsics
     split: Literal["train", "test"] | None = None
+    """None if the capture does not define it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """All posed images of a capture, in the order of its camera file.
-
-    Attributes:
-        images: at least one.
-        root: folder that paths of photographs are relative to.
-        source: description of the files that were read, for messages.
-        white: whether transparent pixels are composited over white.
-        applied: ``(4, 4)`` transform, rotation and translation, from the coordinates of a former model to those of
-            the poses; None if there was none.
-    """
+    """All posed images of a capture, in the order of its camera file."""
 
     images: tuple[PosedImage, ...]
+    """One or more."""
     root: Path
+    """Folder that paths of photographs are relative to."""
     source: str
+    """Description of the files that were read, for messages."""
     white: bool = False
+    """Whether transparent pixels are composited over white."""
     applied: Float64[np.ndarray, "4 4"] | None = None
+    """Rotation and translation from the coordinates of a former model to those of the poses, if there was one."""
 
 
 def _focal(length: float | None, angle: float | None, side: int) -> float | None:

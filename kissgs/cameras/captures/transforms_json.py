@@ -19,14 +19,20 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
-from kissgs.cameras.captures.posed_image import MAX_SIDE, Capture, Intrinsics, PosedImage, composed, open_file, quoted
+from kissgs.cameras.captures.posed_image import (
+    MAX_SIDE,
+    Capture,
+    Intrinsics,
+    PosedImage,
+    composed,
+    invalid,
+    quoted,
+    read_json,
+)
 from kissgs.cameras.photographs import Distortion
 from kissgs.cameras.views import Similarity
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
-
-MAX_JSON_BYTES = 1 << 28
-"""Maximum bytes of a file; ten thousand frames take about 10 MB."""
 
 MAX_SKEW = 0.01
 """Maximum relative difference between the singular values of a rotation matrix, to accept rounded numbers."""
@@ -92,10 +98,6 @@ def read_transforms(path: Path) -> Capture:
     nerfstudio's ``train_filenames`` are for training, and ``test_filenames`` (``val_filenames`` if that is empty) are
     held out. If there is only one of these lists, all other frames are in the other part. If there are both, frames in
     neither are left out, and frames in both are held out.
-
-    Raises:
-        InvalidViewsError: the file cannot be read or is not JSON, or fields are missing, invalid or contradictory.
-        UnsupportedError: a camera is a fisheye or has a distortion coefficient k4.
     """
     document = _read(path, _Transforms)
     images = _posed_images(path, document)
@@ -106,12 +108,7 @@ def read_transforms(path: Path) -> Capture:
 
 
 def read_split_transforms(folder: Path) -> Capture:
-    """Read ``transforms_train.json``, and ``transforms_test.json`` or else ``transforms_val.json`` as held-out frames.
-
-    Raises:
-        InvalidViewsError: as for :func:`read_transforms`.
-        UnsupportedError: as for :func:`read_transforms`.
-    """
+    """Read ``transforms_train.json``, and ``transforms_test.json`` or else ``transforms_val.json`` as held out."""
     train_path = folder / "transforms_train.json"
     tests = [folder / f"transforms_{name}.json" for name in ("test", "val")]
     test_path = next((path for path in tests if path.is_file()), None)
@@ -127,13 +124,8 @@ def read_split_transforms(folder: Path) -> Capture:
 def similarities(folders: Iterable[Path], applied: Float64[np.ndarray, "4 4"] | None) -> tuple[Similarity, ...]:
     """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have.
 
-    Args:
-        folders: folders that may have nerfstudio's ``dataparser_transforms.json``, which it writes beside its
-            checkpoints; the first that has one counts.
-        applied: the capture's ``applied_transform``, see :class:`kissgs.cameras.captures.posed_image.Capture`.
-
-    Raises:
-        InvalidViewsError: the file cannot be read, or is not of nerfstudio's form.
+    nerfstudio writes its ``dataparser_transforms.json`` beside its checkpoints; the first of ``folders`` that has one
+    counts.
     """
     found = []
     path = next((path for folder in folders if (path := folder / DATAPARSER_TRANSFORMS).is_file()), None)
@@ -167,24 +159,16 @@ def _similarity(rows: list[list[float]], where: str) -> Float64[np.ndarray, "4 4
 
 
 def _read(path: Path, model: type[_Document]) -> _Document:
-    with open_file(path) as (file, size):
-        if size > MAX_JSON_BYTES:
-            raise InvalidViewsError(
-                f"{path} has {size:,} bytes; at most {MAX_JSON_BYTES:,} are read; is it a camera file?"
-            )
-        data = file.read()
+    data = read_json(path)
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InvalidViewsError(f"{path} is text in UTF-16; save it as UTF-8")
     try:
-        return model.model_validate_json(data.removeprefix(b"\xef\xbb\xbf"))
+        return model.model_validate_json(data)
     except ValidationError as error:
         problem = error.errors(include_url=False, include_context=False, include_input=False)[0]
         if problem["type"] == "json_invalid":
             raise InvalidViewsError(f"{path} is not JSON: {problem['msg'].removeprefix('Invalid JSON: ')}") from error
-        field = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in problem["loc"]).lstrip(".")
-        raise InvalidViewsError(
-            f"{path}{', ' if field else ''}{field}: {problem['msg'][0].lower()}{problem['msg'][1:]}"
-        ) from error
+        raise invalid(str(path), error) from error
 
 
 def _is_synthetic(document: _Transforms) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kissgs.cameras.random_cameras import UP, Vec3
 from kissgs.cameras.views import black
 from kissgs.core.array_types import Float64, Int
 from kissgs.core.progress import Progress
@@ -18,25 +19,18 @@ from kissgs.rendering.cpu.frame import draw
 
 # ``scene_bounds``: centre, radius and up direction of a scene, estimated from its Gaussians alone.
 
-Vec3 = Float64[np.ndarray, "3"]
-"""``(3,)`` float64, a point or a direction in world space."""
-
-UP_AXES = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+UP_AXES = (UP, np.array([0.0, 0.0, 1.0]))
 """Up directions of scene files: COLMAP's y points roughly down, nerfstudio's z up. The first is the default."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneBounds:
-    """Position, size and orientation of a scene's densest part.
-
-    Attributes:
-        centre: ``(3,)`` float64, centre of the densest part, world units.
-        radius: distance from the centre within which half of the opacity of that part lies, world units.
-        up: ``(3,)`` float64 unit vector.
-    """
+    """Position, size and orientation of a scene's densest part."""
 
     centre: Vec3
+    """Centre of the densest part, world units."""
     radius: float
+    """Distance from the centre within which half of the opacity of that part lies, world units."""
     up: Vec3
 
 
@@ -45,11 +39,8 @@ def scene_bounds(splats: Splats, start: tuple[Vec3, float] | None = None) -> Sce
 
     Gaussians count by their opacity, so that floaters and sky have little influence. A capture has most Gaussians where
     its photographs point. The centre is a mode of that density, found by mean shift from the weighted median of the
-    positions; the bandwidth is the current radius.
-
-    Args:
-        splats: the scene, finite. Without any opacity, the result is the unit sphere around the origin.
-        start: centre, ``(3,)``, and radius from which mean shift starts instead, world units.
+    positions, or from the centre and radius ``start``; the bandwidth is the current radius. Without any opacity, the
+    result is the unit sphere around the origin.
     """
     means = splats.means.astype(np.float64)
     weights = opacity(splats)
@@ -82,13 +73,7 @@ def opacity(splats: Splats) -> Float64[np.ndarray, " N"]:
 def weighted_quantile(
     values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantile: float = 0.5
 ) -> float:
-    """Return the value at which the fraction ``quantile`` of the weight is reached; by default, the weighted median.
-
-    Args:
-        values: ``(n,)`` float64. Without any, the result is 0.
-        weights: ``(n,)`` float64, 0 or more.
-        quantile: 0 to 1.
-    """
+    """Return the value at which this fraction of the weight is reached, by default the median; 0 without values."""
     return weighted_quantiles(values, weights, (quantile,))[0]
 
 
@@ -108,12 +93,8 @@ def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.
     """Return the up direction: the normal of the ground, or the axis that files use if there is no ground.
 
     The short axes of flat Gaussians are surface normals; most of them near one file axis select that axis. The sign
-    follows from the skew of heights: objects stand on the ground, so that density falls off upwards.
-
-    Args:
-        splats: the scene.
-        weights: ``(N,)`` float64, 0 or more; 0 for Gaussians that do not count.
-        offsets: ``(N, 3)`` float64, positions relative to the centre.
+    follows from the skew of heights: objects stand on the ground, so that density falls off upwards. ``offsets`` are
+    positions relative to the centre.
     """
     axis = UP_AXES[0]
     if not weights.any():
@@ -180,40 +161,25 @@ CENTRE_SCALE = 30.0
 
 @dataclass(frozen=True, slots=True)
 class ViewStats:
-    """Statistics of a thumbnail.
-
-    Attributes:
-        alpha: mean alpha, 0 to 1.
-        log_size: median logarithm of the largest scale of the Gaussians, world units. Parts that no photograph shows
-            have large Gaussians.
-        log_angle: median logarithm of the angle that these scales subtend, radians.
-        near: mean alpha of what is nearer than :data:`TOO_NEAR`, 0 to 1.
-        centre: mean alpha of the central Gaussians, those within two radii of the centre, 0 to 1.
-    """
+    """Statistics of a thumbnail."""
 
     alpha: float
+    """Mean alpha, 0 to 1."""
     log_size: float
+    """Median logarithm of the largest scale of the Gaussians, world units. Parts that no photograph shows have
+    large Gaussians."""
     log_angle: float
+    """Median logarithm of the angle that these scales subtend, radians."""
     near: float
+    """Mean alpha of what is nearer than :data:`TOO_NEAR`, 0 to 1."""
     centre: float
+    """Mean alpha of the central Gaussians, those within two radii of the centre, 0 to 1."""
 
 
 class ViewScorer:
-    """Renders thumbnails of a proxy scene and measures their statistics.
-
-    Attributes:
-        bounds: bounds of the part of the scene that views should show.
-    """
+    """Renders thumbnails of a proxy scene, and measures how they show the part of it within ``bounds``."""
 
     def __init__(self, proxy: Splats, bounds: SceneBounds, pool: Workers, progress: Progress) -> None:
-        """Store the arguments; nothing is rendered.
-
-        Args:
-            proxy: scene to render, from :func:`proxy_scene`.
-            bounds: bounds of the part of the scene that views should show.
-            pool: threads to render with.
-            progress: receives the stage ``"cameras"``.
-        """
         self.bounds = bounds
         self._proxy, self._pool, self._progress = proxy, pool, progress
         self._log_sizes = proxy.scales.max(axis=1)
@@ -263,12 +229,8 @@ def _from_colour(colour: np.ndarray) -> np.ndarray:
 
 
 def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.ndarray, " m"] | None = None) -> Splats:
-    """Return at most ``max_count`` evenly selected Gaussians, without SH rest, enlarged to cover the same area.
-
-    Args:
-        splats: the scene.
-        max_count: largest number of Gaussians.
-        among: indices of the Gaussians to select from; by default, all.
+    """Return at most ``max_count`` evenly selected Gaussians ``among`` some, or all, without SH rest, enlarged to
+    cover the same area.
     """
     count = len(splats) if among is None else len(among)
     step = max(1, -(-count // max_count))
@@ -288,12 +250,8 @@ def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[
     """Return the view score of each camera, ``(n,)`` float64, at most 1.
 
     1 is a sharp image of the scene's centre, without holes and with nothing right in front of the camera. Size and
-    angle of Gaussians are compared with the best tenth of the views that show enough.
-
-    Args:
-        stats: statistics of all cameras to compare, at least one.
-        fills_image: whether the scene should fill the image; if not, an object stands alone, and only an image that is
-            much emptier than the others is a fault.
+    angle of Gaussians are compared with the best tenth of the views that show enough. If the scene need not fill the
+    image, since an object stands alone, only an image that is much emptier than the others is a fault.
     """
     names = ("alpha", "log_size", "log_angle", "near", "centre")
     alpha, log_size, log_angle, near, centre = (np.array([getattr(view, name) for view in stats]) for name in names)
@@ -338,13 +296,7 @@ def horizontal_axes(up: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def directions(up: Vec3, elevations: tuple[float, ...], azimuths: int) -> Iterator[Vec3]:
-    """Yield ``(3,)`` float64 unit vectors at evenly spaced azimuths.
-
-    Args:
-        up: ``(3,)`` unit vector.
-        elevations: angles above the horizontal plane, degrees.
-        azimuths: number of azimuths for each elevation.
-    """
+    """Yield unit vectors at evenly spaced azimuths, for each elevation above the horizontal plane, degrees."""
     east, north = horizontal_axes(up)
     for elevation in np.radians(elevations):
         for azimuth in np.arange(azimuths) * (2 * np.pi / azimuths):
@@ -379,11 +331,6 @@ def object_cameras(splats: Splats, bounds: SceneBounds, size: tuple[int, int]) -
     """Yield cameras around an object that stands alone.
 
     Most frame the whole object; one in :data:`CLOSE_UP_INTERVAL` is at half the distance.
-
-    Args:
-        splats: the scene, finite.
-        bounds: bounds of the object.
-        size: (width, height) of the images, pixels.
     """
     weights = opacity(splats)
     means = splats.means.astype(np.float64)

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kissgs.cameras.random_cameras import Vec3
 from kissgs.cameras.virtual.candidates import (
     FIELD_OF_VIEW,
     SceneBounds,
-    Vec3,
     horizontal_axes,
     opacity,
     weighted_quantile,
@@ -27,23 +27,19 @@ from kissgs.rendering.constants import NEAR
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Orbit:
-    """A horizontal circle around a look-at target, and the arc of it from which the scene looks good.
-
-    Attributes:
-        target: ``(3,)`` float64, point that all cameras look at, world units.
-        radius: distance of the cameras from the target, world units; 0 to look around from the target itself.
-        elevation: elevation of the cameras as seen from the target, radians.
-        up: ``(3,)`` float64 unit vector.
-        mid_azimuth: azimuth of the middle of the arc; of a full circle, the azimuth with the best view; radians.
-        sweep: length of the arc, radians; 2 pi for a full circle.
-    """
+    """A horizontal circle around a look-at target, and the arc of it from which the scene looks good."""
 
     target: Vec3
+    """Point that all cameras look at, world units."""
     radius: float
+    """Distance of the cameras from the target, world units; 0 to look around from the target itself."""
     elevation: float
+    """Elevation of the cameras as seen from the target, radians."""
     up: Vec3
     mid_azimuth: float = 0.0
+    """Azimuth of the middle of the arc; of a full circle, the azimuth with the best view; radians."""
     sweep: float = 2 * np.pi
+    """Length of the arc, radians; 2 pi for a full circle."""
 
     @property
     def full(self) -> bool:
@@ -71,14 +67,6 @@ class Orbit:
 
         On an arc, the azimuth is a sine of time, slow at the ends. Frames that show the same view share one camera
         object, so that a caller can render it once.
-
-        Args:
-            frames: number of frames, 1 or more.
-            width: of the images, pixels.
-            height: of the images, pixels.
-
-        Raises:
-            InvalidViewsError: an argument is less than 1.
         """
         _check(frames, width, height)
         if self.full:
@@ -94,16 +82,7 @@ class Orbit:
         return [by_phase[phase] for phase in phases]
 
     def sheet_cameras(self, frames: int, width: int, height: int) -> list[Camera]:
-        """Return the cameras of a contact sheet: evenly spaced, once along the path.
-
-        Args:
-            frames: number of images, 1 or more.
-            width: of the images, pixels.
-            height: of the images, pixels.
-
-        Raises:
-            InvalidViewsError: an argument is less than 1.
-        """
+        """Return the cameras of a contact sheet: evenly spaced, once along the path."""
         _check(frames, width, height)
         if self.full or frames == 1:
             return self.loop_cameras(frames, width, height)
@@ -164,20 +143,7 @@ LOOK_AROUND_PITCH = 6
 def find_orbit(
     splats: Splats, *, width: int = 640, height: int = 480, threads: int = 0, progress: Progress = silent
 ) -> Orbit:
-    """Return the orbit with the longest arc of good views.
-
-    The result is the same for any number of threads.
-
-    Args:
-        splats: the scene, finite (:func:`kissgs.clean`).
-        width: of the images, pixels; only the aspect ratio matters.
-        height: of the images, pixels.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the stage ``"cameras"``.
-
-    Raises:
-        InvalidViewsError: ``width`` or ``height`` is less than 1.
-    """
+    """Return the orbit with the longest arc of good views; only the images' aspect ratio matters."""
     with Workers(threads) as pool:
         candidates = score_candidates(splats, (width, height), pool, progress)
         bounds = candidates.bounds
@@ -221,13 +187,7 @@ def _circles_in_scene(bounds: SceneBounds, *, enclosed: bool) -> Iterator[Orbit]
 
 
 def _circles_around_object(splats: Splats, bounds: SceneBounds, aspect: float) -> Iterator[Orbit]:
-    """Yield circles from which an upright cylinder around the object fits into every image.
-
-    Args:
-        splats: the scene, finite.
-        bounds: bounds of the object.
-        aspect: width of the images divided by their height.
-    """
+    """Yield circles from which an upright cylinder around the object fits into every image of this width to height."""
     weights = opacity(splats)
     axes = np.stack([*horizontal_axes(bounds.up), bounds.up])
     offsets = (splats.means.astype(np.float64) - bounds.centre) @ axes.T
@@ -251,10 +211,6 @@ def _rank(surplus: Float64[np.ndarray, " steps"], radii: float) -> tuple[bool, f
 
     The sum of scores is divided by the square root of the length, so that an arc four times as long ranks like scores
     twice as high: the ends of a long arc are seldom its best views.
-
-    Args:
-        surplus: ``(steps,)`` view scores above the smallest good one.
-        radii: radius of the circle in radii of the scene; an overview ranks higher.
     """
     good = _acceptable(surplus)
     steps = _longest_run(good)

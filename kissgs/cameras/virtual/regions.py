@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kissgs.cameras.random_cameras import Vec3
 from kissgs.cameras.views import Views, black
 from kissgs.cameras.virtual.candidates import (
     FIELD_OF_VIEW,
     PROXY_GAUSSIANS,
     SceneBounds,
-    Vec3,
     ViewScorer,
     opacity,
     proxy_scene,
@@ -64,16 +64,12 @@ TYPICAL_SIZE = 384
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Region:
-    """A part of the scene that needs cameras around or inside it.
-
-    Attributes:
-        candidates: scored candidate cameras, with the region's bounds.
-        share: share of the scene's visible opacity that only this region's cameras show, 0 to 1; of the first region,
-            all that its cameras show.
-    """
+    """A part of the scene that needs cameras around or inside it."""
 
     candidates: ScoredCandidates
     share: float
+    """Share of the scene's visible opacity that only this region's cameras show, 0 to 1; of the first region, all
+    that its cameras show."""
 
     def cameras(self, count: int) -> list[Camera]:
         """Return ``count`` good cameras that are far from each other."""
@@ -85,15 +81,7 @@ def find_regions(
 ) -> list[Region]:
     """Return the regions of a scene in the order in which they were found, at least one; shares add up to 1.
 
-    Args:
-        splats: the scene, finite.
-        size: (width, height) of the images for which cameras are wanted, pixels.
-        pool: threads to render with.
-        progress: receives the stage ``"cameras"``.
-        camera_count: number of cameras that will be selected for the first region, at most.
-
-    Raises:
-        InvalidViewsError: a side of the image is less than 1.
+    ``camera_count`` is the number of cameras that will be selected for the first region, at most.
     """
     candidates = score_candidates(splats, size, pool, progress).refined(camera_count)
     proxy = proxy_scene(splats)
@@ -121,16 +109,10 @@ def find_regions(
 
 
 def allocate_cameras(regions: list[Region], count: int, min_per_region: int = 4) -> list[int]:
-    """Divide ``count`` cameras among regions in proportion to their shares.
+    """Divide ``count`` cameras among regions in proportion to their shares; return how many each gets, at least one.
 
-    Args:
-        regions: one or more.
-        count: number of cameras, 1 or more.
-        min_per_region: a region whose share is less than this many cameras counts as if it had so many; reduced where
-            ``count`` does not suffice. Each region gets at least one.
-
-    Returns:
-        The number of cameras for each region. The sum is more than ``count`` only if there are more regions than that.
+    A share of less than ``min_per_region`` cameras counts as so many, where ``count`` suffices. The sum is more than
+    ``count`` only if there are more regions than that.
     """
     min_per_region = min(min_per_region, max(1, count // len(regions)))
     wanted = np.maximum(np.array([region.share for region in regions]) * count, min_per_region)
@@ -217,17 +199,6 @@ def scene_views(
     """Return views of every region of a scene, more of regions that show more; every 8th is held out.
 
     The result is the same for any number of threads.
-
-    Args:
-        splats: the scene, finite (:func:`kissgs.clean`).
-        width: of the images, pixels.
-        height: of the images, pixels.
-        count: number of views, 1 or more.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the stage ``"cameras"``.
-
-    Raises:
-        InvalidViewsError: ``count``, ``width`` or ``height`` is less than 1.
     """
     check_request(count, (width, height))
     with Workers(threads) as pool:
@@ -275,18 +246,9 @@ def sensitivity_cameras(
 ) -> WeightedCameras:
     """Return the cameras, each with its weight, that measure sensitivity and refit colours.
 
-    Args:
-        splats: the scene, finite (:func:`kissgs.clean`).
-        views: views of a capture; only training views are used, never held-out ones. None, or no training views: only
-            virtual cameras are used.
-        count: largest number of a capture's cameras, evenly selected, to which two thirds as many virtual ones are
-            added; without a capture, the number of virtual cameras. 1 or more.
-        size: longer side of the images, pixels; a capture's smaller images keep their size, larger ones are sampled.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the stage ``"cameras"``.
-
-    Raises:
-        InvalidViewsError: ``count`` or ``size`` is too small for a view.
+    Of a capture, only training views are used, at most ``count``, evenly selected, and two thirds as many virtual
+    cameras are added; without any, ``count`` are virtual. ``size`` is the longer side of the images, pixels; a
+    capture's smaller images keep their size, larger ones are sampled.
     """
     if views is None or not views.train:
         side = size * 4 // 5

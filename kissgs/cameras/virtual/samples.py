@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from kissgs.cameras.random_cameras import Vec3, camera_facing, log_uniform, random_direction
 from kissgs.cameras.views import Views
-from kissgs.cameras.virtual.candidates import Vec3, horizontal_axes, opacity, proxy_scene, scene_bounds
+from kissgs.cameras.virtual.candidates import horizontal_axes, opacity, proxy_scene, scene_bounds
 from kissgs.cameras.virtual.regions import Region, allocate_cameras, find_regions, scene_views
 from kissgs.cameras.virtual.select import ScoredCandidates, split_views
 from kissgs.core.errors import InvalidViewsError
@@ -13,7 +14,6 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera, look_at
-from kissgs.rendering.constants import NEAR
 from kissgs.rendering.coverage import local_scale
 
 # ``random_poses``: virtual cameras to train or to measure losses with, from where photographs might have been taken.
@@ -28,7 +28,7 @@ SCORE_MARGIN = 0.5
 FIELDS_OF_VIEW = np.radians((50, 90))
 """Smallest and largest angle of view along the longer side, radians: from phone to wide-angle lens."""
 
-MIN_DISTANCE, MAX_DISTANCE = 0.8, 2.6
+NEAREST_RADII, FARTHEST_RADII = 0.8, 2.6
 """Distances from the centre, radii of the scene, in front of a scene with a background."""
 
 MIN_ELEVATION, MAX_ELEVATION = -np.pi / 6, np.pi / 3
@@ -52,20 +52,9 @@ def random_poses(
 ) -> Views:
     """Return views for square images from random poses around every region of a scene; every 8th is held out.
 
-    The result is the same for any number of threads.
-
-    Args:
-        splats: the scene, finite (:func:`kissgs.clean`).
-        side: of the images, pixels.
-        count: number of views of a scene with one region, 1 or more. With several regions there are so many more that
-            the region with the largest share gets ``count``, at most :data:`MAX_COUNT_FACTOR` times ``count``. Where
-            few poses show the scene, there are fewer.
-        seed: random seed; equal seeds give equal views.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the stage ``"cameras"``.
-
-    Raises:
-        InvalidViewsError: ``count`` or ``side`` is less than 1.
+    ``count`` is the number of views of a scene with one region. With several there are so many more that the region
+    with the largest share gets ``count``, at most :data:`MAX_COUNT_FACTOR` times ``count``; where few poses show the
+    scene, there are fewer. The result is the same for any number of threads.
     """
     if count < 1:
         raise InvalidViewsError(f"there must be at least 1 view, not {count}")
@@ -133,7 +122,7 @@ class _PoseSampler:
     def _in_front(self) -> Pose:
         """Draw a position at a log-uniform distance, looking roughly at the centre."""
         bounds = self._bounds
-        distance = np.exp(self._rng.uniform(np.log(MIN_DISTANCE), np.log(MAX_DISTANCE)))
+        distance = log_uniform(self._rng, NEAREST_RADII, FARTHEST_RADII)
         return bounds.centre + distance * bounds.radius * self._direction(self._elevation()), self._target()
 
     def _direction(self, elevation: float) -> Vec3:
@@ -161,24 +150,11 @@ FIELD_OF_VIEW = np.radians(70)
 OCTAVES = 3.0
 """Distances are one local scale (:func:`~kissgs.rendering.coverage.local_scale`) to this many octaves more."""
 
-MIN_CLOSE_UP_DISTANCE = 5 * NEAR
-"""Smallest distance of a camera from its target, world units. Nearer, the near plane would cut the target off; such a
-camera stands at this distance with a longer lens, which shows the same part of the scene."""
-
-UP = np.array([0.0, -1.0, 0.0])
-"""Up direction in the images; arbitrary, because the roll does not matter."""
-
 
 def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[Camera]:
     """Return cameras for square images, each with a random Gaussian in the centre, from a random direction.
 
-    A Gaussian is drawn in proportion to its opacity.
-
-    Args:
-        splats: the scene, finite.
-        side: of the images, pixels.
-        count: number of cameras; without any visible Gaussian, the result is empty.
-        seed: random seed; equal seeds give equal cameras.
+    A Gaussian is drawn in proportion to its opacity; without any visible one there are no cameras.
     """
     weights = opacity(splats)
     if not weights.sum() > 0:
@@ -188,29 +164,9 @@ def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[C
     cameras = []
     for target in rng.choice(len(splats), count, p=weights / weights.sum()):
         distance = float(scales[target] * 2 ** rng.uniform(0, OCTAVES))
-        cameras.append(camera_facing(splats.means[target].astype(np.float64), random_direction(rng), distance, side))
+        position = splats.means[target].astype(np.float64)
+        cameras.append(camera_facing(position, random_direction(rng), distance, FIELD_OF_VIEW, (side, side)))
     return cameras
-
-
-def camera_facing(target: Vec3, direction: Vec3, distance: float, side: int) -> Camera:
-    """Return a camera for square images with ``target`` in the centre, seen from ``direction``.
-
-    Args:
-        target: ``(3,)`` point, world units.
-        direction: ``(3,)`` unit vector from the target to the camera.
-        distance: of the camera from the target, world units. Below :data:`MIN_CLOSE_UP_DISTANCE`, a longer lens takes
-            its place.
-        side: of the images, pixels.
-    """
-    possible = max(distance, MIN_CLOSE_UP_DISTANCE)
-    fov = 2 * np.arctan(np.tan(FIELD_OF_VIEW / 2) * distance / possible)
-    return look_at(target + possible * direction, target, UP, fov=float(fov), width=side, height=side)
-
-
-def random_direction(rng: np.random.Generator) -> Vec3:
-    """Return a unit vector, ``(3,)``, uniformly distributed over the sphere."""
-    direction = rng.standard_normal(3)
-    return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))
 
 
 # ``scattered_cameras``: cameras anywhere in and around a scene, for what a capture does not show.
@@ -232,14 +188,7 @@ def scattered_cameras(splats: Splats, *, side: int, count: int, seed: int = 0, t
     """Return cameras for square images, each with a random Gaussian in the centre, from any distance.
 
     Gaussians of the proxy scene are drawn in proportion to their opacity; distances are log-uniformly distributed,
-    directions uniformly.
-
-    Args:
-        splats: the scene, finite.
-        side: of the images, pixels.
-        count: number of cameras; without any visible Gaussian, the result is empty.
-        seed: random seed; equal seeds give equal cameras.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
+    directions uniformly. Without any visible Gaussian there are no cameras.
     """
     proxy = proxy_scene(splats)
     weights = opacity(proxy)
@@ -252,16 +201,12 @@ def scattered_cameras(splats: Splats, *, side: int, count: int, seed: int = 0, t
     for n, (looked_at, beside) in enumerate(drawn):
         target, direction = proxy.means[looked_at].astype(np.float64), random_direction(rng)
         if n % ACROSS == 0:
-            offset = direction * _log_uniform(rng, float(scales[beside]), MAX_BESIDE * float(scales[beside]))
+            offset = direction * log_uniform(rng, float(scales[beside]), MAX_BESIDE * float(scales[beside]))
             direction = proxy.means[beside].astype(np.float64) + offset - target
             distance = max(float(np.linalg.norm(direction)), 1e-9)
             direction /= distance
         else:
             nearest = min(NEAREST * float(scales[looked_at]), radius)
-            distance = _log_uniform(rng, nearest, FARTHEST * radius)
-        cameras.append(camera_facing(target, direction, distance, side))
+            distance = log_uniform(rng, nearest, FARTHEST * radius)
+        cameras.append(camera_facing(target, direction, distance, FIELD_OF_VIEW, (side, side)))
     return cameras
-
-
-def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))

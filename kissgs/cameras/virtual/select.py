@@ -57,21 +57,16 @@ SceneKind = Literal["enclosed", "background", "object"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredCandidates:
-    """Candidate cameras with what is needed to compare their views.
-
-    Attributes:
-        scorer: measures further views on the same scale; its ``bounds`` are those of the scene.
-        kind: kind of scene; whether images should be full follows from it.
-        cameras: one or more, with the size of thumbnails.
-        stats: statistics of their thumbnails.
-        outside_penalty: ``(n,)`` float64, 1 for cameras outside of what encloses the scene, else 0.
-    """
+    """Candidate cameras with what is needed to compare their views."""
 
     scorer: ViewScorer
+    """Measures further views on the same scale."""
     kind: SceneKind
     cameras: list[Camera]
+    """One or more, with the size of thumbnails."""
     stats: list[ViewStats]
     outside_penalty: Float64[np.ndarray, " n"]
+    """1 for cameras outside of what encloses the scene, else 0."""
 
     @property
     def bounds(self) -> SceneBounds:
@@ -132,17 +127,7 @@ class ScoredCandidates:
 
 
 def score_candidates(splats: Splats, size: tuple[int, int], pool: Workers, progress: Progress) -> ScoredCandidates:
-    """Return some hundred candidate cameras of a scene, with their view scores.
-
-    Args:
-        splats: the scene, finite.
-        size: (width, height) of the images for which cameras are wanted, pixels; only the aspect ratio matters.
-        pool: threads to render with.
-        progress: receives the stage ``"cameras"``.
-
-    Raises:
-        InvalidViewsError: a side of the image is less than 1.
-    """
+    """Return some hundred candidate cameras of a scene, with their view scores."""
     if min(size) < 1:
         raise InvalidViewsError(f"an image must have at least 1x1 pixels, not {size[0]}x{size[1]}")
     proxy = proxy_scene(splats)
@@ -206,10 +191,7 @@ def pose_distances(
 ) -> Float64[np.ndarray, " n"]:
     """Return how far each pose is from pose ``index``, ``(n,)`` float64: radii of the scene plus change of direction.
 
-    Args:
-        positions: ``(n, 3)``, from :func:`normalized_poses`.
-        forward: ``(n, 3)`` unit viewing directions.
-        index: 0 to n - 1.
+    ``positions`` and ``forward`` are those of :func:`normalized_poses`.
     """
     to_position = np.linalg.norm(positions - positions[index], axis=1)
     return np.asarray(to_position + np.linalg.norm(forward - forward[index], axis=1))
@@ -307,11 +289,7 @@ def select_diverse(candidates: ScoredCandidates, count: int) -> list[int]:
 
 
 def check_request(count: int, size: tuple[int, int]) -> None:
-    """Check a number of views and the (width, height) of their images.
-
-    Raises:
-        InvalidViewsError: one of them is less than 1.
-    """
+    """Check a number of views and the (width, height) of their images."""
     if min(*size, count) < 1:
         raise InvalidViewsError(
             f"there must be at least 1 view of at least 1x1 pixels, not {count} of {size[0]}x{size[1]}"

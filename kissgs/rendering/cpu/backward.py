@@ -1,4 +1,7 @@
-"""The backward pass of one image on the CPU, independent of the number of threads."""
+"""The backward pass of one image on the CPU, independent of the number of threads.
+
+Only Gaussians that contribute to the image have gradients: of many Gaussians, most lie outside it, or behind others.
+"""
 
 from __future__ import annotations
 
@@ -6,366 +9,394 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
+from numba import boolean, float32, float64, int32, int64, njit, void
 
 from kissgs.core.array_types import Bool, Float32, Int32, Shaped
 from kissgs.core.numba_kernels import compiled
 from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_C0
 from kissgs.rendering.cpu import shading
-from kissgs.rendering.cpu.blending import _FAST, _copy_records, _exp_minus, _footprint, _pixel_centres
-from kissgs.rendering.cpu.frame import LIMITS, Frame
+from kissgs.rendering.cpu.blending import (
+    _FAST,
+    Place,
+    _alpha,
+    _copy_records,
+    _copy_stops,
+    _footprint,
+    _pixel_centres,
+    _rows,
+)
+from kissgs.rendering.cpu.frame import Frame
 from kissgs.rendering.cpu.projection import (
+    Bounds,
+    Matrix,
+    Quat,
+    Vector,
     _applied,
     _by_quat,
     _cholesky,
+    _clamped,
     _cross,
-    _deviations,
     _dot,
+    _ellipsoid,
     _frustum,
+    _helper,
+    _image_axes,
+    _image_rows,
+    _in_camera,
+    _jacobian,
     _load,
     _mix,
     _pose,
-    _rotation,
     _scaled,
     _strain,
     _times,
     _unit,
-    _unit_quat,
     _whitened,
 )
-from kissgs.rendering.cpu.tiles import Slots, each_part, even, even_tiles, number_slots, projection_constants
+from kissgs.rendering.cpu.records import (
+    BLENDED,
+    FOOTPRINTS,
+    GAUSSIANS,
+    PROJECTION,
+    SLOTS,
+    TILE_LISTS,
+    Blended,
+    Footprints,
+    Gaussians,
+    Projection,
+    Slots,
+    TileLists,
+)
+from kissgs.rendering.cpu.tiles import each_part, even, even_tiles, number_slots
 
-# Numba kernel of the backward pass of alpha blending, tile by tile; see :mod:`kissgs.rendering.cpu.blending`.
+# Blending, tile by tile; see :mod:`kissgs.rendering.cpu.blending`.
+
+
+@njit(nogil=True, error_model="numpy")
+def _copy_gradient(v_image: np.ndarray, x0: int, y0: int, s: np.ndarray) -> None:
+    """Write the gradient of a tile's pixels by R, G, B from the fifth 256 values of ``s`` on; 0 beyond the image."""
+    height, width, _ = v_image.shape
+    for p in range(256):
+        x, y = x0 + (p & 15), y0 + (p >> 4)
+        inside = x < width and y < height
+        x, y = min(x, width - 1), min(y, height - 1)
+        s[1024 + p] = v_image[y, x, 0] if inside else np.float32(0)
+        s[1280 + p] = v_image[y, x, 1] if inside else np.float32(0)
+        s[1536 + p] = v_image[y, x, 2] if inside else np.float32(0)
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def _begin_tile(frame: Blended, v_alpha: np.ndarray, x0: int, y0: int, s: np.ndarray) -> None:
+    """Write T, the gradient by alpha, and the product of the background and its gradient of a tile's pixels."""
+    height, width = v_alpha.shape
+    background = frame.background
+    for p in range(256):
+        x, y = x0 + (p & 15), y0 + (p >> 4)
+        inside = x < width and y < height
+        x, y = min(x, width - 1), min(y, height - 1)
+        s[768 + p] = frame.transmittance[y, x] if inside else np.float32(1)
+        s[1792 + p] = v_alpha[y, x] if inside else np.float32(0)
+        s[2048 + p] = background[0] * s[1024 + p] + background[1] * s[1280 + p] + background[2] * s[1536 + p]
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
+def _backward(
+    s: np.ndarray,
+    span: np.uint16,
+    index: np.float32,
+    footprint: tuple[Place, tuple[np.float32, ...]],
+    limits: tuple[np.float32, np.float32],
+    sums: np.ndarray,
+) -> None:
+    """Compute the nine sums of one footprint over a tile's pixels, and step in front of it."""
+    place, (opacity, red, green, blue) = footprint
+    zero, one = np.float32(0), np.float32(1)
+    top, bottom = _rows(span)
+    m, mu, mv, muu, muv, mvv, vr, vg, vb = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for p in range(top, bottom):
+        drawn = index < s[p + np.uint64(512)]
+        u, v, full, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
+        t = s[p + np.uint64(768)] / (one - alpha)
+        s[p + np.uint64(768)] = t
+        gr, gg, gb = s[p + np.uint64(1024)], s[p + np.uint64(1280)], s[p + np.uint64(1536)]
+        weight = alpha * t
+        vr += weight * gr
+        vg += weight * gg
+        vb += weight * gb
+        change = red * gr + green * gg + blue * gb + s[p + np.uint64(1792)] - s[p + np.uint64(2048)]
+        s[p + np.uint64(2048)] += alpha * change
+        g = -weight * change
+        g = g if full <= limits[1] else zero
+        m += g
+        mu += g * u
+        mv += g * v
+        muu += g * u * u
+        muv += g * u * v
+        mvv += g * v * v
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = m, mu, mv, muu, muv, mvv
+    sums[6], sums[7], sums[8] = vr, vg, vb
 
 
 @compiled(
-    "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
-    " float32[::1], float32[::1], float32[:, ::1], int32[:, ::1],"
-    " float32[:, :, ::1], float32[:, ::1], float32[:, ::1], boolean[::1])",
+    void(
+        float32[:, ::1],
+        TILE_LISTS,
+        SLOTS,
+        int64,
+        int64,
+        BLENDED,
+        float32[:, :, ::1],
+        float32[:, ::1],
+        float32[:, ::1],
+        boolean[::1],
+    ),
     fastmath=_FAST,
 )
 def blend_backward(
     records: np.ndarray,
-    members: np.ndarray,
-    spans: np.ndarray,
-    slots: np.ndarray,
-    starts: np.ndarray,
+    lists: TileLists,
+    slots: Slots,
     first: int,
     last: int,
-    columns: int,
-    limits: np.ndarray,
-    background: np.ndarray,
-    transmittance: np.ndarray,
-    stops: np.ndarray,
+    frame: Blended,
     v_image: np.ndarray,
     v_alpha: np.ndarray,
     v_slots: np.ndarray,
     changed: np.ndarray,
 ) -> None:
-    """Compute gradients of tiles ``first`` to ``last`` (exclusive), which were rendered.
+    """Compute the gradients of tiles ``first`` to ``last`` (exclusive), given those by the image and by its alpha.
 
-    Args:
-        records, members, spans, starts, first, last, columns, limits, background, transmittance, stops: as for
-            :func:`kissgs.rendering.cpu.blending.blend`.
-        slots: row of ``v_slots`` of each member.
-        v_image: ``(H, W, 3)`` gradient of the loss by the image.
-        v_alpha: ``(H, W)`` gradient of the loss by 1 - transmittance.
-        v_slots: out, ``(slots, 9)``, 0 before: sums over the tile's pixels of the gradient by the exponent times 1, u,
-            v, u², uv, v²; and the gradient by the colour's R, G, B.
-        changed: out, ``(M,)``, False before: True for footprints whose gradient is not 0 in one of the tiles.
+    ``v_slots``, ``(slots, 9)``, 0 before, receives the sums over the tile's pixels of the gradient by the exponent
+    times 1, u, v, u², uv, v², and of the gradient by the colour's R, G, B. ``changed`` becomes True for footprints with
+    any.
     """
-    alpha_min, alpha_max = limits[0], limits[1]
-    zero, one = np.float32(0), np.float32(1)
-    height, width = transmittance.shape
+    limits = frame.limits[0], frame.limits[1]
     # Per pixel: x, y, stop, T; gradient by R, G, B and alpha; product of the colour behind and its gradient.
     s = np.empty(9 * 256, np.float32)
     # Slots lie anywhere in memory, as records do.
     copies, sums = np.empty((64, 9), np.float32), np.empty((64, 9), np.float32)
     _pixel_centres(s)
     for tile in range(first, last):
-        x0, y0 = (tile % columns) * 16, (tile // columns) * 16
-        begin = starts[tile]
-        last_stop = 0
-        for p in range(256):
-            x, y = x0 + (p & 15), y0 + (p >> 4)
-            last_stop = max(last_stop, stops[tile, p])
-            s[512 + p] = np.float32(stops[tile, p])
-            inside = x < width and y < height
-            x, y = min(x, width - 1), min(y, height - 1)
-            s[768 + p] = transmittance[y, x] if inside else one
-            s[1024 + p] = v_image[y, x, 0] if inside else zero
-            s[1280 + p] = v_image[y, x, 1] if inside else zero
-            s[1536 + p] = v_image[y, x, 2] if inside else zero
-            s[1792 + p] = v_alpha[y, x] if inside else zero
-            s[2048 + p] = background[0] * s[1024 + p] + background[1] * s[1280 + p] + background[2] * s[1536 + p]
+        x0, y0 = (tile % lists.columns) * 16, (tile // lists.columns) * 16
+        begin, last_stop = lists.starts[tile], _copy_stops(frame.stops, tile, s)
+        _copy_gradient(v_image, x0, y0, s)
+        _begin_tile(frame, v_alpha, x0, y0, s)
         for end in range(begin + last_stop, begin, -64):
             start = max(begin, end - 64)
-            _copy_records(records, members, start, end, copies)
+            _copy_records(records, lists.members, start, end, copies)
             for i in range(end - 1, start - 1, -1):
-                j = i - start
-                (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(copies, j, x0, y0)
-                top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
-                index = np.float32(i - begin)
-                m, mu, mv, muu, muv, mvv, vr, vg, vb = zero, zero, zero, zero, zero, zero, zero, zero, zero
-                for p in range(top * np.uint64(16), bottom * np.uint64(16)):
-                    dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
-                    u, v = l0 * dx + l1 * dy, l2 * dy
-                    full = opacity * _exp_minus(u * u + v * v)
-                    alpha = min(full, alpha_max)
-                    alpha = alpha if alpha >= alpha_min else zero
-                    alpha = alpha if index < s[p + np.uint64(512)] else zero
-                    t = s[p + np.uint64(768)] / (one - alpha)
-                    s[p + np.uint64(768)] = t
-                    gr, gg, gb = s[p + np.uint64(1024)], s[p + np.uint64(1280)], s[p + np.uint64(1536)]
-                    weight = alpha * t
-                    vr += weight * gr
-                    vg += weight * gg
-                    vb += weight * gb
-                    change = red * gr + green * gg + blue * gb + s[p + np.uint64(1792)] - s[p + np.uint64(2048)]
-                    s[p + np.uint64(2048)] += alpha * change
-                    g = -weight * change
-                    g = g if full <= alpha_max else zero
-                    m += g
-                    mu += g * u
-                    mv += g * v
-                    muu += g * u * u
-                    muv += g * u * v
-                    mvv += g * v * v
-                sums[j, 0], sums[j, 1], sums[j, 2], sums[j, 3], sums[j, 4], sums[j, 5] = m, mu, mv, muu, muv, mvv
-                sums[j, 6], sums[j, 7], sums[j, 8] = vr, vg, vb
+                footprint = _footprint(copies, i - start, x0, y0)
+                _backward(s, lists.spans[i], np.float32(i - begin), footprint, limits, sums[i - start])
             for i in range(start, end):
                 for c in range(9):
-                    v_slots[slots[i], c] = sums[i - start, c]
+                    v_slots[slots.of[i - slots.begin], c] = sums[i - start, c]
                     if sums[i - start, c] != 0:
-                        changed[members[i]] = True
+                        changed[lists.members[i]] = True
 
 
 @compiled(
-    "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
-    " float32[::1], int32[:, ::1], float32[:, :, ::1], float32[:, ::1])",
+    void(float32[:, ::1], TILE_LISTS, SLOTS, int64, int64, BLENDED, float32[:, :, ::1], float32[:, ::1]),
     fastmath=_FAST,
 )
 def blend_colors_backward(
     records: np.ndarray,
-    members: np.ndarray,
-    spans: np.ndarray,
-    slots: np.ndarray,
-    starts: np.ndarray,
+    lists: TileLists,
+    slots: Slots,
     first: int,
     last: int,
-    columns: int,
-    limits: np.ndarray,
-    stops: np.ndarray,
+    frame: Blended,
     v_image: np.ndarray,
     v_slots: np.ndarray,
 ) -> None:
-    """Compute gradients by colours alone, of tiles ``first`` to ``last`` (exclusive).
-
-    The arguments are those of :func:`blend_backward`. ``v_slots``: out, ``(slots, 3)``, sums over the tile's pixels of
-    the gradient by the colour's R, G, B.
-    """
-    alpha_min, alpha_max = limits[0], limits[1]
-    zero, one = np.float32(0), np.float32(1)
-    height, width = v_image.shape[0], v_image.shape[1]
+    """Compute the last three sums of :func:`blend_backward` alone, ``(slots, 3)``, front to back."""
+    limits = frame.limits[0], frame.limits[1]
+    zero = np.float32(0)
     # Per pixel: x, y, stop, T; gradient by R, G, B.
     s, copies = np.empty(7 * 256, np.float32), np.empty((64, 9), np.float32)
     _pixel_centres(s)
     for tile in range(first, last):
-        x0, y0 = (tile % columns) * 16, (tile // columns) * 16
-        begin, last_stop = starts[tile], 0
-        for p in range(256):
-            x, y = x0 + (p & 15), y0 + (p >> 4)
-            last_stop = max(last_stop, stops[tile, p])
-            s[512 + p] = np.float32(stops[tile, p])
-            s[768 + p] = one
-            inside = x < width and y < height
-            x, y = min(x, width - 1), min(y, height - 1)
-            s[1024 + p] = v_image[y, x, 0] if inside else zero
-            s[1280 + p] = v_image[y, x, 1] if inside else zero
-            s[1536 + p] = v_image[y, x, 2] if inside else zero
-        for i in range(begin + last_stop, starts[tile + 1]):
-            v_slots[slots[i], :] = zero
+        x0, y0 = (tile % lists.columns) * 16, (tile // lists.columns) * 16
+        begin, last_stop = lists.starts[tile], _copy_stops(frame.stops, tile, s)
+        _copy_gradient(v_image, x0, y0, s)
+        s[768:1024] = np.float32(1)
+        for i in range(begin + last_stop, lists.starts[tile + 1]):
+            v_slots[slots.of[i - slots.begin], :] = zero
         for start in range(begin, begin + last_stop, 64):
             end = min(start + 64, begin + last_stop)
-            _copy_records(records, members, start, end, copies)
+            _copy_records(records, lists.members, start, end, copies)
             for i in range(start, end):
-                (mx, my, l0, l1, l2), (opacity, _, _, _) = _footprint(copies, i - start, x0, y0)
-                top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
-                index = np.float32(i - begin)
+                place, (opacity, _, _, _) = _footprint(copies, i - start, x0, y0)
+                top, bottom = _rows(lists.spans[i])
+                index, slot = np.float32(i - begin), slots.of[i - slots.begin]
                 red, green, blue = zero, zero, zero
-                for p in range(top * np.uint64(16), bottom * np.uint64(16)):
-                    dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
-                    u, v = l0 * dx + l1 * dy, l2 * dy
-                    alpha = min(opacity * _exp_minus(u * u + v * v), alpha_max)
-                    alpha = alpha if alpha >= alpha_min else zero
-                    alpha = alpha if index < s[p + np.uint64(512)] else zero
+                for p in range(top, bottom):
+                    drawn = index < s[p + np.uint64(512)]
+                    _, _, _, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
                     weight = alpha * s[p + np.uint64(768)]
                     s[p + np.uint64(768)] -= weight
                     red += weight * s[p + np.uint64(1024)]
                     green += weight * s[p + np.uint64(1280)]
                     blue += weight * s[p + np.uint64(1536)]
-                v_slots[slots[i], 0], v_slots[slots[i], 1], v_slots[slots[i], 2] = red, green, blue
+                v_slots[slot, 0], v_slots[slot, 1], v_slots[slot, 2] = red, green, blue
 
 
-@compiled(
-    "void(float32[:, ::1], float32[:, ::1], int32[::1], int32[::1], int32[::1], int64, int64, float32, float32[:, ::1])"
-)
+@compiled(void(float32[:, ::1], SLOTS, FOOTPRINTS, int64, int64, float32, float32[:, ::1]))
 def add_colors(
     v_slots: np.ndarray,
-    records: np.ndarray,
-    rows: np.ndarray,
-    slots_from: np.ndarray,
-    visible: np.ndarray,
+    slots: Slots,
+    footprints: Footprints,
     first: int,
     last: int,
     factor: float,
     v_colors: np.ndarray,
 ) -> None:
-    """Add ``factor`` times the sum of the slots of the footprints ``rows[first:last]`` to ``v_colors[visible]``.
+    """Add ``factor`` times the sum of the slots of footprints ``slots.rows[first:last]`` to their Gaussians' colours.
 
     Colours that are clamped to 0 have no gradient.
     """
     for i in range(first, last):
-        row = rows[i]
+        row = slots.rows[i]
         for c in range(3):
-            if records[row, 6 + c] > 0:
+            if footprints.records[row, 6 + c] > 0:
                 total = np.float32(0)
-                for slot in range(slots_from[row], slots_from[row + 1]):
+                for slot in range(slots.first[row], slots.first[row + 1]):
                     total += v_slots[slot, c]
-                v_colors[visible[row], c] += factor * total
+                v_colors[footprints.visible[row], c] += factor * total
 
 
-# Numba kernel of the backward pass of projection: gradients by the parameters of Gaussians.
-#
-# Arithmetic is that of :mod:`kissgs.rendering.cpu.projection`.
+# Projection: gradients by the parameters of Gaussians, with the arithmetic of :mod:`kissgs.rendering.cpu.projection`.
+
+
+@_helper
+def _by_axes(
+    sums: np.ndarray, w: Vector, v: Vector, dilation: float, antialiased: bool, v_scales: np.ndarray, i: int
+) -> tuple[Vector, Vector]:
+    """Return the gradients by the rows of W; write those by the log-scales of row ``i``.
+
+    By W: -4 Lᵀ S L W, S = (Σ uu, Σ uv; Σ uv, Σ vv); the derivative of a scale by its logarithm is the scale.
+    """
+    l0, l1, l2 = _cholesky(w, v, dilation)
+    u_rows, v_rows = _whitened(w, v, dilation)
+    spread_u, spread_v = _mix(sums[3], u_rows, sums[4], v_rows), _mix(sums[4], u_rows, sums[5], v_rows)
+    for c in range(3):
+        v_scales[i, c] = -4 * (spread_u[c] * u_rows[c] + spread_v[c] * v_rows[c])
+    by_w, by_v = _mix(-4 * l0, spread_u, 0.0, spread_v), _mix(-4 * l1, spread_u, -4 * l2, spread_v)
+    if antialiased:
+        # By the logarithm of the compensation, -Σ 1; by W it is ((W Wᵀ)⁻¹ - 2 Lᵀ L) W, and the first term has the
+        # rows v × n and n × w over n², n being w × v.
+        by_log, normal = -sums[0], _cross(w, v)
+        axis, more = _unit(normal), by_log / _dot(normal, normal)
+        for k in range(3):
+            v_scales[i, k] += by_log * _strain(axis, u_rows, v_rows, k, k)
+        by_w = _mix(1.0, by_w, -2 * by_log * l0, u_rows)
+        by_v = _mix(1.0, _mix(1.0, by_v, -2 * by_log * l1, u_rows), -2 * by_log * l2, v_rows)
+        by_w, by_v = _mix(1.0, by_w, more, _cross(v, normal)), _mix(1.0, by_v, more, _cross(normal, w))
+    return by_w, by_v
+
+
+@_helper
+def _by_rotation(p: Vector, q: Vector, by_w: Vector, by_v: Vector, quat: Quat) -> Quat:
+    """Return the gradient by the unit quaternion, given those by the rows of W over the scales."""
+    e0, e1, e2 = _mix(p[0], by_w, q[0], by_v), _mix(p[1], by_w, q[1], by_v), _mix(p[2], by_w, q[2], by_v)
+    return _by_quat(quat, (e0, e1, e2))
+
+
+@_helper
+def _by_position(
+    K: np.ndarray,
+    rotation: Matrix,
+    frustum: Bounds,
+    position: Vector,
+    J: tuple[float, float, float, float],
+    by_centre: tuple[float, float],
+    by_rows: tuple[Vector, Vector],
+) -> Vector:
+    """Return the gradient by the mean: through the centre, through J, and through the x/z and y/z of J if not clamped.
+
+    ``position``: x/z, y/z and z; ``by_rows``: gradients by the rows of J Rc.
+    """
+    (left, right, top, bottom), (x, y, z), (jx, jxz, jy, jyz) = frustum, position, J
+    by_p, by_q = by_rows
+    by_jx, by_jxz = _dot(by_p, rotation[0]), _dot(by_p, rotation[2])
+    by_jy, by_jyz = _dot(by_q, rotation[1]), _dot(by_q, rotation[2])
+    by_ratio_x = by_centre[0] * K[0, 0] - (by_jxz * jx if left < x < right else 0.0)
+    by_ratio_y = by_centre[1] * K[1, 1] - (by_jyz * jy if top < y < bottom else 0.0)
+    by_z = -(by_jx * jx + by_jxz * jxz + by_jy * jy + by_jyz * jyz + by_ratio_x * x + by_ratio_y * y) / z
+    return _times((by_ratio_x / z, by_ratio_y / z, by_z), rotation)
 
 
 @compiled(
-    "void(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1],"
-    " int32[::1], int32[::1], int32[::1], float32[:, ::1], float32[:, ::1], int64, int64,"
-    " float64[:, ::1], float64[:, ::1], int64, int64, float64[::1],"
-    " int32[::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1], float64[:, ::1])"
+    void(
+        GAUSSIANS,
+        PROJECTION,
+        FOOTPRINTS,
+        SLOTS,
+        float32[:, ::1],
+        int32[::1],
+        int64,
+        int64,
+        int32[::1],
+        GAUSSIANS,
+        float64[:, ::1],
+    )
 )
 def project_backward(
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    visible: np.ndarray,
-    changed: np.ndarray,
-    slots_from: np.ndarray,
+    gaussians: Gaussians,
+    projection: Projection,
+    footprints: Footprints,
+    slots: Slots,
     v_slots: np.ndarray,
-    records: np.ndarray,
+    changed: np.ndarray,
     first: int,
     last: int,
-    viewmat: np.ndarray,
-    K: np.ndarray,
-    width: int,
-    height: int,
-    constants: np.ndarray,
-    gaussians: np.ndarray,
-    v_means: np.ndarray,
-    v_quats: np.ndarray,
-    v_scales: np.ndarray,
-    v_opacities: np.ndarray,
+    indices: np.ndarray,
+    gradients: Gaussians,
     v_colors: np.ndarray,
 ) -> None:
-    """Compute gradients by the parameters of the Gaussians whose footprints are ``changed[first:last]``.
+    """Compute the gradients of the footprints ``changed[first:last]`` from those of :func:`blend_backward`.
 
-    Args:
-        means, quats, scales, opacities, viewmat, K, width, height, constants, records: as for
-            :func:`kissgs.rendering.cpu.projection.project`.
-        visible: ``(N,)`` the Gaussian of each row that holds a footprint.
-        changed: ``(R,)`` footprints.
-        slots_from: first slot of each footprint; its slots end where the next footprint's begin.
-        v_slots: output of :func:`kissgs.rendering.cpu.backward.blend_backward`.
-        first: first index into ``changed``.
-        last: end of the indices, exclusive.
-        gaussians: out, ``(R,)``, the Gaussian of each of ``changed``.
-        v_means, v_quats, v_scales, v_opacities: out, ``(R, ...)``, gradients by the parameters.
-        v_colors: out, ``(R, 3)``, gradients by the colours before they are clamped.
+    Writes their Gaussians, ``indices``; the gradients by these, all but those by SH; and, ``(R, 3)``, those by the
+    colours before they are clamped.
     """
-    dilation = constants[2]
-    fx, fy = K[0, 0], K[1, 1]
-    rotation, translation = _pose(viewmat)
-    left, right, top, bottom = _frustum(K, width, height, constants[3])
+    pose, frustum = _pose(projection.viewmat), _frustum(projection)
     sums = np.empty(9, np.float64)
     for i in range(first, last):
         row = changed[i]
-        n = visible[row]
-        gaussians[i] = n
+        n = footprints.visible[row]
+        indices[i] = n
         sums[:] = 0.0
-        for slot in range(slots_from[row], slots_from[row + 1]):
+        for slot in range(slots.first[row], slots.first[row + 1]):
             for c in range(9):
                 sums[c] += v_slots[slot, c]
         for c in range(3):
-            v_colors[i, c] = sums[6 + c] if records[row, 6 + c] > 0 else 0.0
-        v_opacities[i] = -sums[0] / (1.0 + np.exp(np.float64(opacities[n])))
+            v_colors[i, c] = sums[6 + c] if footprints.records[row, 6 + c] > 0 else 0.0
+        gradients.opacities[i] = -sums[0] / (1.0 + np.exp(np.float64(gaussians.opacities[n])))
 
-        # Like project.
-        mean = _load(means, n)
-        z = _dot(rotation[2], mean) + translation[2]
-        x, y = (_dot(rotation[0], mean) + translation[0]) / z, (_dot(rotation[1], mean) + translation[1]) / z
-        jx, jxz = fx / z, -fx / z * min(right, max(left, x))
-        jy, jyz = fy / z, -fy / z * min(bottom, max(top, y))
-        p, q = _mix(jx, rotation[0], jxz, rotation[2]), _mix(jy, rotation[1], jyz, rotation[2])
-        qw, qx, qy, qz, shrink = _unit_quat(quats, n)
-        R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
-        w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)
-        l0, l1, l2 = _cholesky(w, v, dilation)
-
-        # By the centre: -2 Lᵀ (Σ u, Σ v). By W: -4 Lᵀ S L W, S = (Σ uu, Σ uv; Σ uv, Σ vv); then by p and q (the
-        # derivative of a scale by its logarithm is the scale).
-        by_x, by_y = -2 * l0 * sums[1], -2 * (l1 * sums[1] + l2 * sums[2])
-        u_rows, v_rows = _whitened(w, v, dilation)
-        spread_u, spread_v = _mix(sums[3], u_rows, sums[4], v_rows), _mix(sums[4], u_rows, sums[5], v_rows)
-        for c in range(3):
-            v_scales[i, c] = -4 * (spread_u[c] * u_rows[c] + spread_v[c] * v_rows[c])
-        by_w, by_v = _mix(-4 * l0, spread_u, 0.0, spread_v), _mix(-4 * l1, spread_u, -4 * l2, spread_v)
-        if constants[5] != 0.0:
-            # By the logarithm of the compensation, -Σ 1; by W it is ((W Wᵀ)⁻¹ - 2 Lᵀ L) W, and the first term has the
-            # rows v × n and n × w over n², n being w × v.
-            by_log, normal = -sums[0], _cross(w, v)
-            axis, more = _unit(normal), by_log / _dot(normal, normal)
-            for k in range(3):
-                v_scales[i, k] += by_log * _strain(axis, u_rows, v_rows, k, k)
-            by_w = _mix(1.0, by_w, -2 * by_log * l0, u_rows)
-            by_v = _mix(1.0, _mix(1.0, by_v, -2 * by_log * l1, u_rows), -2 * by_log * l2, v_rows)
-            by_w, by_v = _mix(1.0, by_w, more, _cross(v, normal)), _mix(1.0, by_v, more, _cross(normal, w))
+        x, y, z = _in_camera(pose, _load(gaussians.means, n))
+        clamped_x, clamped_y = _clamped(x, y, frustum)
+        J = _jacobian(projection.K, clamped_x, clamped_y, z)
+        p, q = _image_rows(J, pose[0])
+        quat, shrink, R, s = _ellipsoid(gaussians, n)
+        w, v = _image_axes(p, q, R, s)
+        by_w, by_v = _by_axes(sums, w, v, projection.dilation, projection.antialiased, gradients.scales, i)
         by_w, by_v = _scaled(by_w, s), _scaled(by_v, s)
-        by_p, by_q = _applied(R, by_w), _applied(R, by_v)
-
-        # By R, with rows e0, e1, e2; then by the quaternion before normalisation.
-        e0, e1, e2 = _mix(p[0], by_w, q[0], by_v), _mix(p[1], by_w, q[1], by_v), _mix(p[2], by_w, q[2], by_v)
-        by_quat = _by_quat((qw, qx, qy, qz), (e0, e1, e2))
+        by_quat = _by_rotation(p, q, by_w, by_v, quat)
         for c in range(4):
-            v_quats[i, c] = by_quat[c] * shrink
-
-        # By the position in the camera: through the centre, through J, and through the x/z and y/z of J if not clamped.
-        by_jx, by_jxz = _dot(by_p, rotation[0]), _dot(by_p, rotation[2])
-        by_jy, by_jyz = _dot(by_q, rotation[1]), _dot(by_q, rotation[2])
-        by_ratio_x = by_x * fx - (by_jxz * jx if left < x < right else 0.0)
-        by_ratio_y = by_y * fy - (by_jyz * jy if top < y < bottom else 0.0)
-        by_z = -(by_jx * jx + by_jxz * jxz + by_jy * jy + by_jyz * jyz + by_ratio_x * x + by_ratio_y * y) / z
-        v_mean = _times((by_ratio_x / z, by_ratio_y / z, by_z), rotation)
-        v_means[i, 0], v_means[i, 1], v_means[i, 2] = v_mean
-
-
-# The backward pass of one image on the CPU, independent of the number of threads.
-#
-# Only Gaussians that contribute to the image have gradients: of many Gaussians, most lie outside it, or behind others.
+            gradients.quats[i, c] = by_quat[c] * shrink
+        l0, l1, l2 = _cholesky(w, v, projection.dilation)
+        by_centre = -2 * l0 * sums[1], -2 * (l1 * sums[1] + l2 * sums[2])  # -2 Lᵀ (Σ u, Σ v)
+        by_rows = _applied(R, by_w), _applied(R, by_v)
+        by_mean = _by_position(projection.K, pose[0], frustum, (x, y, z), J, by_centre, by_rows)
+        gradients.means[i, 0], gradients.means[i, 1], gradients.means[i, 2] = by_mean
 
 
 @dataclass(frozen=True, slots=True)
 class Gradients:
-    """Gradients of a loss by the stored parameters of the R Gaussians that have any; those of all others are 0.
-
-    Attributes:
-        gaussians: ``(R,)`` indices of these Gaussians, ascending.
-        means, quats, scales, opacities, sh0, shN: gradients by the parameters of each, see :class:`kissgs.Splats`.
-    """
+    """Gradients of a loss by the stored parameters of the R Gaussians that have any; those of all others are 0."""
 
     gaussians: Int32[np.ndarray, " R"]
+    """Indices of these Gaussians, ascending."""
     means: Float32[np.ndarray, "R 3"]
     quats: Float32[np.ndarray, "R 4"]
     scales: Float32[np.ndarray, "R 3"]
@@ -398,67 +429,20 @@ def differentiate(
     v_alpha: Float32[np.ndarray, "H W"],
     pool: Workers,
 ) -> Gradients:
-    """Return the gradients of a loss by the stored parameters.
-
-    Args:
-        frame: a rendered image.
-        v_image: ``(H, W, 3)`` gradient of the loss by the image.
-        v_alpha: ``(H, W)`` gradient of the loss by alpha.
-        pool: threads; the result does not depend on their number.
-
-    Raises:
-        MemoryError: there is not enough memory.
-    """
-    splats, camera, footprints = frame.splats, frame.camera, frame.footprints
+    """Return the gradients of a loss by the stored parameters, given those by the image and by its alpha."""
     v_slots, slots, any_gradient = differentiate_footprints(frame, v_image, v_alpha, pool)
     changed = slots.rows[any_gradient[slots.rows]]
     count = len(changed)
-    found = Gradients(
-        np.empty(count, np.int32),
-        *(np.empty((count, *getattr(splats, field.name).shape[1:]), np.float32) for field in fields(Gradients)[1:]),
-    )
-    v_colors = np.empty((count, 3), np.float64)
+    gradients = Gaussians(*(np.empty((count, *array.shape[1:]), np.float32) for array in frame.gaussians))
+    indices, v_colors = np.empty(count, np.int32), np.empty((count, 3), np.float64)
 
-    def project(first: int, last: int) -> None:
-        project_backward(
-            splats.means,
-            splats.quats,
-            splats.scales,
-            splats.opacities,
-            footprints.visible,
-            changed,
-            slots.first,
-            v_slots,
-            footprints.records,
-            first,
-            last,
-            camera.viewmat,
-            camera.K,
-            camera.width,
-            camera.height,
-            projection_constants(splats, camera),
-            found.gaussians,
-            found.means,
-            found.quats,
-            found.scales,
-            found.opacities,
-            v_colors,
-        )
-        shading.shade_backward(
-            splats.means,
-            splats.shN,
-            camera.position,
-            found.gaussians,
-            first,
-            last,
-            v_colors,
-            found.means,
-            found.sh0,
-            found.shN,
-        )
+    def part(first: int, last: int) -> None:
+        scene = frame.gaussians, frame.projection
+        project_backward(*scene, frame.footprints, slots, v_slots, changed, first, last, indices, gradients, v_colors)
+        shading.shade_backward(*scene, indices, first, last, v_colors, gradients)
 
-    each_part(project, even(count, pool), pool)
-    return found
+    each_part(part, even(count, pool), pool)
+    return Gradients(indices, *gradients)
 
 
 def differentiate_footprints(
@@ -467,37 +451,16 @@ def differentiate_footprints(
     v_alpha: Float32[np.ndarray, "H W"],
     pool: Workers,
 ) -> tuple[Float32[np.ndarray, "slots 9"], Slots, Bool[np.ndarray, " N"]]:
-    """Return the gradients of a loss by each footprint in each tile, their slots, and the rows that have any.
-
-    Arguments are those of :func:`differentiate`; the gradients are described at
-    :func:`kissgs.rendering.cpu.backward.blend_backward`.
-    """
-    lists, changed = frame.lists, np.zeros(len(frame.footprints.records), bool)
-    slots = number_slots(frame.footprints, lists, 0, len(lists.starts) - 1)
+    """Return what :func:`blend_backward` finds: sums by slot, the slots, and which rows have any gradient."""
+    lists, records = frame.lists, frame.footprints.records
+    slots, changed = number_slots(lists, len(records)), np.zeros(len(records), bool)
     v_slots = np.empty((len(lists.members), 9), np.float32)
     v_slots.fill(0)  # members behind the end of all pixels get nothing
-
-    def blend(first: int, last: int) -> None:
-        blend_backward(
-            frame.footprints.records,
-            lists.members,
-            lists.spans,
-            slots.of,
-            lists.starts,
-            first,
-            last,
-            lists.columns,
-            LIMITS,
-            frame.background,
-            frame.transmittance,
-            frame.stops,
-            v_image,
-            v_alpha,
-            v_slots,
-            changed,
-        )
-
-    each_part(blend, even_tiles(lists, pool), pool)
+    each_part(
+        lambda a, b: blend_backward(records, lists, slots, a, b, frame.blended, v_image, v_alpha, v_slots, changed),
+        even_tiles(lists, pool),
+        pool,
+    )
     return v_slots, slots, changed
 
 
@@ -505,29 +468,12 @@ def add_color_gradients(
     frame: Frame, v_image: Float32[np.ndarray, "H W 3"], into: Float32[np.ndarray, "N 3"], pool: Workers
 ) -> None:
     """Add the gradients of a loss by ``sh0`` alone, given its gradient by the image, ``v_image``, to ``into``."""
-    lists, visible, records = frame.lists, frame.footprints.visible, frame.footprints.records
-    slots = number_slots(frame.footprints, lists, 0, len(lists.starts) - 1)
+    lists, footprints = frame.lists, frame.footprints
+    slots = number_slots(lists, len(footprints.records))
     v_slots = np.empty((len(lists.members), 3), np.float32)
-
-    def blend(first: int, last: int) -> None:
-        blend_colors_backward(
-            records,
-            lists.members,
-            lists.spans,
-            slots.of,
-            lists.starts,
-            first,
-            last,
-            lists.columns,
-            LIMITS,
-            frame.stops,
-            v_image,
-            v_slots,
-        )
-
-    each_part(blend, even_tiles(lists, pool), pool)
-
-    def add(first: int, last: int) -> None:
-        add_colors(v_slots, records, slots.rows, slots.first, visible, first, last, SH_C0, into)
-
-    each_part(add, even(len(slots.rows), pool), pool)
+    each_part(
+        lambda a, b: blend_colors_backward(footprints.records, lists, slots, a, b, frame.blended, v_image, v_slots),
+        even_tiles(lists, pool),
+        pool,
+    )
+    each_part(lambda a, b: add_colors(v_slots, slots, footprints, a, b, SH_C0, into), even(len(slots.rows), pool), pool)

@@ -1,11 +1,17 @@
-"""Numba kernels of local scale: leaves of a k-d tree, and distances within each."""
+"""A k-d tree of points: its leaves, distances within each, and exact nearest neighbours."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
+from kissgs.core.array_types import Float64, Int32, Int64, Shaped
 from kissgs.core.numba_kernels import compiled
+from kissgs.core.resources import Workers
+from kissgs.rendering.cpu.tiles import each_part, even
+
+SEARCH_LEAF = 16
+"""Largest number of points in a leaf in which nearest neighbours are searched."""
 
 
 @njit(nogil=True, error_model="numpy")
@@ -48,18 +54,8 @@ def _partition(values: np.ndarray, order: np.ndarray, first: int, last: int, mid
 
 
 @compiled("int64(float32[:, ::1], int64, int32[::1], int64[::1])")
-def split_into_leaves(columns: np.ndarray, leaf: int, order: np.ndarray, edges: np.ndarray) -> int:
-    """Split points into the leaves of a k-d tree of equal counts: at the median of a part's longest side.
-
-    Args:
-        columns: ``(3, N)`` positions.
-        leaf: largest number of points in a leaf.
-        order: ``(N,)`` numbers of the points; permuted so that a leaf's points follow each other.
-        edges: out, first position of each leaf, and the number of points; long enough.
-
-    Returns:
-        The number of leaves.
-    """
+def _split(columns: np.ndarray, leaf: int, order: np.ndarray, edges: np.ndarray) -> int:
+    """Split points ``(3, N)`` into leaves, see :func:`leaves_of`; return their number. ``edges`` are long enough."""
     firsts, lasts = np.empty(64, np.int64), np.empty(64, np.int64)
     firsts[0], lasts[0] = 0, order.shape[0]
     depth, found = 1, 0
@@ -90,13 +86,9 @@ def split_into_leaves(columns: np.ndarray, leaf: int, order: np.ndarray, edges: 
 
 @njit(nogil=True, error_model="numpy")
 def _at_rank(bits: np.ndarray, rank: int, low: int, high: int) -> int:
-    """Return the bits of the float at this rank, 0 or more, to 11 bits of the mantissa, by bisection of counts.
+    """Return the bits of the float at this rank, to 11 bits of the mantissa, by bisection of counts.
 
-    Args:
-        bits: bits of positive floats, which sort as the floats do.
-        rank: rank of the float that is sought.
-        low: bits of the smallest.
-        high: bits at or above the one that is sought.
+    Bits of positive floats sort as the floats do; ``low`` are those of the smallest, ``high`` at or above the result.
     """
     while high - low > 4096:
         middle = low + (high - low) // 2
@@ -110,9 +102,31 @@ def _at_rank(bits: np.ndarray, rank: int, low: int, high: int) -> int:
     return high
 
 
+@njit(nogil=True, error_model="numpy")
+def _squared_scale(squared: np.ndarray, rank: int, gap: float) -> float:
+    """Return the square of the local scale, given squared distances and the rank at which it usually lies."""
+    bits, value = squared.view(np.int32), np.empty(1, np.int32)
+    low, high = bits[0], bits[0]
+    for j in range(bits.shape[0]):
+        low, high = min(low, bits[j]), max(high, bits[j])
+    at = _at_rank(bits, rank, low, high)
+    value[0] = at
+    usual = np.float64(value.view(np.float32)[0])
+    smallest, few = usual, rank // 2
+    for _ in range(3):
+        if few > 1:
+            at = _at_rank(bits, few, low, at)
+            value[0] = at
+            smallest = min(smallest, np.float64(value.view(np.float32)[0]) * (rank / few))
+        few //= 2
+    if rank == 0:
+        return 0.0
+    return smallest if smallest < gap * gap * usual else usual
+
+
 @compiled("void(float32[:, ::1], int32[::1], int64[::1], int64, int64, int64, int64, float64, float32[::1])")
 def leaf_scales(
-    columns: np.ndarray,
+    means: np.ndarray,
     order: np.ndarray,
     edges: np.ndarray,
     first: int,
@@ -124,16 +138,9 @@ def leaf_scales(
 ) -> None:
     """Compute the local scales of the points in leaves ``first`` to ``last`` (exclusive).
 
-    Args:
-        columns: ``(3, N)`` positions.
-        order, edges: as :func:`split_into_leaves` made them.
-        first: first leaf.
-        last: end of the leaves, exclusive.
-        stride: distances are measured to every ``stride``-th point of the leaf.
-        neighbours: the scale is the distance within which one in ``neighbours`` of these points lie.
-        gap: if the nearest half, quarter or eighth of them is nearer than this share of what a surface of uniform
-            density would have, their distance is used.
-        scales: out, ``(N,)``.
+    Distances are measured to every ``stride``-th point of the leaf; the scale is the one within which one in
+    ``neighbours`` of these lie. If the nearest half, quarter or eighth of them is nearer than the share ``gap`` of what
+    a surface of uniform density would have, their distance is used.
     """
     for leaf in range(first, last):
         members = np.sort(order[edges[leaf] : edges[leaf + 1]])
@@ -141,29 +148,151 @@ def leaf_scales(
         points = np.empty((3, count), np.float64)
         for i in range(count):
             for c in range(3):
-                points[c, i] = columns[c, members[i]]
+                points[c, i] = means[members[i], c]
         some = np.ascontiguousarray(points[:, ::stride])
         number = some.shape[1]
         squared, rank = np.empty(number, np.float32), min(number // neighbours, number - 1)
-        bits, value = squared.view(np.int32), np.empty(1, np.int32)
         for i in range(count):
             x, y, z = points[0, i], points[1, i], points[2, i]
             for j in range(number):
                 dx, dy, dz = x - some[0, j], y - some[1, j], z - some[2, j]
                 squared[j] = dx * dx + dy * dy + dz * dz
-            low, high = bits[0], bits[0]
-            for j in range(number):
-                low, high = min(low, bits[j]), max(high, bits[j])
-            at = _at_rank(bits, rank, low, high)
-            value[0] = at
-            usual = np.float64(value.view(np.float32)[0])
-            smallest, few = usual, rank // 2
-            for _ in range(3):
-                if few > 1:
-                    at = _at_rank(bits, few, low, at)
-                    value[0] = at
-                    smallest = min(smallest, np.float64(value.view(np.float32)[0]) * (rank / few))
-                few //= 2
-            if rank == 0:
-                smallest = usual = np.float64(0.0)
-            scales[members[i]] = np.sqrt(smallest if smallest < gap * gap * usual else usual)
+            scales[members[i]] = np.sqrt(_squared_scale(squared, rank, gap))
+
+
+@compiled("void(float64[:, ::1], int32[::1], int64[::1], float64[:, :, ::1])")
+def _fill_boxes(means: np.ndarray, order: np.ndarray, edges: np.ndarray, boxes: np.ndarray) -> None:
+    """Compute the bounding boxes ``(2 * S, 2, 3)`` of a binary tree over the leaves, S being a power of two.
+
+    They are the lowest and highest coordinates of node n, whose children are 2 n and 2 n + 1; node S + i is leaf i.
+    Nodes without points have inverted boxes.
+    """
+    side = boxes.shape[0] // 2
+    boxes[:, 0] = np.inf
+    boxes[:, 1] = -np.inf
+    for leaf in range(edges.shape[0] - 1):
+        box = boxes[side + leaf]
+        for at in range(edges[leaf], edges[leaf + 1]):
+            for c in range(3):
+                value = means[order[at], c]
+                box[0, c], box[1, c] = min(box[0, c], value), max(box[1, c], value)
+    for node in range(side - 1, 0, -1):
+        for c in range(3):
+            boxes[node, 0, c] = min(boxes[2 * node, 0, c], boxes[2 * node + 1, 0, c])
+            boxes[node, 1, c] = max(boxes[2 * node, 1, c], boxes[2 * node + 1, 1, c])
+
+
+@njit(nogil=True, error_model="numpy")
+def _distance_to_box(box: np.ndarray, x: float, y: float, z: float) -> float:
+    """Return the squared distance from a point to a box; infinity for an inverted one."""
+    dx = max(box[0, 0] - x, x - box[1, 0], 0.0)
+    dy = max(box[0, 1] - y, y - box[1, 1], 0.0)
+    dz = max(box[0, 2] - z, z - box[1, 2], 0.0)
+    return dx * dx + dy * dy + dz * dz
+
+
+@njit(nogil=True, error_model="numpy")
+def _insert(squared: np.ndarray, found: np.ndarray, value: float, index: int) -> None:
+    """Insert a neighbour into a list sorted by distance, of which the last one is dropped."""
+    at = found.shape[0] - 1
+    if value >= squared[at]:
+        return
+    while at > 0 and value < squared[at - 1]:
+        squared[at], found[at] = squared[at - 1], found[at - 1]
+        at -= 1
+    squared[at], found[at] = value, index
+
+
+@compiled(
+    "void(float64[:, ::1], int32[::1], int64[::1], float64[:, :, ::1], int64, int64, int64, int32[:, ::1], "
+    "float64[::1])"
+)
+def _nearest(
+    means: np.ndarray,
+    order: np.ndarray,
+    edges: np.ndarray,
+    boxes: np.ndarray,
+    first: int,
+    last: int,
+    rank: int,
+    found: np.ndarray,
+    distances: np.ndarray,
+) -> None:
+    """Find the K nearest of the points in leaves ``first`` to ``last`` (exclusive), see :func:`nearest_neighbours`."""
+    side, near = boxes.shape[0] // 2, found.shape[1]
+    squared, waiting, away = np.empty(near), np.empty(64, np.int64), np.empty(64)
+    for home in range(first, last):
+        for at_home in range(edges[home], edges[home + 1]):
+            point = order[at_home]
+            x, y, z = means[point, 0], means[point, 1], means[point, 2]
+            mine = found[point]
+            squared[:] = np.inf
+            mine[:] = 2147483647
+            # The own leaf comes first: of many points at one place, each then has neighbours of its own.
+            waiting[0], away[0], waiting[1], away[1], depth = 1, 0.0, side + home, -1.0, 2
+            while depth > 0:
+                depth -= 1
+                node = waiting[depth]
+                if away[depth] >= squared[near - 1] or (node == side + home and away[depth] >= 0):
+                    continue
+                if node >= side:
+                    for at in range(edges[node - side], edges[node - side + 1]):
+                        other = order[at]
+                        if other != point:
+                            dx, dy, dz = x - means[other, 0], y - means[other, 1], z - means[other, 2]
+                            _insert(squared, mine, dx * dx + dy * dy + dz * dz, other)
+                    continue
+                a = _distance_to_box(boxes[2 * node], x, y, z)
+                b = _distance_to_box(boxes[2 * node + 1], x, y, z)
+                closer, farther = (2 * node, 2 * node + 1) if a <= b else (2 * node + 1, 2 * node)
+                for child, distance in ((farther, max(a, b)), (closer, min(a, b))):
+                    if distance < squared[near - 1]:
+                        waiting[depth], away[depth] = child, distance
+                        depth += 1
+            distances[point] = squared[rank]
+
+
+@compiled("int64(int32[:, ::1], int32[:, ::1])")
+def unique_pairs(found: np.ndarray, pairs: np.ndarray) -> int:
+    """List each pair of neighbours ``(N, K)`` once, the lower index first, in ``(N * K, 2)``; return their number."""
+    count = 0
+    for i in range(found.shape[0]):
+        for j in found[i]:
+            both = False
+            for k in found[j]:
+                both |= k == i
+            if i < j or not both:
+                pairs[count, 0], pairs[count, 1] = min(i, j), max(i, j)
+                count += 1
+    return count
+
+
+def leaves_of(points: Shaped[np.ndarray, "N 3"], leaf: int) -> tuple[Int32[np.ndarray, " N"], Int64[np.ndarray, " e"]]:
+    """Split points into the leaves of a k-d tree of equal counts: at the median of a part's longest side.
+
+    Returns:
+        Numbers of the points, leaf after leaf, and the edges of the leaves of at most ``leaf`` points in it.
+    """
+    order, edges = np.arange(len(points), dtype=np.int32), np.empty(4 * len(points) // leaf + 2, np.int64)
+    found = _split(np.array(points.T, np.float32, order="C"), leaf, order, edges)
+    return order, edges[: found + 1]
+
+
+def nearest_neighbours(
+    points: Float64[np.ndarray, "N 3"], count: int, rank: int, pool: Workers
+) -> tuple[Int32[np.ndarray, "N K"], Float64[np.ndarray, " N"]]:
+    """Return the ``count`` nearest other points of each, nearest first, and the squared distance to that of ``rank``.
+
+    Of equally near ones, any; there must be more than ``count`` points, and ranks are from 0.
+    """
+    order, edges = leaves_of(points, SEARCH_LEAF)
+    leaves = len(edges) - 1
+    boxes = np.empty((2 << (leaves - 1).bit_length(), 2, 3))
+    _fill_boxes(points, order, edges, boxes)
+    found, squared = np.empty((len(points), count), np.int32), np.empty(len(points))
+    each_part(
+        lambda first, last: _nearest(points, order, edges, boxes, first, last, rank, found, squared),
+        even(leaves, pool),
+        pool,
+    )
+    return found, squared

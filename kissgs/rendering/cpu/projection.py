@@ -11,13 +11,15 @@ Vectors are tuples and matrices tuples of rows, so that they stay in registers.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numba import int64, njit
 
 from kissgs.core.numba_kernels import compiled
+from kissgs.rendering.cpu.records import FOOTPRINTS, GAUSSIANS, PROJECTION, Footprints, Gaussians, Projection
 
 Vector = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
+Bounds = tuple[float, float, float, float]
 
 _helper = njit(nogil=True, error_model="numpy")
 
@@ -72,8 +74,9 @@ def _pose(viewmat: np.ndarray) -> tuple[Matrix, Vector]:
 
 
 @_helper
-def _frustum(K: np.ndarray, width: int, height: int, margin: float) -> tuple[float, float, float, float]:
+def _frustum(projection: Projection) -> Bounds:
     """Return the left, right, top and bottom bound of x/z and y/z, to which the projection's derivative is clamped."""
+    K, width, height, margin = projection.K, projection.width, projection.height, projection.margin
     margin_x, margin_y = margin * 0.5 * width / K[0, 0], margin * 0.5 * height / K[1, 1]
     return (
         -K[0, 2] / K[0, 0] - margin_x,
@@ -180,10 +183,42 @@ def _is_far_outside(centre: float, side: int, deviation: float, clamped: float, 
 
 
 @_helper
-def _image_axes(p: Vector, q: Vector, quats: np.ndarray, scales: np.ndarray, n: int) -> tuple[Vector, Vector]:
+def _in_camera(pose: tuple[Matrix, Vector], mean: Vector) -> Vector:
+    """Return x/z, y/z and z of a point in the camera."""
+    rotation, translation = pose
+    z = _dot(rotation[2], mean) + translation[2]
+    return (_dot(rotation[0], mean) + translation[0]) / z, (_dot(rotation[1], mean) + translation[1]) / z, z
+
+
+@_helper
+def _clamped(x: float, y: float, frustum: Bounds) -> tuple[float, float]:
+    """Return x/z and y/z within :func:`_frustum`."""
+    left, right, top, bottom = frustum
+    return min(right, max(left, x)), min(bottom, max(top, y))
+
+
+@_helper
+def _jacobian(K: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Return the derivatives of the image's x by x and z, and of its y by y and z, given x/z, y/z and z."""
+    return K[0, 0] / z, -K[0, 0] / z * x, K[1, 1] / z, -K[1, 1] / z * y
+
+
+@_helper
+def _image_rows(J: tuple[float, float, float, float], rotation: Matrix) -> tuple[Vector, Vector]:
+    """Return the rows of J Rc."""
+    return _mix(J[0], rotation[0], J[1], rotation[2]), _mix(J[2], rotation[1], J[3], rotation[2])
+
+
+@_helper
+def _ellipsoid(gaussians: Gaussians, n: int) -> tuple[Quat, float, Matrix, Vector]:
+    """Return the unit quaternion, 1 / length of the stored one, the rotation and the standard deviations."""
+    w, x, y, z, shrink = _unit_quat(gaussians.quats, n)
+    return (w, x, y, z), shrink, _rotation(w, x, y, z), _deviations(gaussians.scales, n)
+
+
+@_helper
+def _image_axes(p: Vector, q: Vector, R: Matrix, s: Vector) -> tuple[Vector, Vector]:
     """Return the rows of W, given those of J Rc."""
-    w, x, y, z, _ = _unit_quat(quats, n)
-    R, s = _rotation(w, x, y, z), _deviations(scales, n)
     return _scaled(_times(p, R), s), _scaled(_times(q, R), s)
 
 
@@ -193,75 +228,38 @@ def _overlaps(centre: float, half: float, side: int) -> bool:
     return centre + half > 0 and centre - half < side
 
 
-@compiled(
-    "int64(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1],"
-    " int64, int64, float64[:, ::1], float64[:, ::1], int64, int64, float64[::1],"
-    " int32[::1], float32[::1], float32[:, ::1])"
-)
-def project(
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    first: int,
-    last: int,
-    viewmat: np.ndarray,
-    K: np.ndarray,
-    width: int,
-    height: int,
-    constants: np.ndarray,
-    visible: np.ndarray,
-    depths: np.ndarray,
-    records: np.ndarray,
-) -> int:
-    """Compute the footprints of the Gaussians ``first`` to ``last`` (exclusive) that touch the image.
+@compiled(int64(GAUSSIANS, PROJECTION, int64, int64, FOOTPRINTS))
+def project(gaussians: Gaussians, projection: Projection, first: int, last: int, found: Footprints) -> int:
+    """Find the footprints of the Gaussians ``first`` to ``last`` (exclusive) that touch the image.
 
-    Args:
-        means, quats, scales, opacities: stored parameters, see :class:`kissgs.Splats`.
-        first: first Gaussian.
-        last: end of the Gaussians, exclusive.
-        viewmat: ``(4, 4)`` world to camera.
-        K: ``(3, 3)`` intrinsics.
-        width: of the image, pixels.
-        height: of the image, pixels.
-        constants: NEAR, FAR, the camera's dilation, FRUSTUM_MARGIN, ALPHA_MIN, and 1 for an antialiased scene, else 0.
-        visible: out, from row ``first``, ``(N,)``: the Gaussian of each footprint.
-        depths: out, from row ``first``, ``(N,)``: z in the camera.
-        records: out, from row ``first``, ``(N, 11)``: centre x, y; l0, l1, l2 of :mod:`kissgs.rendering.cpu.blending`;
-            opacity, compensated in an antialiased scene; R, G, B (written by
-            :func:`kissgs.rendering.cpu.shading.shade`); the largest exponent whose alpha reaches ALPHA_MIN; half height
-            in pixels.
-
-    Returns:
-        Number of footprints.
+    They are written from row ``first`` on, without colours; their number is returned.
     """
-    near, far, dilation, alpha_min = constants[0], constants[1], constants[2], constants[4]
+    K, width, height, dilation = projection.K, projection.width, projection.height, projection.dilation
+    alpha_min, records = projection.alpha_min, found.records
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    rotation, translation = _pose(viewmat)
-    left, right, top, bottom = _frustum(K, width, height, constants[3])
+    pose, frustum = _pose(projection.viewmat), _frustum(projection)
     most = -2.001 * np.log(alpha_min)  # of 2 tau, for an opacity of 1
-    found = 0
+    row = first
     for n in range(first, last):
-        mean = _load(means, n)
-        z = _dot(rotation[2], mean) + translation[2]
-        if not (z >= near and z <= far):
+        x, y, z = _in_camera(pose, _load(gaussians.means, n))
+        if not (z >= projection.near and z <= projection.far):
             continue
-        x, y = (_dot(rotation[0], mean) + translation[0]) / z, (_dot(rotation[1], mean) + translation[1]) / z
         centre_x, centre_y = fx * x + cx, fy * y + cy
-        clamped_x, clamped_y = min(right, max(left, x)), min(bottom, max(top, y))
+        clamped_x, clamped_y = _clamped(x, y, frustum)
         if not (0 <= centre_x <= width and 0 <= centre_y <= height):
             # Most Gaussians outside the image are far from it: a bound on the footprint's size needs less arithmetic.
+            scales = gaussians.scales
             angle = np.exp(np.float64(max(scales[n, 0], scales[n, 1], scales[n, 2]))) / z
             far_x = _is_far_outside(centre_x, width, fx * angle, clamped_x, most, dilation)
             if far_x or _is_far_outside(centre_y, height, fy * angle, clamped_y, most, dilation):
                 continue
-        opacity = 1.0 / (1.0 + np.exp(-np.float64(opacities[n])))
+        opacity = 1.0 / (1.0 + np.exp(-np.float64(gaussians.opacities[n])))
         if not opacity >= alpha_min:
             continue
-        p = _mix(fx / z, rotation[0], -fx / z * clamped_x, rotation[2])
-        q = _mix(fy / z, rotation[1], -fy / z * clamped_y, rotation[2])
-        w, v = _image_axes(p, q, quats, scales, n)
-        if constants[5] != 0.0:
+        p, q = _image_rows(_jacobian(K, clamped_x, clamped_y, z), pose[0])
+        _, _, R, s = _ellipsoid(gaussians, n)
+        w, v = _image_axes(p, q, R, s)
+        if projection.antialiased:
             opacity *= _compensation(w, v, dilation)
             if not opacity >= alpha_min:
                 continue
@@ -269,13 +267,9 @@ def project(
         half_width, half_height = np.sqrt(2 * tau * (_dot(w, w) + dilation)), np.sqrt(2 * tau * (_dot(v, v) + dilation))
         if not (_overlaps(centre_x, half_width, width) and _overlaps(centre_y, half_height, height)):
             continue
-        row = first + found
-        found += 1
-        visible[row] = n
-        depths[row] = z
+        found.visible[row], found.depths[row] = n, z
         records[row, 0], records[row, 1] = centre_x, centre_y
         records[row, 2], records[row, 3], records[row, 4] = _cholesky(w, v, dilation)
-        records[row, 5] = opacity
-        records[row, 9] = tau
-        records[row, 10] = half_height
-    return found
+        records[row, 5], records[row, 9], records[row, 10] = opacity, tau, half_height
+        row += 1
+    return row - first

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numba import float64, int32, int64, njit, void
 
 from kissgs.core.numba_kernels import compiled
+from kissgs.rendering.cpu.records import FOOTPRINTS, GAUSSIANS, PROJECTION, Footprints, Gaussians, Projection
 
 
 @njit(nogil=True, error_model="numpy")
@@ -59,34 +60,14 @@ def _harmonics_gradient(x: float, y: float, z: float, count: int, v: np.ndarray)
     return gx, gy, gz
 
 
-@compiled(
-    "void(float32[:, ::1], float32[:, ::1], float32[:, :, ::1], float64[::1], int32[::1], int64, int64,"
-    " float32[:, ::1])"
-)
-def shade(
-    means: np.ndarray,
-    sh0: np.ndarray,
-    shN: np.ndarray,
-    eye: np.ndarray,
-    visible: np.ndarray,
-    first: int,
-    last: int,
-    records: np.ndarray,
-) -> None:
-    """Write the colours of footprints ``first`` to ``last`` (exclusive), clamped to at least 0.
-
-    Args:
-        means, sh0, shN: stored parameters, see :class:`kissgs.Splats`.
-        eye: ``(3,)`` position of the camera, world units.
-        visible: the Gaussian of each footprint.
-        first: first footprint.
-        last: end of the footprints, exclusive.
-        records: ``(M, 11)`` records of :func:`kissgs.rendering.cpu.projection.project`; columns 6 to 8 are written.
-    """
-    rest = shN.shape[1]
+@compiled(void(GAUSSIANS, PROJECTION, int64, int64, FOOTPRINTS))
+def shade(gaussians: Gaussians, projection: Projection, first: int, last: int, footprints: Footprints) -> None:
+    """Write the colours of footprints ``first`` to ``last`` (exclusive), clamped to at least 0."""
+    means, sh0, shN, records = gaussians.means, gaussians.sh0, gaussians.shN, footprints.records
+    eye, rest = projection.eye, shN.shape[1]
     basis = np.empty(15, np.float64)
     for row in range(first, last):
-        n = visible[row]
+        n = footprints.visible[row]
         x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
         inverse = 1.0 / np.sqrt(x * x + y * y + z * z)
         _harmonics(x * inverse, y * inverse, z * inverse, rest, basis)
@@ -102,35 +83,22 @@ def shade(
         records[row, 8] = max(blue, 0.0)
 
 
-@compiled(
-    "void(float32[:, ::1], float32[:, :, ::1], float64[::1], int32[::1], int64, int64,"
-    " float64[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, :, ::1])"
-)
+@compiled(void(GAUSSIANS, PROJECTION, int32[::1], int64, int64, float64[:, ::1], GAUSSIANS))
 def shade_backward(
-    means: np.ndarray,
-    shN: np.ndarray,
-    eye: np.ndarray,
-    gaussians: np.ndarray,
+    gaussians: Gaussians,
+    projection: Projection,
+    indices: np.ndarray,
     first: int,
     last: int,
     v_colors: np.ndarray,
-    v_means: np.ndarray,
-    v_sh0: np.ndarray,
-    v_shN: np.ndarray,
+    gradients: Gaussians,
 ) -> None:
-    """Compute gradients by means and SH coefficients, of ``gaussians[first:last]``.
-
-    Args:
-        means, shN, eye: as for :func:`shade`.
-        gaussians, first, last, v_colors: as for :func:`kissgs.rendering.cpu.backward.project_backward`.
-        v_means: ``(R, 3)``; gradients are added.
-        v_sh0: out, ``(R, 3)``.
-        v_shN: out, ``(R, K, 3)``.
-    """
-    rest = shN.shape[1]
+    """Compute gradients by SH coefficients, and add those by means, of the Gaussians ``indices[first:last]``."""
+    means, shN, eye, rest = gaussians.means, gaussians.shN, projection.eye, gaussians.shN.shape[1]
+    v_means, v_sh0, v_shN = gradients.means, gradients.sh0, gradients.shN
     basis, v_basis = np.empty(15, np.float64), np.empty(15, np.float64)
     for i in range(first, last):
-        n = gaussians[i]
+        n = indices[i]
         x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
         inverse = 1.0 / np.sqrt(x * x + y * y + z * z)
         x, y, z = x * inverse, y * inverse, z * inverse

@@ -4,34 +4,35 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numba import njit
+from numba import float32, int32, int64, njit, uint32, void
 
-from kissgs.core.array_types import Float32, Float64, Int32, Int64, UInt16, UInt32
+from kissgs.core.array_types import Int64
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.numba_kernels import compiled
 from kissgs.core.resources import Workers
-from kissgs.core.splats import Splats
 from kissgs.rendering import constants
-from kissgs.rendering.camera import Camera
-from kissgs.rendering.cpu import projection, shading
-
-# Numba kernels of tiles: lists of the footprints that touch each tile, front to back.
+from kissgs.rendering.cpu import projection as projection_kernels
+from kissgs.rendering.cpu import shading
+from kissgs.rendering.cpu.records import (
+    FOOTPRINTS,
+    SLOTS,
+    TILE_LISTS,
+    Footprints,
+    Gaussians,
+    Projection,
+    Slots,
+    TileLists,
+)
 
 
 @njit(nogil=True, error_model="numpy")
 def _sort_list(keys: np.ndarray, rows: np.ndarray, spans: np.ndarray, scratch: np.ndarray, counts: np.ndarray) -> None:
-    """Sort the members of one tile by their keys, stably.
+    """Sort ``rows`` and ``spans`` of one tile's members by their keys, stably.
 
-    Args:
-        keys: ``(n,)`` uint32; unchanged.
-        rows: ``(n,)`` footprint of each member; sorted.
-        spans: ``(n,)`` span of each member; sorted.
-        scratch: ``(4, n)`` uint32 or longer.
-        counts: ``(2048,)`` int64.
+    ``scratch`` has four rows, as long as the keys or longer, ``counts`` 2048 entries.
     """
     count = keys.shape[0]
     order, other = scratch[0], scratch[1]
@@ -69,42 +70,22 @@ def _sort_list(keys: np.ndarray, rows: np.ndarray, spans: np.ndarray, scratch: n
         rows[i], spans[i] = moved_rows[order[i]], moved_spans[order[i]]
 
 
-@compiled("void(int64[::1], int64, int64, uint32[::1], int32[::1], uint16[::1])")
-def sort_tiles(
-    starts: np.ndarray, first: int, last: int, keys: np.ndarray, members: np.ndarray, spans: np.ndarray
-) -> None:
-    """Sort the members of tiles ``first`` to ``last`` (exclusive) by their keys; members of equal keys stay in order.
-
-    Args:
-        starts: ``(tiles + 1,)`` index of the first member of each tile.
-        first: first tile.
-        last: end of the tiles, exclusive.
-        keys: sort key of each member, for which the bits of a positive float32 serve; unchanged.
-        members: footprint of each member; sorted.
-        spans: span of each member; sorted.
-    """
-    longest = 0
+@compiled(void(TILE_LISTS, int64, int64, uint32[::1]))
+def sort_tiles(lists: TileLists, first: int, last: int, keys: np.ndarray) -> None:
+    """Sort the members of tiles ``first`` to ``last`` (exclusive) by their keys, stably."""
+    starts, longest = lists.starts, 0
     for tile in range(first, last):
         longest = max(longest, starts[tile + 1] - starts[tile])
     scratch, counts = np.empty((4, longest), np.uint32), np.empty(2048, np.int64)
     for tile in range(first, last):
         a, b = starts[tile], starts[tile + 1]
-        _sort_list(keys[a:b], members[a:b], spans[a:b], scratch, counts)
+        _sort_list(keys[a:b], lists.members[a:b], lists.spans[a:b], scratch, counts)
 
 
-@compiled("int64(int32[::1], int32[::1], int32[::1], int32[::1])")
-def fill_slots(members: np.ndarray, first: np.ndarray, slots: np.ndarray, rows: np.ndarray) -> int:
-    """Number members footprint by footprint, and in their order within each.
-
-    Args:
-        members: footprint of each member, 0 to R - 1.
-        first: out, ``(R + 1,)`` first slot of each footprint, and the number of members.
-        slots: out, slot of each member.
-        rows: out, the footprints that have a member, ascending.
-
-    Returns:
-        The number of footprints that have a member.
-    """
+@compiled(int64(int32[::1], SLOTS))
+def fill_slots(members: np.ndarray, out: Slots) -> int:
+    """Number members footprint by footprint, in their order within each; return how many footprints have any."""
+    first, slots, rows = out.first, out.of, out.rows
     count = first.shape[0] - 1
     first[:] = 0
     for row in members:
@@ -205,9 +186,10 @@ def _whole_span(records: np.ndarray, n: int, row: int) -> int:
     return 32 * _clamp(np.ceil(-reach - y - 0.51), 16) + _clamp(np.floor(reach - y - 0.49) + 1, 16)
 
 
-@compiled("void(float32[:, ::1], int64, int64, int64, int64, int64[::1])")
-def count_tiles(records: np.ndarray, first: int, last: int, columns: int, rows: int, per_tile: np.ndarray) -> None:
+@compiled(void(float32[:, ::1], int64, int64, int64[:, ::1]))
+def count_tiles(records: np.ndarray, first: int, last: int, per_tile: np.ndarray) -> None:
     """Add the number of footprints ``first`` to ``last`` (exclusive) that touch each tile to ``per_tile``."""
+    rows, columns = per_tile.shape
     for n in range(first, last):
         left, right, top, bottom = _box(records, n, columns, rows)
         several = right - left > 1 and bottom - top > 1
@@ -215,38 +197,19 @@ def count_tiles(records: np.ndarray, first: int, last: int, columns: int, rows: 
             if several:
                 left, right = _columns(records, n, row, columns)
             for column in range(left, right):
-                per_tile[row * columns + column] += 1
+                per_tile[row, column] += 1
 
 
-@compiled(
-    "void(float32[:, ::1], uint32[::1], int64, int64, int64, int64, int64[::1], uint32[::1], int32[::1], uint16[::1])"
-)
+@compiled(void(FOOTPRINTS, int64, int64, TILE_LISTS, int64[:, ::1], uint32[::1]))
 def fill_tiles(
-    records: np.ndarray,
-    depths: np.ndarray,
-    first: int,
-    last: int,
-    columns: int,
-    rows: int,
-    ends: np.ndarray,
-    keys: np.ndarray,
-    members: np.ndarray,
-    spans: np.ndarray,
+    footprints: Footprints, first: int, last: int, lists: TileLists, ends: np.ndarray, keys: np.ndarray
 ) -> None:
-    """Write footprints ``first`` to ``last`` (exclusive) into the lists of the tiles that they touch.
+    """Append footprints ``first`` to ``last`` (exclusive) to the lists of the tiles that they touch.
 
-    Args:
-        records: ``(R, 11)`` records of :func:`kissgs.rendering.cpu.projection.project`.
-        depths: ``(R,)`` bits of each footprint's depth.
-        first: first footprint.
-        last: end of the footprints, exclusive.
-        columns: number of tiles in a row of tiles.
-        rows: number of rows of tiles.
-        ends: index at which the list of each tile continues; advanced.
-        keys: out, depth of each entry.
-        members: out, footprint of each entry, tile after tile.
-        spans: out, rows of pixels that each entry touches, as ``32 * first + last``, last exclusive.
+    The list of each tile continues at ``ends``. ``keys``: bits of each member's depth, which sort as depths do.
     """
+    records, depths = footprints.records, footprints.depths.view(np.uint32)
+    rows, columns = ends.shape
     for n in range(first, last):
         left, right, top, bottom = _box(records, n, columns, rows)
         several = right - left > 1 and bottom - top > 1
@@ -255,18 +218,17 @@ def fill_tiles(
             if several:
                 left, right = _columns(records, n, row, columns)
             for column in range(left, right):
-                end = ends[row * columns + column]
+                end = ends[row, column]
                 keys[end] = depths[n]
-                members[end] = n
-                spans[end] = _whole_span(records, n, row) if one_column else _span(records, n, column, row)
-                ends[row * columns + column] = end + 1
+                lists.members[end] = n
+                lists.spans[end] = _whole_span(records, n, row) if one_column else _span(records, n, column, row)
+                ends[row, column] = end + 1
 
-
-# Lists of the Gaussians that touch an image and each of its tiles, built in parts by threads.
-#
-# The result does not depend on the number of parts.
 
 R = TypeVar("R")
+
+Part = tuple[int, int]
+"""First and last (exclusive) of some items."""
 
 MAX_PAIRS = 2**31 - 1
 """Largest number of pairs of a footprint and a tile that it touches: the lists are int32."""
@@ -278,136 +240,48 @@ PARTS_PER_THREAD = 4
 """Number of parts per thread; parts differ in cost, and smaller ones balance the load."""
 
 
-@dataclass(frozen=True, slots=True)
-class Footprints:
-    """The M Gaussians that touch an image, in the order of the scene, in rows of arrays for all N.
+def find_footprints(gaussians: Gaussians, projection: Projection, pool: Workers) -> tuple[Footprints, list[Part]]:
+    """Project and shade all Gaussians; return those that touch the image, and the ranges of rows that hold them."""
+    count = len(gaussians.means)
+    found = Footprints(np.empty(count, np.int32), np.empty(count, np.float32), np.empty((count, 11), np.float32))
 
-    Attributes:
-        parts: ranges of rows that hold footprints; other rows are not set.
-        visible: ``(N,)`` index of the Gaussian of each row.
-        depths: ``(N,)`` bits of each footprint's depth, a positive float32; they sort as depths do.
-        records: ``(N, 11)``, see :func:`kissgs.rendering.cpu.projection.project`.
-    """
+    def part(first: int, last: int) -> Part:
+        end = first + projection_kernels.project(gaussians, projection, first, last, found)
+        shading.shade(gaussians, projection, first, end, found)
+        return first, end
 
-    parts: list[tuple[int, int]]
-    visible: Int32[np.ndarray, " N"]
-    depths: UInt32[np.ndarray, " N"]
-    records: Float32[np.ndarray, "N 11"]
-
-    @property
-    def count(self) -> int:
-        """The number M of footprints."""
-        return sum(last - first for first, last in self.parts)
-
-    def rows(self) -> Int64[np.ndarray, " M"]:
-        """Return the rows that hold footprints, ascending."""
-        return np.concatenate([np.arange(first, last) for first, last in self.parts])
+    return found, each_part(part, even(count, pool), pool)
 
 
-@dataclass(frozen=True, slots=True)
-class TileLists:
-    """Lists of the footprints that touch each tile.
-
-    Attributes:
-        columns: number of tiles in a row of tiles.
-        starts: ``(tiles + 1,)`` index of the first member of each tile.
-        members: ``(P,)`` rows of the footprints, tile after tile, front to back.
-        spans: ``(P,)`` rows of pixels that each member touches, see :func:`kissgs.rendering.cpu.tiles.fill_tiles`.
-    """
-
-    columns: int
-    starts: Int64[np.ndarray, " tiles_1"]
-    members: Int32[np.ndarray, " P"]
-    spans: UInt16[np.ndarray, " P"]
-
-
-@dataclass(frozen=True, slots=True)
-class Slots:
-    """Numbers of the members of some tiles, footprint by footprint, so that sums over tiles have a fixed order.
-
-    Attributes:
-        of: ``(S,)`` slot of each member of these tiles.
-        rows: ``(T,)`` rows of the footprints that are members, ascending.
-        first: ``(N + 1,)`` first slot of each row; a row's slots end where the next one's begin.
-    """
-
-    of: Int32[np.ndarray, " S"]
-    rows: Int32[np.ndarray, " T"]
-    first: Int32[np.ndarray, " N_1"]
-
-
-def projection_constants(splats: Splats, camera: Camera) -> Float64[np.ndarray, "6"]:
-    """Return the constants of projection, as kernels take them."""
-    margin, alpha_min = constants.FRUSTUM_MARGIN, constants.ALPHA_MIN
-    antialiased = float(splats.antialiased)
-    return np.array([constants.NEAR, constants.FAR, camera.dilation, margin, alpha_min, antialiased], np.float64)
-
-
-def find_footprints(splats: Splats, camera: Camera, pool: Workers) -> Footprints:
-    """Project and shade all Gaussians; return those that touch the image."""
-    count = len(splats)
-    visible, depths = np.empty(count, np.int32), np.empty(count, np.float32)
-    records = np.empty((count, 11), np.float32)
-
-    def part(first: int, last: int) -> tuple[int, int]:
-        found = projection.project(
-            splats.means,
-            splats.quats,
-            splats.scales,
-            splats.opacities,
-            first,
-            last,
-            camera.viewmat,
-            camera.K,
-            camera.width,
-            camera.height,
-            projection_constants(splats, camera),
-            visible,
-            depths,
-            records,
-        )
-        shading.shade(splats.means, splats.sh0, splats.shN, camera.position, visible, first, first + found, records)
-        return first, first + found
-
-    return Footprints(each_part(part, even(count, pool), pool), visible, depths.view(np.uint32), records)
-
-
-def sort_into_tiles(footprints: Footprints, camera: Camera, pool: Workers) -> TileLists:
-    """Return lists of the footprints that touch each tile, nearest first.
-
-    Raises:
-        UnsupportedError: there are more than :data:`MAX_PAIRS`, or more than :data:`MAX_MEMBERS` in one tile.
-    """
-    columns, rows = -(-camera.width // constants.TILE), -(-camera.height // constants.TILE)
-    records, depths = footprints.records, footprints.depths
-
-    def count(part: tuple[int, int]) -> Int64[np.ndarray, " tiles"]:
-        per_tile = np.zeros(columns * rows, np.int64)
-        count_tiles(records, *part, columns, rows, per_tile)
-        return per_tile
-
-    per_part = np.stack(pool.map(count, footprints.parts))
-    starts = _running_sum(per_part.sum(axis=0))
+def sort_into_tiles(footprints: Footprints, parts: list[Part], projection: Projection, pool: Workers) -> TileLists:
+    """Return lists of the footprints that touch each tile, nearest first; they do not depend on the parts."""
+    rows, columns = -(-projection.height // constants.TILE), -(-projection.width // constants.TILE)
+    per_part = np.zeros((len(parts), rows, columns), np.int64)
+    pool.map(lambda n: count_tiles(footprints.records, *parts[n], per_part[n]), range(len(parts)))
+    starts = np.zeros(rows * columns + 1, np.int64)
+    np.cumsum(per_part.sum(axis=0), out=starts[1:])
     _check_lists(starts)
-    keys, members = np.empty(starts[-1], np.uint32), np.empty(starts[-1], np.int32)
-    spans = np.empty(starts[-1], np.uint16)
-    ends = starts[:-1] + np.cumsum(per_part, axis=0) - per_part
-
-    def fill(n: int) -> None:
-        fill_tiles(records, depths, *footprints.parts[n], columns, rows, ends[n], keys, members, spans)
-
-    pool.map(fill, range(len(footprints.parts)))
-    lists = TileLists(columns, starts, members, spans)
-    each_part(lambda a, b: sort_tiles(starts, a, b, keys, members, spans), even_tiles(lists, pool), pool)
+    total = int(starts[-1])
+    lists = TileLists(columns, starts, np.empty(total, np.int32), np.empty(total, np.uint16))
+    keys = np.empty(total, np.uint32)
+    ends = starts[:-1].reshape(rows, columns) + np.cumsum(per_part, axis=0) - per_part
+    pool.map(lambda n: fill_tiles(footprints, *parts[n], lists, ends[n], keys), range(len(parts)))
+    each_part(lambda first, last: sort_tiles(lists, first, last, keys), even_tiles(lists, pool), pool)
     return lists
 
 
-def number_slots(footprints: Footprints, lists: TileLists, first: int, last: int) -> Slots:
-    """Return the slots of the members of tiles ``first`` to ``last`` (exclusive)."""
-    members = lists.members[lists.starts[first] : lists.starts[last]]
-    from_slot, of = np.empty(len(footprints.records) + 1, np.int32), np.empty(len(members), np.int32)
-    rows = np.empty(min(len(members), len(footprints.records)), np.int32)
-    return Slots(of, rows[: fill_slots(members, from_slot, of, rows)], from_slot)
+def number_slots(lists: TileLists, rows: int, tiles: Part | None = None) -> Slots:
+    """Return the slots of the members of some tiles, or of all; ``rows``: number of rows for footprints."""
+    first, last = tiles or (0, len(lists.starts) - 1)
+    begin, end = int(lists.starts[first]), int(lists.starts[last])
+    slots = Slots(
+        begin,
+        np.empty(end - begin, np.int32),
+        np.empty(min(end - begin, rows), np.int32),
+        np.empty(rows + 1, np.int32),
+    )
+    found = fill_slots(lists.members[begin:end], slots)
+    return slots._replace(rows=slots.rows[:found])
 
 
 def _check_lists(starts: Int64[np.ndarray, " tiles_1"]) -> None:
@@ -424,28 +298,15 @@ def _check_lists(starts: Int64[np.ndarray, " tiles_1"]) -> None:
         )
 
 
-def _running_sum(counts: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n_1"]:
-    total = np.zeros(len(counts) + 1, np.int64)
-    np.cumsum(counts, out=total[1:])
-    return total
-
-
 def even(count: int, pool: Workers) -> Int64[np.ndarray, " edges"]:
     """Return the edges of at least one part of about equal numbers of items; no part is empty if there are items."""
     parts = max(1, min(pool.threads * PARTS_PER_THREAD, count))
     return np.linspace(0, count, parts + 1).astype(np.int64)
 
 
-def even_tiles(lists: TileLists, pool: Workers, first: int = 0, last: int | None = None) -> Int64[np.ndarray, " edges"]:
-    """Return the edges of parts of tiles of about equal cost: the number of members plus a constant per tile.
-
-    Args:
-        lists: lists of all tiles.
-        pool: threads.
-        first: first tile.
-        last: end of the tiles, exclusive; None for all.
-    """
-    last = len(lists.starts) - 1 if last is None else last
+def even_tiles(lists: TileLists, pool: Workers, tiles: Part | None = None) -> Int64[np.ndarray, " edges"]:
+    """Return the edges of parts of some tiles, or of all, of about equal cost: members plus a constant per tile."""
+    first, last = tiles or (0, len(lists.starts) - 1)
     work = lists.starts[first : last + 1] + 8 * np.arange(last - first + 1)
     edges = np.searchsorted(work, np.linspace(work[0], work[-1], pool.threads * PARTS_PER_THREAD + 1))
     edges[0], edges[-1] = 0, last - first

@@ -16,6 +16,7 @@ from ...core.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemError
 from ...core.schemas import JobStatus
 from ...jobs.container import Owner, Service, ServiceContainer
 from ...jobs.status import job_status
+from ...storage.job_files import JOB
 
 MAX_WAIT_SECONDS = 30.0
 """Maximum duration of a long poll, shorter than typical idle time-outs of proxies."""
@@ -44,7 +45,7 @@ async def _find(
     owner: Owner,
     id: Annotated[str, Path(description="Id of a job: 32 hexadecimal digits.", max_length=100)],
 ) -> Job:
-    job = await run_sync(context.store.get, id, owner) if re.fullmatch("[0-9a-f]{32}", id) else None
+    job = await run_sync(context.store.get, id, owner) if JOB.fullmatch(id) else None
     if job is None:
         raise ProblemError("not-found", f"there is no job {id!r}; it may have been deleted")
     return job
@@ -64,11 +65,7 @@ async def statuses(context: ServiceContainer, *jobs: Job) -> list[JobStatus]:
 
 
 async def reload(context: ServiceContainer, job: Job) -> Job:
-    """Return the current row of a job.
-
-    Raises:
-        ProblemError: it has been deleted.
-    """
+    """Return the current row of a job."""
     current = await run_sync(context.store.get, job.id)
     if current is None:
         raise ProblemError("not-found", f"there is no job {job.id}; it has just been deleted")

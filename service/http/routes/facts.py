@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated
 
 from anyio.to_thread import run_sync
@@ -9,6 +10,7 @@ from fastapi import APIRouter, Path, Response
 from sqlalchemy.exc import SQLAlchemyError
 
 import kissgs
+from kissgs.formats import DOUBLE_ENDINGS, UPLOADS
 
 from ...core.files import CONTAINER_FILES
 from ...core.metrics import CONTENT_TYPE
@@ -30,7 +32,7 @@ async def get_limits(context: Service) -> Limits:
     """Limits of uploads and jobs; requests beyond them are refused."""
     settings = context.settings
     return Limits(
-        formats=["ply", "compressed.ply", "sog", "spz", "splat", "ksplat", "glb"],
+        formats=[ending.removeprefix(".") for ending in (*UPLOADS.values(), *DOUBLE_ENDINGS)],
         containers=list(CONTAINER_FILES),
         max_upload_bytes=settings.max_upload_bytes,
         max_header_bytes=settings.max_header_bytes,
@@ -51,14 +53,14 @@ async def get_limits(context: Service) -> Limits:
 
 @router.get("/v1/presets", tags=["facts"], operation_id="presets", summary="List the presets")
 async def get_presets() -> Presets:
-    """All presets, with the typical size, time and quality of each, and all settings that options may change."""
+    """All presets, with the typical size, time and quality of each, and all values that each states."""
     return presets()
 
 
 @router.get("/v1/problems", tags=["facts"], operation_id="problems", summary="List the problem types")
 async def get_problems() -> list[ProblemKind]:
     """All codes that a problem document can have."""
-    return [_kind(code) for code in PROBLEM_TYPES]
+    return [ProblemKind(code=code, **asdict(kind)) for code, kind in PROBLEM_TYPES.items()]
 
 
 @router.get(
@@ -72,7 +74,7 @@ async def get_problem(code: Annotated[str, Path(description="Code of a problem t
     """Description of a problem type; the `type` of a problem document links to it."""
     if code not in PROBLEM_TYPES:
         raise ProblemError("not-found", f"there is no code {code!r}; GET /v1/problems lists all")
-    return _kind(code)
+    return ProblemKind(code=code, **asdict(PROBLEM_TYPES[code]))
 
 
 @router.head("/version", include_in_schema=False)
@@ -131,11 +133,6 @@ async def get_metrics(context: Service) -> Response:
     counts, disk = await run_sync(lambda: (context.store.counts(), context.store.disk_bytes()))
     context.metrics.uploads.set(context.admission.uploads)
     return Response(context.metrics.text(counts, disk), media_type=CONTENT_TYPE)
-
-
-def _kind(code: str) -> ProblemKind:
-    kind = PROBLEM_TYPES[code]
-    return ProblemKind(code=code, status=kind.status, title=kind.title, retryable=kind.retryable)
 
 
 def _database_problem(context: ServiceContainer) -> str | None:

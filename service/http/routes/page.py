@@ -16,8 +16,11 @@ from starlette.types import Scope
 
 from ...core.files import WEB_DECODER
 from ...core.problems import ProblemError
+from ...storage.job_files import JOB
 
 router = APIRouter(include_in_schema=False)
+
+READ = ["GET", "HEAD"]
 
 STATIC = Path(__file__).parents[2] / "static"
 
@@ -31,7 +34,6 @@ POLICY = (
 """Content security policy. Spark sorts in WebAssembly, in workers that it creates from blobs; the hash is that of the
 import map, which must be inline."""
 
-_JOB = re.compile(r"[0-9a-f]{32}")
 _FILE = re.compile(
     r"(preview/)?[\w-]+\.(js|css|svg)|vendor/([\w-]+/)+([\w.-]+\.(js|css)|LICENSE|NOTICE)|vendor/versions\.json",
     re.ASCII,
@@ -58,39 +60,34 @@ class RevalidatedFiles(StaticFiles):
         return response
 
 
-@router.head("/")
-@router.get("/")
+@router.api_route("/", methods=READ)
 async def get_page() -> FileResponse:
     """Return the web page."""
     return FileResponse(STATIC / "index.html", headers=REVALIDATE)
 
 
-@router.head("/docs")
-@router.get("/docs")
+@router.api_route("/docs", methods=READ)
 async def get_explorer() -> FileResponse:
     """Return the page that shows the OpenAPI document and sends requests; its script is in ``web_decoder/vendor``."""
     return FileResponse(STATIC / "docs.html", headers=REVALIDATE)
 
 
-@router.head("/favicon.ico")
-@router.get("/favicon.ico")
+@router.api_route("/favicon.ico", methods=READ)
 async def get_icon() -> FileResponse:
     """Return the icon that browsers request by default."""
     return FileResponse(STATIC / "icon.svg", media_type="image/svg+xml", headers=REVALIDATE)
 
 
-@router.head("/preview")
-@router.get("/preview")
+@router.api_route("/preview", methods=READ)
 async def get_no_job() -> RedirectResponse:
     """Redirect to the folder, because the page's links are relative and a proxy may serve it under another path."""
     return RedirectResponse("preview/", headers=REVALIDATE)
 
 
-@router.head("/preview/{path:path}")
-@router.get("/preview/{path:path}")
+@router.api_route("/preview/{path:path}", methods=READ)
 async def get_preview(request: Request, path: str) -> Response:
     """Return the page or one of its files; the page itself finds out whether the job exists."""
-    if path in ("", "preview.html") or _JOB.fullmatch(path):
+    if path in ("", "preview.html") or JOB.fullmatch(path):
         return await run_sync(_page)
     if not _FILE.fullmatch(path):
         raise ProblemError("not-found", f"{request.url.path[:200]} does not exist")

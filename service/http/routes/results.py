@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 from urllib.parse import quote
 
 from anyio.to_thread import run_sync
@@ -29,9 +29,6 @@ class StoredFile(FileResponse):
 
     Of ranges, it sends a single valid one; others are ignored, as RFC 9110 permits. ``download`` is the file name for
     saving in a browser; None lets the browser show the file.
-
-    Raises:
-        ProblemError: it was removed.
     """
 
     def __init__(
@@ -78,11 +75,7 @@ class StoredFile(FileResponse):
 
 
 def described(summary: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    """Return the entry of a job's summary at a path of names.
-
-    Raises:
-        ProblemError: it does not exist.
-    """
+    """Return the entry of a job's summary at a path of names."""
     entry: Any = summary
     for name in names:
         if not isinstance(entry, dict) or name not in entry:
@@ -120,6 +113,9 @@ def _is_range(headers: list[str]) -> bool:
 
 router = APIRouter(prefix="/v1/jobs/{id}", tags=["results"])
 
+Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
+
+BINARY = "application/octet-stream"
 _MEDIA_TYPES = {".webp": "image/webp", ".json": "application/json", ".yaml": "application/yaml"}
 
 CONTAINER_TYPES = tuple(file.media_type for file in CONTAINER_FILES.values())
@@ -156,11 +152,33 @@ def _file_answers(media_types: str, *codes: str) -> dict[int | str, dict[str, An
     }
 
 
+def _route(path: str, summary: str, media_types: str, *codes: str) -> Callable[[Endpoint], Endpoint]:
+    """Make a function the documented GET and HEAD routes of a file."""
+
+    def add(endpoint: Endpoint) -> Endpoint:
+        name = endpoint.__name__.removeprefix("get_")
+        for method, operation, text in (("GET", name, summary), ("HEAD", f"{name}_head", f"{summary}: headers only")):
+            router.add_api_route(
+                path,
+                endpoint,
+                methods=[method],
+                operation_id=operation,
+                summary=text,
+                response_class=Response,
+                responses=_file_answers(media_types, *codes),
+            )
+        return endpoint
+
+    return add
+
+
+@_route("/result", "Download the container", " ".join(CONTAINER_TYPES))
 async def get_result(context: Service, job: RequestedJob) -> Response:
     """The container, `.zip` (SOG-XT) or `.sog` as the options say, until the job expires."""
     return await container(context, job)
 
 
+@_route("/files/{name}", "Download one file of the container", " ".join(_MEDIA_TYPES.values()))
 async def get_file(
     context: Service,
     job: RequestedJob,
@@ -169,30 +187,32 @@ async def get_file(
     """One file of the container, for readers that need only some. It never changes and may be cached."""
     _ready(job)
     entry = described(job.result or {}, ("files", name))
-    media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+    media_type = _MEDIA_TYPES.get(Path(name).suffix, BINARY)
     file = context.storage.result(job.id) / "files" / name
     return await _stored(file, sha256=entry["sha256"], media_type=media_type, headers=_FOREVER)
 
 
+@_route("/decoded", "Download the decoded scene", BINARY, "disk-full", "memory-limit", "crashed", "time-limit")
 async def get_decoded(context: Service, job: RequestedJob) -> Response:
     """The container decoded to a `.ply`, on the first request."""
     _ready(job)
     file, entry = await context.decoder.scene(job)
-    media_type = "application/octet-stream"
     download = f"{job.name}.decoded.ply"
-    return await _stored(file, sha256=entry["sha256"], media_type=media_type, download=download, headers=_PRIVATE)
+    return await _stored(file, sha256=entry["sha256"], media_type=BINARY, download=download, headers=_PRIVATE)
 
 
+@_route("/source", "Download the upload", BINARY)
 async def get_source(context: Service, job: RequestedJob) -> Response:
     """The uploaded scene, for comparisons, unless it was removed to free disk space."""
     _ready(job)
     file = await run_sync(context.storage.upload, job.id)
     if not job.upload_kept:
         raise ProblemError("gone", "the upload was removed to free disk space; the result is still available")
-    media_type, download = "application/octet-stream", f"{job.name}{file.suffix}"
-    return await _stored(file, sha256=job.upload_sha256, media_type=media_type, download=download, headers=_PRIVATE)
+    download = f"{job.name}{file.suffix}"
+    return await _stored(file, sha256=job.upload_sha256, media_type=BINARY, download=download, headers=_PRIVATE)
 
 
+@_route("/report", "Download the report", "application/json")
 async def get_report(context: Service, job: RequestedJob) -> Response:
     """The report of the compression, as from the library."""
     _ready(job)
@@ -202,11 +222,7 @@ async def get_report(context: Service, job: RequestedJob) -> Response:
 
 
 async def container(context: ServiceContainer, job: Job) -> StoredFile:
-    """Return the response with the container of a succeeded job.
-
-    Raises:
-        ProblemError: the job has not succeeded.
-    """
+    """Return the response with the container of a succeeded job."""
     _ready(job)
     entry = described(job.result or {}, ("container",))
     kind = container_file(job.options)
@@ -232,34 +248,3 @@ def _ready(job: Job) -> None:
             raise ProblemError("not-succeeded", f"the job failed: {reason}")
         case _:
             raise ProblemError("not-succeeded", "the job was cancelled; submit the scene again")
-
-
-def _add(endpoint: Callable[..., Any], path: str, summary: str, media_types: str, *codes: str) -> None:
-    """Add documented GET and HEAD routes of a file."""
-    name = endpoint.__name__.removeprefix("get_")
-    for method, operation in (("GET", name), ("HEAD", f"{name}_head")):
-        router.add_api_route(
-            path,
-            endpoint,
-            methods=[method],
-            operation_id=operation,
-            summary=summary if method == "GET" else f"{summary}: headers only",
-            response_class=Response,
-            responses=_file_answers(media_types, *codes),
-        )
-
-
-_add(get_result, "/result", "Download the container", " ".join(CONTAINER_TYPES))
-_add(get_file, "/files/{name}", "Download one file of the container", " ".join(_MEDIA_TYPES.values()))
-_add(
-    get_decoded,
-    "/decoded",
-    "Download the decoded scene",
-    "application/octet-stream",
-    "disk-full",
-    "memory-limit",
-    "crashed",
-    "time-limit",
-)
-_add(get_source, "/source", "Download the upload", "application/octet-stream")
-_add(get_report, "/report", "Download the report", "application/json")

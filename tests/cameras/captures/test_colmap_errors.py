@@ -1,5 +1,6 @@
 """Oracle: the expected message for each error in a model; and mutated files, which may raise no other exception."""
 
+import os
 import struct
 
 import pytest
@@ -133,9 +134,13 @@ def test_lines_beyond_the_limit(tmp_path, monkeypatch):
 def test_missing_files_and_folders_instead_of_files(tmp_path):
     with pytest.raises(InvalidViewsError, match=r"^cannot read .*cameras.txt: there is no such file$"):
         read_colmap(tmp_path)
-    (tmp_path / "cameras.txt").mkdir()
+    os.mkfifo(tmp_path / "cameras.txt")  # nothing waits for a writer of the pipe
     with pytest.raises(InvalidViewsError, match=r"^cannot read .*cameras.txt: it is a folder or a device$"):
         read_colmap(tmp_path)
+    write_text(tmp_path / "model", CAMERAS, IMAGES)
+    (tmp_path / "model" / "images.txt").unlink()
+    with pytest.raises(InvalidViewsError, match=r"has cameras.txt but no images.txt; a COLMAP model needs both$"):
+        load_views(tmp_path / "model")
 
 
 def test_invalid_focal_lengths(tmp_path):

@@ -1,7 +1,5 @@
 """Oracle: small captures written by hand, the README of fox, and independent code for the rules of INRIA and COLMAP."""
 
-import struct
-
 import numpy as np
 import pytest
 from helpers.reference_cameras import (
@@ -9,7 +7,6 @@ from helpers.reference_cameras import (
     assert_camera,
     frames,
     poses,
-    write_binary,
     write_json,
     write_photo,
     write_text,
@@ -17,7 +14,6 @@ from helpers.reference_cameras import (
 from PIL import Image
 
 from kissgs.cameras.captures.load import load_views
-from kissgs.cameras.views import View
 from kissgs.core.errors import InvalidViewsError
 
 NAMES = [f"{letter}.jpg" for letter in "jihgfedcba"]
@@ -45,29 +41,6 @@ def test_fox(shared_data):
         np.testing.assert_array_equal(quarter.load_photo(), np.asarray(image))
 
 
-def test_garden_has_cameras_only(shared_data, tmp_path):
-    """Cameras of an archive without photographs survive a round trip through a COLMAP model."""
-    with np.load(shared_data / "garden" / "test_garden.npz") as archive:
-        viewmats, Ks = archive["viewmats"].astype(float), archive["Ks"].astype(float)
-    data = struct.pack("<Q", 3)
-    for i, K in enumerate(Ks):
-        data += struct.pack("<IiQQ4d", i, 1, 648, 420, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    images = poses(["view_0.png", "view_1.png", "view_2.png"])
-    for i, pose in enumerate(images):
-        pose.camera, pose.rotation = i, type(pose.rotation).from_matrix(viewmats[i, :3, :3])
-        pose.translation = viewmats[i, :3, 3]
-    write_binary(tmp_path, {}, images)
-    (tmp_path / "cameras.bin").write_bytes(data)
-    views = load_views(tmp_path, hold_out=0)
-    for view, viewmat, K in zip(views.train, viewmats, Ks, strict=True):
-        np.testing.assert_allclose(view.camera.viewmat, viewmat, atol=1e-5)
-        np.testing.assert_allclose(view.camera.K, K)
-        assert view.photo is None
-    assert views.source == f"COLMAP model {tmp_path}, no photographs"
-    searched = f"searched {tmp_path} for 'images', 'input'"
-    assert views.note == f"no photographs were found ({searched}); name their folder with --images"
-
-
 @pytest.mark.parametrize("photos", ["images", "images_4", "input"])
 def test_source_names_the_folder_of_photographs(tmp_path, photos):
     """Subfolders of a camera rig are not named, and there is no note."""
@@ -83,7 +56,14 @@ def test_source_names_the_folder_of_photographs(tmp_path, photos):
 
 def test_photographs_in_an_unusual_folder_cause_a_note(tmp_path):
     capture(tmp_path, photos="rgb", size=(120, 80))
-    assert "no photographs were found" in load_views(tmp_path).note
+    views = load_views(tmp_path)
+    assert views.source == f"COLMAP model {tmp_path}/sparse/0, no photographs"
+    searched = f"searched {tmp_path} for 'images', 'input'"
+    assert views.note == f"no photographs were found ({searched}); name their folder with --images"
+    with pytest.raises(InvalidViewsError, match=r"^view b.jpg has no photograph, only a camera; add"):
+        views.train[0].load_photo()
+    small = load_views(tmp_path, scale=4).train[0].camera
+    assert (small.width, small.height) == (30, 20)
     views = load_views(tmp_path, images=tmp_path / "rgb")
     assert (views.note, views.source.split(", ")[-1]) == ("", "photographs of rgb")
 
@@ -139,26 +119,19 @@ def test_cameras_have_the_size_of_their_photographs(tmp_path, size, resolution, 
     assert view.load_photo().shape == (*expected[::-1], 3)
 
 
-def test_resolution_limits_the_longer_side_of_portrait_photographs(tmp_path):
-    """INRIA's code limits the width only and would not reduce them."""
-    capture(tmp_path, ("PINHOLE", 1200, 3200, (900.0, 900.0, 600.0, 1600.0)))
-    camera = load_views(tmp_path).train[0].camera
-    assert (camera.width, camera.height) == (600, 1600)
-
-
 @pytest.mark.parametrize("width", [1601, 1610, 1999, 5187])
 def test_reduced_sizes_equal_inrias(tmp_path, width):
-    """``int(w / (w / 1600))`` is 1599 for some widths, and published results use these sizes."""
+    """``int(w / (w / 1600))`` is 1599 for some widths, and published results use these sizes.
+
+    INRIA's code limits the width only and would not reduce portrait photographs.
+    """
     capture(tmp_path, ("PINHOLE", width, 1000, (900.0, 900.0, width / 2, 500.0)))
     scale = width / 1600
     camera = load_views(tmp_path).train[0].camera
     assert (camera.width, camera.height) == (int(width / scale), int(1000 / scale))
-
-
-def test_scale_without_photographs_reduces_the_cameras(tmp_path):
-    capture(tmp_path)
-    camera = load_views(tmp_path, scale=4).train[0].camera
-    assert (camera.width, camera.height) == (30, 20)
+    capture(tmp_path, ("PINHOLE", 1000, width, (900.0, 900.0, 500.0, width / 2)))
+    camera = load_views(tmp_path).train[0].camera
+    assert (camera.width, camera.height) == (int(1000 / scale), int(width / scale))
 
 
 def test_a_distorting_lens_is_undistorted(tmp_path):
@@ -257,11 +230,3 @@ def test_no_capture(tmp_path):
 )
 def test_arguments_out_of_range(tmp_path, options, sentence):
     assert message(tmp_path, **options) == sentence
-
-
-def test_views_without_a_photograph(tmp_path):
-    capture(tmp_path)
-    view = load_views(tmp_path).train[0]
-    assert isinstance(view, View)
-    with pytest.raises(InvalidViewsError, match=r"^view b.jpg has no photograph, only a camera; add"):
-        view.load_photo()

@@ -93,14 +93,8 @@ def test_spellings_of_a_path(tmp_path):
     assert [p.path for p in find_photos([str(here / "images" / "a.jpg")], tmp_path)] == [here / "images" / "a.jpg"]
 
 
-@pytest.mark.parametrize("name", ["/home/elsewhere/capture/images/a.jpg", "C:\\captures\\images\\a.jpg"])
-def test_absolute_paths_of_a_moved_capture(tmp_path, name):
-    touch(tmp_path, "images_2/a.jpg")
-    assert found(tmp_path, name) == ["images_2/a.jpg"]
-
-
-@pytest.mark.parametrize("start", ["/home/elsewhere/", "C:\\captures\\", "d:/captures/", "\\\\server\\share\\"])
-@pytest.mark.parametrize("photos", ["images", "images_4", "input"])
+@pytest.mark.parametrize("start", ["/home/elsewhere/", "C:\\captures\\", "\\\\server\\share\\"])
+@pytest.mark.parametrize("photos", ["images_4", "input"])
 def test_absolute_paths_are_matched_by_their_longest_suffix(tmp_path, start, photos):
     """Several cameras of a rig may have photographs with equal file names."""
     touch(tmp_path, f"{photos}/1.jpg", f"{photos}/left/1.jpg", f"{photos}/2.jpg", "elsewhere/2.jpg", "other_2/3.jpg")

@@ -75,9 +75,16 @@ def test_the_same_seed_gives_the_same_cameras(draw):
     assert not np.array_equal(positions[0], positions[2])
 
 
-def test_a_scene_without_visible_gaussians_has_none():
+@pytest.mark.parametrize("draw", [close_ups, scattered_cameras])
+def test_a_scene_without_visible_gaussians_has_none(draw):
     scene = sample_scene(20)
-    unseen = replace(scene, opacities=np.full(20, -np.inf, np.float32))
-    assert close_ups(unseen, side=8, count=5) == []
-    assert close_ups(scene.select(np.arange(0)), side=8, count=5) == []
-    assert len(close_ups(scene.select(np.arange(1)), side=8, count=5)) == 5
+    assert draw(replace(scene, opacities=np.full(20, -np.inf, np.float32)), side=8, count=5) == []
+    assert draw(scene.select(np.arange(0)), side=8, count=5) == []
+
+
+@pytest.mark.parametrize("draw", [close_ups, scattered_cameras])
+def test_scenes_of_a_few_gaussians_and_of_one_place(draw):
+    for count in (1, 2, 7):
+        scene = sample_scene(count)
+        for splats in (scene, replace(scene, means=np.zeros_like(scene.means))):
+            assert len(draw(splats, side=8, count=6)) == 6

@@ -31,6 +31,8 @@ def test_views_are_split_named_square_and_of_several_fields_of_view(tall_box):
     angles = np.array([2 * np.arctan(24 / view.camera.K[0, 0]) for view in views.all])
     assert FIELDS_OF_VIEW[0] <= angles.min() < angles.max() <= FIELDS_OF_VIEW[1]
     assert np.ptp(angles) > 0.2
+    single = random_poses(tall_box, side=24, count=1)
+    assert (len(single.train), len(single.test)) == (1, 0)
 
 
 @pytest.mark.quick(0)
@@ -100,11 +102,6 @@ def test_any_scene_gets_views(count, size, log_scale, opacity):
     for view in views.all:
         image, _ = render(scene, view.camera)
         assert np.isfinite(image).all()
-
-
-def test_a_single_view_is_for_training(tall_box):
-    views = random_poses(tall_box, side=24, count=1)
-    assert (len(views.train), len(views.test)) == (1, 0)
 
 
 @pytest.mark.parametrize("wrong", [{"count": 0, "side": 8}, {"count": 1, "side": 0}])

@@ -165,12 +165,6 @@ def test_any_scene_gets_cameras(monkeypatch, count, size, offset, log_scale, opa
         assert np.isfinite(image).all()
 
 
-@pytest.mark.usefixtures("fewer")
-def test_a_single_view_is_for_training():
-    views = virtual_views(box((1, 1, 1), 500), count=1)
-    assert (len(views.train), len(views.test)) == (1, 0)
-
-
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"width": 0}, {"height": -1}])
 def test_numbers_below_one_are_refused(wrong):
     with pytest.raises(InvalidViewsError, match="at least 1 view"):

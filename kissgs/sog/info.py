@@ -1,4 +1,4 @@
-"""Describe SOG containers, for ``kissgs info``."""
+"""Facts of a SOG container from its metadata, for ``kissgs info``."""
 
 from __future__ import annotations
 
@@ -8,26 +8,25 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.origin import recorded
+from kissgs.core.progress import Progress
 from kissgs.core.signed_log import signed_exp
-from kissgs.io.containers import open_source
-from kissgs.pipeline.container_facts import Facts, stored_size
-from kissgs.sog.metadata import META_NAME, SogLayout, read_layout
+from kissgs.core.splats import Splats
+from kissgs.io.containers import META_NAME, open_source, stored_size
+from kissgs.io.scene_format import Codec, Facts, ReadOptions, SceneSource, titled
+from kissgs.sog.metadata import SogLayout, read_layout
 
 
-def sog_facts(path: Path) -> Facts:
-    """Return the facts of a SOG container.
-
-    Raises:
-        KissgsError: the container is damaged or incomplete.
-    """
+def describe(path: Path | bytes, level: int) -> Facts:
+    """Return the facts of a SOG container."""
     with open_source(path) as files:
         layout = read_layout(files)
-        parts = {name: stored_size(files, name) for name in (META_NAME, *sog_images(layout))}
+        parts = {name: stored_size(files, name) for name in (META_NAME, *layout.images)}
     return Facts(
+        title=titled("SOG container", f"version {layout.version}", layout.model, layout.generator),
         count=layout.count,
         sh_degree=layout.sh_degree,
         parts=parts,
-        ranges=sog_ranges([layout]),
+        ranges=ranges_of([layout]),
         notes=layout.notes,
         details={
             **recorded(layout.origin),
@@ -40,21 +39,14 @@ def sog_facts(path: Path) -> Facts:
     )
 
 
-def sog_images(layout: SogLayout) -> list[str]:
-    """Return the names of a container's images."""
-    rest = [layout.rest.centroids, layout.rest.labels] if layout.rest else []
-    return [*layout.files.values(), *rest]
-
-
-def sog_ranges(layouts: list[SogLayout]) -> dict[str, tuple[float, float]]:
+def ranges_of(layouts: list[SogLayout]) -> dict[str, tuple[float, float]]:
     """Return the values of the lowest and the highest level of every attribute, over all containers."""
-    rest = [layout.rest.table for layout in layouts if layout.rest]
     values: dict[str, Iterable[np.ndarray]] = {
         "means": [signed_exp(end) for layout in layouts for end in (layout.low, layout.high)],
         "scales": [layout.scales for layout in layouts],
         "opacities": [layout.opacities for layout in layouts],
         "sh0": [layout.sh0 for layout in layouts],
-        "shN": rest,
+        "shN": [layout.rest.table for layout in layouts if layout.rest],
     }
     found = {}
     for name, arrays in values.items():
@@ -63,3 +55,12 @@ def sog_ranges(layouts: list[SogLayout]) -> dict[str, tuple[float, float]]:
             together = np.concatenate(finite)
             found[name] = float(together.min()), float(together.max())
     return found
+
+
+def _read(source: SceneSource, reading: ReadOptions, threads: int, progress: Progress) -> Splats:
+    from kissgs.sog.decode import decode  # which the description does not need
+
+    return decode(source, max_gaussians=reading.max_compressed, threads=threads, progress=progress)
+
+
+FORMAT = Codec(info=describe, read=_read)
