@@ -339,7 +339,7 @@ def test_a_target_size_is_met_if_fine_tuned_containers_are_too_large(monkeypatch
     found = kissgs.compress(cloud(60), settings=gentle)
     assert b"finetune" not in found.files[YAML_NAME]
     assert not found.report.finetuning.kept
-    assert "as it was without" in found.report.finetuning.note
+    assert "this one is not fine-tuned" in found.report.finetuning.note
 
 
 @pytest.mark.quick(0)
