@@ -163,7 +163,7 @@ class Remote:
         """
         path = Path(source)
         options = {
-            **(settings or Settings()).model_dump(mode="json", exclude_unset=True),
+            **_given(settings or Settings()),
             "format": container,
             "evaluate": evaluate,
             **({} if origin is None else {"origin": origin}),
@@ -319,6 +319,19 @@ def _sleep(seconds: float, progress: Progress, why: str) -> None:
     while time.monotonic() < end:
         progress(WAIT, 0.0, why)
         time.sleep(min(0.5, seconds))
+
+
+def _given(settings: Settings) -> dict[str, Any]:
+    """Return the settings as JSON without what belongs to the preset, which the server's version decides."""
+    values = settings.model_dump(mode="json", exclude_unset=True)
+    if not settings.for_research:
+        for name, group in (
+            ("compact", settings.compact),
+            ("encode", settings.encode),
+            ("finetune", settings.finetune),
+        ):
+            values[name] = {key: value for key, value in values.get(name, {}).items() if key in group.public()}
+    return values
 
 
 def _size(path: Path) -> int:

@@ -260,6 +260,8 @@ def chosen(
         if not equals:
             raise UnsupportedError(f"--set {change!r}: write NAME=VALUE, for example --set max_encodes=5")
         of, dot, inner = name.strip().partition(".")
+        if not dot and of in ("preset", "time_limit", *values):
+            raise UnsupportedError(f"--set {change!r}: write GROUP.NAME=VALUE, or --preset and --time")
         if dot and of not in values:
             raise UnsupportedError(
                 f"--set {change!r}: unknown group {of!r}; the groups are compact, encode and finetune"

@@ -49,6 +49,7 @@ def _defer(kernel: Any, signature: str | Signature) -> None:  # noqa: ANN401
     def compile_signature() -> Any:  # noqa: ANN401
         with _compiling:
             if not kernel.signatures:
+                _load_called(kernel)
                 kernel.compile(signature)
                 kernel.disable_compile()
             return next(iter(kernel.overloads.values()))
@@ -68,6 +69,21 @@ def _defer(kernel: Any, signature: str | Signature) -> None:  # noqa: ANN401
     # numba asks these two when it finds no compiled version of a kernel.
     kernel._compile_for_args, kernel.get_call_template = called_by_python, called_by_kernel
     kernel.load = compile_signature
+
+
+def _load_called(kernel: Any) -> None:  # noqa: ANN401
+    """Load the kernels that a kernel calls, as compiling it does but loading it from the cache does not.
+
+    Its code holds copies of theirs, rounded in another way where fastmath lets LLVM choose; whichever is loaded first
+    is used, so that results would depend on whether this process or an earlier one compiled the kernel.
+    """
+    for name in kernel.py_func.__code__.co_names:
+        called = kernel.py_func.__globals__.get(name)
+        if any(called is other for other in kernels):
+            if called is not kernel:
+                called.load()
+        elif hasattr(called, "py_func"):  # compiled into each of its callers
+            _load_called(called)
 
 
 @contextlib.contextmanager

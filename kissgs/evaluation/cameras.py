@@ -309,8 +309,8 @@ class _PoseSampler:
         target_index = self.gaussians.at(quantile if 2 * attempt < MAX_DRAWS else rng.random())
         origin_index = self.gaussians.at(rng.random())
         fov, direction = float(rng.uniform(*FIELDS_OF_VIEW)), random_direction(rng)
-        halvings = 2 * attempt * (attempt % 2)  # every other attempt: an isolated cluster may have fewer Gaussians
-        fewest, most = (max(1, min(limit, self.columns.shape[1]) >> halvings) for limit in CLOSE_UP_RANKS)
+        shift = 2 * attempt * (attempt % 2)  # every other attempt: an isolated cluster may have fewer Gaussians
+        fewest, most = (max(1, min(limit, self.columns.shape[1]) >> shift) for limit in CLOSE_UP_RANKS)
         close_rank = _whole_log_uniform(rng, fewest, most)
         if kind == "far":
             target, radius = self._bounding_sphere(EXTENT_SHARES[(number // len(KINDS) + attempt) % len(EXTENT_SHARES)])
@@ -323,7 +323,7 @@ class _PoseSampler:
         rank = (
             close_rank
             if kind == "close-up"
-            else _whole_log_uniform(rng, fewest, max(fewest, self.columns.shape[1] >> halvings))
+            else _whole_log_uniform(rng, fewest, max(fewest, self.columns.shape[1] >> shift))
         )
         return self._looking(kind, target + direction * self._distance(target_index, rank), target, fov)
 

@@ -93,6 +93,8 @@ def _limit_resources(memory: int | None) -> None:
         import resource
 
         if memory is not None:
+            # numba would load its OpenBLAS, which no kernel calls and which loops forever when it gets no memory.
+            sys.modules["scipy"] = None  # type: ignore[assignment]
             resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         with contextlib.suppress(OSError):

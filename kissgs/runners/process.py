@@ -35,7 +35,9 @@ from kissgs.runners.contract import (
 from kissgs.runners.temporary_folder import temporary_folder
 
 OUT_OF_MEMORY = re.compile(
-    "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.IGNORECASE
+    "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory|failed to map|can't start new thread"
+    "|error return without exception set",
+    re.IGNORECASE,
 )
 """Messages of Python, C++, LLVM, OpenBLAS and the C library when an allocation fails; any of them may be the first."""
 
@@ -220,4 +222,5 @@ def child_environment(secret: tuple[str, ...] = ("KISSGS_", "AWS_")) -> dict[str
     By default, these are the settings of a service and the credentials of a cloud.
     """
     inherited = {name: value for name, value in os.environ.items() if not name.upper().startswith(secret)}
-    return {**inherited, "OMP_WAIT_POLICY": "PASSIVE", "PYTHONUNBUFFERED": "1"}
+    libraries = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}  # its buffers count as memory
+    return {**inherited, **libraries, "PYTHONUNBUFFERED": "1"}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -50,6 +50,11 @@ class JobOptions(kissgs.Settings):
         description="auto: make positions relative to the middle of the scene, where containers have the finest steps, "
         "and record it; by default as in the file. For scenes far from the origin.",
     )
+
+    @classmethod
+    def stored(cls, options: dict[str, Any]) -> Self:
+        """Return the options of a job in the database; older versions took values that belong to the preset now."""
+        return cls.model_validate({"for_research": True, **options})
 
     @property
     def kind(self) -> str:

@@ -106,7 +106,7 @@ def job_status(job: Job, queue: Queue) -> JobStatus:
         position=queue.position(job) if waits else None,
         progress=Progress(stage=job.stage, fraction=job.fraction, note=job.note) if runs and job.stage else None,
         estimate=_estimate(job, queue) if waits or runs else None,
-        options=JobOptions.model_validate(job.options),
+        options=JobOptions.stored(job.options),
         upload_bytes=job.upload_bytes,
         gaussians=job.gaussians,
         sh_degree=job.sh_degree,

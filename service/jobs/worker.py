@@ -358,7 +358,7 @@ class Worker:
 
     def _task(self, job: Job, upload: str, work: Path) -> dict[str, Any]:
         """Return the task of a start, whose result goes to ``work`` in the job's folder."""
-        options = JobOptions.model_validate(job.options)
+        options = JobOptions.stored(job.options)
         checkpoints = self.storage.checkpoints(job.id) if options.resumable else []
         return {
             "function": COMPRESS,
@@ -367,9 +367,7 @@ class Worker:
             "source": upload,
             "work": work.name,
             "checkpoint": CHECKPOINT if options.resumable else None,
-            "settings": {
-                name: value for name, value in job.options.items() if name not in ("format", "evaluate", "origin")
-            },
+            "settings": options.model_dump(mode="json", exclude={"format", "evaluate", "origin"}),
             "format": options.format,
             "container": container_file(job.options).name,
             "evaluate": options.evaluate,

@@ -111,6 +111,7 @@ def test_settings_from_the_command_line(scene: Path, tmp_path: Path) -> None:
     assert (settings["sh_neighbors"], settings["seed"]) == (16, 3)
     assert "there is no setting 'bits'" in failure("compress", scene, "-o", tmp_path / "b.zip", "--set", "bits=16")
     assert "NAME=VALUE" in failure("compress", scene, "-o", tmp_path / "b.zip", "--set", "bits")
+    assert "write GROUP.NAME=VALUE" in failure("compress", scene, "-o", tmp_path / "b.zip", "--set", "preset=small")
     assert "fast, balanced, small, paper" in failure("compress", scene, "-o", tmp_path / "b.zip", "-p", "huge")
 
 

@@ -44,3 +44,23 @@ def test_no_kernel_is_compiled_while_a_scene_is_compressed():
         check=False,
     )
     assert (done.returncode, done.stdout) == (0, ""), done.stderr[-2000:]
+
+
+GRADIENT = """
+import hashlib, numpy, torch
+from kissgs.rendering.differentiable import photometric_loss
+image, target = torch.from_numpy(numpy.random.default_rng(1).random((2, 2, 72, 96, 3), dtype=numpy.float32))
+photometric_loss(image.requires_grad_(), target, ssim_weight=0.3, mse_weight=0.1).backward()
+print(hashlib.sha256(image.grad.numpy().tobytes()).hexdigest())
+"""
+
+
+def test_results_do_not_depend_on_whether_kernels_come_from_the_cache(tmp_path):
+    """Regression: the process that compiled the kernels of SSIM rounded its gradient in another way than later ones."""
+    paths = os.pathsep.join(path for path in sys.path if path)
+    environment = {**os.environ, "PYTHONPATH": paths, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", GRADIENT]
+    first, second = (subprocess.run(command, capture_output=True, check=True, env=environment).stdout for _ in range(2))
+    assert list(tmp_path.rglob("*.nbi"))
+    assert len(first) > 64
+    assert first == second

@@ -303,7 +303,7 @@ def test_more_gaussians_are_pruned_before_fine_tuning(monkeypatch, encode, finet
 @both
 def test_the_fine_tuned_container_meets_a_target_size(container):
     scene, common = cloud(600, 1), {"sensitivity_views": 4, "sensitivity_view_size": 60}
-    plain = kissgs.compress(scene, settings=Settings(encode=common), container=container)
+    plain = kissgs.compress(scene, settings=Settings.research("balanced", **common), container=container)
     size = int(0.8 * plain.report.container_bytes)
     settings = Settings.research("balanced", finetune={**SHORT, **GENTLE}, target_size=size, **common)
     found = kissgs.compress(scene, settings=settings, container=container)

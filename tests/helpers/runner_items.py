@@ -53,6 +53,20 @@ def allocate(arguments, progress):
     return {"bytes": len(bytearray(arguments["bytes"]))}
 
 
+def load_kernels(arguments, progress):
+    """Load a kernel, and what numba loads for the first one, when only so many bytes are left."""
+    import resource
+
+    from kissgs.core.numba_kernels import kernels
+    from kissgs.rendering.cpu import coverage
+
+    assert coverage
+    used = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
+    ballast = bytearray(resource.getrlimit(resource.RLIMIT_DATA)[0] - used - arguments["left"])
+    kernels[0].load()
+    return {"ballast": len(ballast)}
+
+
 def write_slowly(arguments, progress):
     """Add a line to the file ``starts``, then wait, in the first start for long, and write ``output`` atomically."""
     from kissgs.io.files import atomic_file

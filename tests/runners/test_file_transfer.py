@@ -86,7 +86,7 @@ def test_an_item_whose_node_is_killed_leaves_its_checkpoint(whole_cluster, ray_r
     assert outcome.result["folder"].startswith(str(whole_cluster.folder))
     digest = hashlib.sha256((folder / "scene").read_bytes()).hexdigest()
     assert contents(folder / "made") == {"digest": digest.encode()}
-    assert whole_cluster.left_by_items() == []
+    wait_until(lambda: whole_cluster.left_by_items() == [])
 
 
 def test_files_that_cannot_be_stored_end_the_item(ray_cluster, ray_runner, work):

@@ -4,9 +4,10 @@ import errno
 import io
 import signal
 import subprocess
+import sys
 
 import pytest
-from helpers.running import item
+from helpers.running import MB, item
 
 import kissgs
 from kissgs.cli.compress_cluster import ClusterCompression
@@ -33,6 +34,15 @@ def test_what_a_crash_is_attributed_to(status, used, output, expected):
     process = ItemProcess(item("count", memory_limit=1 << 30))
     process._peak_data = int(used * (1 << 30))
     assert process._explain(None, status, io.BytesIO(output.encode())).code == expected
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the memory of a process")
+@pytest.mark.parametrize("left", [2, 14, 30, 60])
+def test_libraries_that_lack_memory_end_the_work(left):
+    """That of scipy, which numba loads, waited forever."""
+    work = item("load_kernels", left=left * MB, memory_limit=400 * MB, seconds=30)
+    *_, outcome = ItemProcess(work).events()
+    assert outcome.kind == "done" or outcome.code == "memory-limit"
 
 
 def test_a_folder_that_this_machine_does_not_see(tmp_path):

@@ -123,7 +123,7 @@ def test_no_more_items_run_than_their_requests_allow(whole_cluster, ray_runner, 
     assert [handle.outcome.result(120).kind for handle in handles] == ["done"] * 5
     spans = [tuple(map(float, path.read_text().split())) for path in tmp_path.iterdir()]
     assert len(spans) == 5
-    assert max(sum(start <= moment < end for start, end in spans) for moment, _ in spans) == 2
+    assert max(sum(start <= moment < end for start, end in spans) for moment, _ in spans) <= 2
 
 
 @pytest.mark.parametrize("large", [Resources(64), Resources(1, 1 << 40), Resources(1, 0, 1)])

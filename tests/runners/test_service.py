@@ -153,7 +153,7 @@ def test_a_service_is_killed_at_any_moment(service, moment):
 @pytest.mark.parametrize("runner", ["local", "ray"])
 def test_the_limits_of_jobs(settings_of, tmp_path, runner):
     with ServiceProcess(tmp_path / "a", **{**settings_of[runner], "KISSGS_JOB_MEMORY": "256MiB"}) as service:
-        problem = service.ended(service.submit(scene_bytes(120_000, 3), json.dumps({"preset": "balanced"})))["problem"]
+        problem = service.ended(service.submit(scene_bytes(200_000, 3), json.dumps({"preset": "balanced"})))["problem"]
         assert problem["code"] == "memory-limit"
         assert "fewer Gaussians" in problem["detail"]
     with ServiceProcess(tmp_path / "b", **{**settings_of[runner], "KISSGS_JOB_SECONDS": 1.5}) as service:

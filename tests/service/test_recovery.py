@@ -5,10 +5,12 @@ import json
 import shutil
 
 import pytest
-from helpers.data_folders import add_a_job, listing, opened, service
+from helpers.data_folders import add_a_job, database, listing, opened, service
 
+import kissgs
 from service.core.models import State
 from service.core.settings import SettingsError
+from service.jobs.status import Queue, job_status
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 
@@ -41,6 +43,20 @@ def two_jobs(tmp_path):
         first, second = add_a_job(context), add_a_job(context)
         context.store.claim()
     return tmp_path / "data", second, first
+
+
+def test_options_that_an_older_version_accepted_are_kept(tmp_path):
+    """Regression: a job whose values belong to the preset now had no status, and could not start."""
+    options = {"preset": "fast", "encode": {"seed": 3, "sh_step": 1.0}, "compact": {"seed": 0}}
+    with service(tmp_path / "data") as context:
+        job_id = add_a_job(context)
+    database(tmp_path / "data", f"UPDATE jobs SET options = '{json.dumps(options)}'")
+    with service(tmp_path / "data") as context:
+        job = context.store.get(job_id)
+        found = job_status(job, Queue(context.store, 1)).options
+        task = context.worker._task(job, str(context.storage.upload(job_id)), tmp_path)
+    for settings in (found, kissgs.Settings.model_validate(task["settings"])):
+        assert (settings.encode.seed, settings.encode.sh_step, settings.compact.seed) == (3, 1.0, 0)
 
 
 # A database that is older than the folder ----------------------------------------------------------------------------

@@ -86,7 +86,7 @@ def _copy_gradient(v_image: np.ndarray, x0: int, y0: int, s: np.ndarray) -> None
         s[1536 + p] = v_image[y, x, 2] if inside else np.float32(0)
 
 
-@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 def _begin_tile(frame: Blended, v_alpha: np.ndarray, x0: int, y0: int, s: np.ndarray) -> None:
     """Write T, the gradient by alpha, and the product of the background and its gradient of a tile's pixels."""
     height, width = v_alpha.shape

@@ -149,7 +149,7 @@ def blend(records: np.ndarray, lists: TileLists, first: int, last: int, out: Ble
         _store_tile(s, tile, x0, y0, out)
 
 
-@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 def _store_tile(s: np.ndarray, tile: int, x0: int, y0: int, out: Blended) -> None:
     """Write the pixels of a tile over the background."""
     background, (height, width) = out.background, out.transmittance.shape
