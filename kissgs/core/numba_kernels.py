@@ -7,6 +7,7 @@ it from numba's per-user cache. Constants are literals inside the functions, as 
 from __future__ import annotations
 
 import contextlib
+import pickle
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar, cast
@@ -19,6 +20,9 @@ Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 kernels: list[Any] = []
 """All kernels of the modules that are imported; the method ``load`` of each compiles it without a call."""
+
+UNREADABLE = (ImportError, AttributeError, EOFError, pickle.UnpicklingError)
+"""Errors by which numba fails to read its cache of a kernel."""
 
 _compiling = threading.RLock()
 _uncached: list[str] = []
@@ -50,7 +54,11 @@ def _defer(kernel: Any, signature: str | Signature) -> None:  # noqa: ANN401
         with _compiling:
             if not kernel.signatures:
                 _load_called(kernel)
-                kernel.compile(signature)
+                try:
+                    kernel.compile(signature)
+                except UNREADABLE:  # another version's cache may name modules that are gone
+                    kernel._cache.flush()
+                    kernel.compile(signature)
                 kernel.disable_compile()
             return next(iter(kernel.overloads.values()))
 

@@ -1,8 +1,11 @@
 """Kernels are compiled on import or loaded from the cache, and never again while a command works."""
 
 import os
+import pickle
 import subprocess
 import sys
+
+import numba
 
 PROGRAM = """
 import importlib, pkgutil, sys, tempfile
@@ -64,3 +67,9 @@ def test_results_do_not_depend_on_whether_kernels_come_from_the_cache(tmp_path):
     assert list(tmp_path.rglob("*.nbi"))
     assert len(first) > 64
     assert first == second
+    for index in tmp_path.rglob("*.nbi"):  # as left by a version with a module of another name
+        version = index.read_bytes()[: len(pickle.dumps(numba.__version__, protocol=-1))]
+        assert pickle.loads(version) == numba.__version__
+        index.write_bytes(version + b"cgone\nname\n.")
+    done = subprocess.run(command, capture_output=True, check=False, env=environment)
+    assert done.stdout == first, done.stderr.decode()[-2000:]

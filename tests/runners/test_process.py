@@ -39,7 +39,7 @@ def test_what_a_crash_is_attributed_to(status, used, output, expected):
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the memory of a process")
 @pytest.mark.parametrize("left", [2, 14, 30, 60])
 def test_libraries_that_lack_memory_end_the_work(left):
-    """That of scipy, which numba loads, waited forever."""
+    """OpenBLAS of scipy, which numba loads, waited forever."""
     work = item("load_kernels", left=left * MB, memory_limit=400 * MB, seconds=30)
     *_, outcome = ItemProcess(work).events()
     assert outcome.kind == "done" or outcome.code == "memory-limit"
