@@ -165,6 +165,14 @@ def test_the_result_does_not_depend_on_threads():
     ]
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 7])
+@pytest.mark.quick(2)
+def test_scenes_of_few_gaussians(count):
+    few = SCENE.select(range(count))
+    found = kissgs.compress(few, settings=settings(target_size="9kB"))
+    assert len(kissgs.decompress(found.files)) <= count
+
+
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.quick(1)
 def test_a_stopped_search_returns_its_best(count):
