@@ -53,17 +53,14 @@ def run() -> None:
         case "settings":
             _list_settings()
         case _:
-            _run(_settings())
+            _run()
 
 
-def _settings() -> ServiceSettings:
+def _run() -> None:
     try:
-        return ServiceSettings.from_environment()
+        settings = ServiceSettings.from_environment()
     except SettingsError as error:
         _fail(error)
-
-
-def _run(settings: ServiceSettings) -> None:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s %(message)s", stream=sys.stderr)
     from .http.app import create_app
     from .http.server import Server, allow_connections, listen

@@ -56,6 +56,15 @@ for name in CHECKED:  # a module that has moved must stay checked
 install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "helpers.shape_checks.typechecker")
 
 
+@pytest.fixture(autouse=True)
+def fewer_virtual_cameras(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let tests of formats choose virtual cameras from fewer, which take most of the time of encoding a small scene."""
+    if request.path.parent.name in ("io", "sog", "sogxt", "extremes", "finetuning"):
+        from helpers.fewer_cameras import try_fewer  # after the hook
+
+        try_fewer(monkeypatch)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Return the folder of real scenes beside this repository, which their licences keep out of it."""

@@ -12,7 +12,7 @@ from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.formats import FORMATS
 from kissgs.io.files import refuse_more_than
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Facts, ReadOptions
-from kissgs.pipeline.scene_files import read_scene, reading_notes, recognise, scene_root, stored_bytes
+from kissgs.pipeline.scene_files import read_scene, reading_notes, recognise, refuse_level, scene_root, stored_bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +76,7 @@ def describe(path: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS) -> Info:
     No image of a container is decoded, except SOG-XT's mask if the metadata does not state the number of Gaussians.
     """
     kind = recognise(path)
+    refuse_level(kind, reading.level)
     facts = FORMATS[kind].codec.info(scene_root(path), reading.level)
     if FORMATS[kind].is_container:
         refuse_more_than(reading.max_gaussians, facts.count, str(path))  # no default: no image is decoded

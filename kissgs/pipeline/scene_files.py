@@ -9,7 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal
 
-from kissgs.core.errors import InvalidContainerError, OutputError
+from kissgs.core.errors import InvalidContainerError, OutputError, UnsupportedError
 from kissgs.core.origin import WORLD, centred, in_world, origin_for, relative_to, world_positions
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Cleaned, Splats, clean
@@ -329,7 +329,14 @@ def _read(
     root = scene_root(source) if isinstance(source, Path) else source
     if only_containers and found == "ply":
         found = "sogxt"  # whose reader says what is wrong
+    refuse_level(found, reading.level)
     return FORMATS[found].codec.read(root, reading, threads, progress)
+
+
+def refuse_level(kind: str, level: int) -> None:
+    """Refuse a level of detail, but for the finest, of a format that has none."""
+    if level and not FORMATS[kind].manifest:
+        raise UnsupportedError(f"there is no level {level}: this scene has no levels of detail, so leave the level out")
 
 
 def reading_notes(splats: Splats) -> list[str]:

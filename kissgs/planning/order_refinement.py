@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from kissgs.core.array_types import Int, Int32, UInt8, UInt16
+from kissgs.core.array_types import Int32, Integer, UInt8, UInt16
 from kissgs.core.progress import Progress
 from kissgs.core.resources import Workers
 from kissgs.planning.encoding_plan import EncodingPlan
@@ -70,7 +70,7 @@ def refine_order(
 def refined_order(
     means: UInt16[np.ndarray, "M 3"],
     colors: UInt8[np.ndarray, "M 3"],
-    runs: Int[np.ndarray, " M"],
+    runs: Integer[np.ndarray, " M"],
     pool: Workers,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Int32[np.ndarray, " M"]:

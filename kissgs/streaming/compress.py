@@ -21,7 +21,7 @@ from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, na
 from kissgs.io.files import atomic_file, reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, stored_bytes
+from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_level, stored_bytes
 from kissgs.runners import Runner
 from kissgs.settings import Settings
 from kissgs.streaming import build
@@ -236,6 +236,7 @@ def _check_settings(settings: Settings) -> None:
 def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, int, int]:
     """Return a function that reads the scene in blocks, the number of its Gaussians, and their SH degree."""
     if recognise(source) == "ply":
+        refuse_level("ply", reading.level)
         info = read_ply_info(source)
         if not info.compressed:
             origin = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 import os
 import re
 from collections.abc import Iterable
@@ -145,11 +144,6 @@ class ServiceSettings(BaseSettings):
             if not re.fullmatch(r"\*|https?://[^/\s]+", origin):
                 raise ValueError(f"{origin!r} is not an origin such as https://example.org")
         return value
-
-    @property
-    def max_uploads_of_one(self) -> int:
-        """Maximum number of simultaneous uploads of one key's owner, or without keys of one address."""
-        return math.ceil(self.max_uploads / 4)
 
     @property
     def is_private(self) -> bool:

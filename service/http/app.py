@@ -124,7 +124,7 @@ def build(settings: ServiceSettings) -> ServiceContainer:
         runners = JobRunners.open(settings)
         opened.pop_all()  # the service closes them
     storage.remove_unfinished(store.ids())
-    clock.start_after(store.latest_time())
+    clock.start_after(store.meta_value("time") or 0.0)
     storage.keep_reserve()
     notifier, metrics = JobNotifier(), Metrics()
     metrics.queue_limit.set(settings.max_queue)
@@ -200,11 +200,8 @@ def _allowed(path: str) -> str:
 
 
 def _describe(app: FastAPI, *, keys_required: bool) -> None:
-    """Complete the OpenAPI document of ``app``.
-
-    Adds the schemas of errors and of form fields, removes unused schemas, links responses that create a job to the
-    operations on it, and makes authorization optional unless keys are required.
-    """
+    """Complete the OpenAPI document: schemas of errors and of form fields, links to the operations on a new job, and
+    authorization, which is optional unless keys are required."""
     app.description = DESCRIPTION
     made = app.openapi
 

@@ -22,7 +22,7 @@ from ..core.schemas import JobOptions
 from ..jobs.container import ServiceContainer
 from ..jobs.worker import QUEUE
 from ..storage.job_records import LimitExceeded
-from .uploads import PartBegin, PartData, Received, Spool, parts, scene_name, timed
+from .uploads import PartBegin, Received, Spool, parts, scene_name, timed
 
 RAW_TYPES = ("", "application/octet-stream", "application/ply", "application/x-ply", "model/ply")
 FORM_TYPE = "multipart/form-data"
@@ -54,16 +54,11 @@ class Submission:
 
 async def submit(
     context: ServiceContainer, request: Request, owner: str, *, options: str | None, name: str | None, key: str | None
-) -> tuple[Job, bool]:
-    """Receive a scene and queue a job for it.
-
-    Returns:
-        The job, and whether it is new. A repeated idempotency key with an identical scene and options gives the
-        existing job.
-    """
+) -> Job:
+    """Receive a scene and queue a job for it; a repeated key with an identical scene and options gives its job."""
     if context.worker.draining:
         raise ProblemError("stopping", "the service is stopping; try again in a minute", retry_after=60)
-    if health_problem := await run_sync(context.store.health_problem):
+    if health_problem := await run_sync(context.store.monitor.health_problem):
         log.error("a submission was refused: the job database cannot be used: %s", health_problem)
         raise unusable_database()
     known = await run_sync(context.store.by_idempotency_key, owner, key) if key is not None else None
@@ -74,20 +69,15 @@ async def submit(
         path = context.storage.new_upload()
         kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         _check_headers(request, kind)
-        spool = Spool(
-            context.settings,
-            context.admission,
-            path,
-            at_most=_scene_bytes(request, kind, context.settings.max_upload_bytes),
-        )
-        spool.name = name or ""
-        async with spool:
+        at_most = _scene_bytes(request, kind, context.settings.max_upload_bytes)
+        async with Spool(context.settings, context.admission, path, at_most) as spool:
+            spool.name = name or ""
             if kind == FORM_TYPE:
-                submission = await _receive_form(context, request, spool, parsed, name, key)
+                parsed, name = await _receive_form(context, request, spool, parsed, name)
             else:
-                received = await _receive_raw(context, request, spool)
-                chosen = parsed or JobOptions().decided(photographs=None, torch=can_train())
-                submission = Submission(received, chosen, scene_name(name), key)
+                async for chunk in _body(context, request):
+                    await spool.write(chunk)
+            submission = Submission(await spool.finish(), parsed or parse_options("{}"), scene_name(name), key)
             try:
                 job, new = await run_sync(_queue, context, submission, owner)
             finally:
@@ -98,7 +88,7 @@ async def submit(
         context.notifier.notify(QUEUE)
         asked = request.state.request_id
         log.info("job %s submitted by %s: %d bytes (request %s)", job.id, owner or "anyone", job.upload_bytes, asked)
-    return job, new
+    return job
 
 
 def parse_options(text: str | bytes) -> JobOptions:
@@ -152,16 +142,14 @@ def _scene_bytes(request: Request, kind: str, limit: int) -> int | None:
     return limit if kind == FORM_TYPE and limit < length <= limit + MAX_FORM_BYTES else length
 
 
-async def _receive_raw(context: ServiceContainer, request: Request, spool: Spool) -> Received:
-    async for chunk in timed(request, context.settings, context.notifier.subscribe(STOPPING)):
-        await spool.write(chunk)
-    return await spool.finish()
+def _body(context: ServiceContainer, request: Request) -> AsyncIterator[bytes]:
+    return timed(request, context.settings, context.notifier.subscribe(STOPPING))
 
 
 async def _form_bytes(context: ServiceContainer, request: Request, spool: Spool) -> AsyncIterator[bytes]:
     """Yield the body of a form; raise an error if it exceeds the limit for bytes other than the scene."""
     received = 0
-    async for chunk in timed(request, context.settings, context.notifier.subscribe(STOPPING)):
+    async for chunk in _body(context, request):
         yield chunk
         received += len(chunk)
         if received - spool.size > MAX_FORM_BYTES + len(chunk):
@@ -171,14 +159,9 @@ async def _form_bytes(context: ServiceContainer, request: Request, spool: Spool)
 
 
 async def _receive_form(
-    context: ServiceContainer,
-    request: Request,
-    spool: Spool,
-    options: JobOptions | None,
-    name: str | None,
-    key: str | None,
-) -> Submission:
-    """Receive a form with the fields ``file`` and ``options``, in any order."""
+    context: ServiceContainer, request: Request, spool: Spool, options: JobOptions | None, name: str | None
+) -> tuple[JobOptions | None, str | None]:
+    """Receive a form with the fields ``file`` and ``options``, in any order; return the options and the name."""
     seen: list[str] = []
     text = bytearray()
     async for event in parts(request.headers["content-type"], _form_bytes(context, request, spool)):
@@ -191,19 +174,17 @@ async def _receive_form(
                 seen.append(field)
                 name = name or filename if field == "file" else name
                 spool.name = filename or name or "" if field == "file" else spool.name
-            case PartData(data) if seen[-1] == "file":
-                await spool.write(data)
-            case PartData(data):
-                text += data
+            case bytes() if seen[-1] == "file":
+                await spool.write(event)
+            case bytes():
+                text += event
                 if len(text) > MAX_OPTIONS_BYTES:
                     raise invalid(f"the options exceed {MAX_OPTIONS_BYTES} bytes, which is the limit; send less")
     if "file" not in seen:
         raise invalid("the form has no field 'file'; send the scene in it")
     if "options" in seen and options is not None:
         raise invalid("the options are both in the form and in the URL; send them once")
-    if "options" in seen:
-        options = parse_options(bytes(text))
-    return Submission(await spool.finish(), options or JobOptions(), scene_name(name), key)
+    return parse_options(bytes(text)) if "options" in seen else options, name
 
 
 def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tuple[Job, bool]:
@@ -222,15 +203,11 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
         sh_degree=received.info.sh_degree,
         upload_bytes=received.size,
         disk_bytes=received.size,
-        work_bytes=(
-            checkpoint_bytes(
-                received.info.count,
-                received.info.sh_degree,
-                compact=options.retrains,
-                finetune=bool(options.finetune.enabled),
-            )
-            if options.resumable
-            else 0
+        work_bytes=checkpoint_bytes(
+            received.info.count,
+            received.info.sh_degree,
+            compact=options.resumable and options.retrains,
+            finetune=options.resumable and bool(options.finetune.enabled),
         ),
         upload_sha256=received.sha256,
         fingerprint=submission.fingerprint,

@@ -47,18 +47,11 @@ class PartBegin:
     filename: str | None
 
 
-@dataclass(frozen=True, slots=True)
-class PartData:
-    """Next bytes of the current part."""
-
-    data: bytes
-
-
 class _Parser:
     """Collects the events of the library's callbacks."""
 
     def __init__(self, boundary: bytes) -> None:
-        self.found: list[PartBegin | PartData] = []
+        self.found: list[PartBegin | bytes] = []
         self.complete = False
         self._name, self._value, self._size = b"", b"", 0
         self._headers: dict[bytes, bytes] = {}
@@ -75,7 +68,7 @@ class _Parser:
             },
         )
 
-    def feed(self, chunk: bytes) -> list[PartBegin | PartData]:
+    def feed(self, chunk: bytes) -> list[PartBegin | bytes]:
         self.found = []
         self._parser.write(chunk)
         return self.found
@@ -111,7 +104,7 @@ class _Parser:
 
     def _data(self, data: bytes, start: int, end: int) -> None:
         if end > start:
-            self.found.append(PartData(bytes(data[start:end])))
+            self.found.append(bytes(data[start:end]))
 
     def _end(self) -> None:
         self.complete = True
@@ -151,8 +144,8 @@ class _Preamble:
         return self._boundary + self._head[found.end() :]
 
 
-async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterator[PartBegin | PartData]:
-    """Yield the parts of a form in the order in which they arrive."""
+async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterator[PartBegin | bytes]:
+    """Yield the parts of a form as they arrive: the beginning of each, then its bytes."""
     _, options = parse_options_header(content_type)
     boundary = options.get(b"boundary", b"")
     if not 1 <= len(boundary) <= 256:
@@ -219,8 +212,9 @@ class Spool:
         self._settings, self._admission, self._path = settings, admission, path
         self._at_most = at_most
         self.name = ""  # of the file according to the client; set it before the first write
+        self.size = 0  # bytes received so far
         self._pending = bytearray()
-        self._size, self._reserved, self._written = 0, 0, 0
+        self._reserved, self._written = 0, 0
         self._hash = hashlib.sha256()
         self._file: BinaryIO | None = None
         self._checked = self._kept = False
@@ -234,23 +228,18 @@ class Spool:
     async def __aexit__(self, *error: object) -> None:
         await asyncio.shield(asyncio.ensure_future(run_sync(self._leave)))
 
-    @property
-    def size(self) -> int:
-        """Number of bytes received so far."""
-        return self._size
-
     async def write(self, data: bytes) -> None:
         """Process the next bytes, unless the scene is invalid, exceeds a limit, or does not fit on the disk."""
         line = max(self._pending.rfind(b"\n"), 0)  # start of the last line, which may continue
         self._pending += data
-        self._size += len(data)
-        self._refuse_size(self._size)
-        if self._size > self._reserved:
+        self.size += len(data)
+        self._refuse_size(self.size)
+        if self.size > self._reserved:
             coming = STEP_BYTES if self._at_most is None else min(STEP_BYTES, self._at_most - self._reserved)
-            await self._reserve(max(coming, self._size - self._reserved))
-        if not self._checked and (
-            self._size > self._settings.max_header_bytes or LAST_LINE.search(self._pending, line)
-        ):
+            coming = max(coming, self.size - self._reserved)
+            await run_sync(self._admission.reserve, coming)
+            self._reserved += coming
+        if not self._checked and (self.size > self._settings.max_header_bytes or LAST_LINE.search(self._pending, line)):
             self._check_header()
         if len(self._pending) >= BLOCK_BYTES:
             await run_sync(self._flush)
@@ -260,9 +249,9 @@ class Spool:
         await run_sync(self._close)
         async with self._admission.parsing:
             info = await run_sync(self._read_info)
-        refuse_count(info.count, self._size, self._settings.max_gaussians)
+        refuse_count(info.count, self.size, self._settings.max_gaussians)
         self._kept = True
-        return Received(self._path, self._size, self._hash.hexdigest(), info)
+        return Received(self._path, self.size, self._hash.hexdigest(), info)
 
     def _close(self) -> None:
         self._flush()
@@ -278,10 +267,6 @@ class Spool:
         if not self._kept:
             self._path.unlink(missing_ok=True)
         self._admission.release(self._reserved, self._written)
-
-    async def _reserve(self, size: int) -> None:
-        await run_sync(self._admission.reserve, size)
-        self._reserved += size
 
     def _flush(self) -> None:
         with self._writing() as file:
@@ -331,10 +316,10 @@ class Spool:
         if kissgs.recognise(start, name=name, size=whole) != "ply":
             return
         try:
-            info = kissgs.read_ply_info(head[:limit], size=max(whole, self._size))
+            info = kissgs.read_ply_info(head[:limit], size=max(whole, self.size))
         except kissgs.KissgsError as error:
             raise self._named(error) from error
-        refuse_count(info.count, max(whole, self._size), self._settings.max_gaussians)
+        refuse_count(info.count, max(whole, self.size), self._settings.max_gaussians)
 
     def _refuse_size(self, size: int) -> None:
         if size > self._settings.max_upload_bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -65,7 +66,7 @@ class Admission:
         """Count an upload of a client, the owner of a key or an address, while it is received."""
         if self.uploads >= self.settings.max_uploads:
             self._refuse_upload(f"{self.uploads} uploads are in progress")
-        if self._uploads[client] >= self.settings.max_uploads_of_one:
+        if self._uploads[client] >= math.ceil(self.settings.max_uploads / 4):
             which = "this key" if self.settings.keys else "this address"
             self._refuse_upload(f"{self._uploads[client]} uploads of {which} are in progress")
         self._uploads[client] += 1
@@ -91,10 +92,10 @@ class Admission:
             if not self._fits(size) and not self._fits(size, self.store.reclaimable_bytes()):
                 raise self._full(size)
             while not self._fits(size):
-                oldest = self.store.reclaimable(1)
-                if not oldest:
+                oldest = self.store.oldest_reclaimable()
+                if oldest is None:
                     raise self._full(size)
-                self._reclaim(*oldest[0])
+                self._reclaim(oldest)
             self._reserved += size
 
     def wrote(self, size: int) -> None:
@@ -108,11 +109,12 @@ class Admission:
             self._reserved -= size
             self._written -= written
 
-    def _reclaim(self, number: int, job_id: str) -> None:
+    def _reclaim(self, job: Job) -> None:
         """Remove the upload of an ended job, and its decoded scene, which can be decoded again."""
-        self.store.check()
-        self.storage.reclaim(job_id)
-        self.store.update(number, upload_kept=False, reclaimable_bytes=0, disk_bytes=self.storage.job_bytes(job_id))
+        self.store.monitor.check_files()
+        self.storage.reclaim(job.id)
+        left = self.storage.job_bytes(job.id)
+        self.store.update(job.number, upload_kept=False, reclaimable_bytes=0, disk_bytes=left)
 
     def _fits(self, size: int, reclaimable: int = 0) -> bool:
         taken = self.store.disk_bytes() + self._reserved - reclaimable

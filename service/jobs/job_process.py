@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 Task = dict[str, Any]
 
+REPORTED = ("count", "finetuning", "note", "invisible", "cleaned", "seconds", "cpu_seconds")
+"""Entries of the library's report that the summary repeats."""
+
 
 def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     """Compress the scene ``source`` into the folder ``result`` of ``work``, and return its summary."""
@@ -42,15 +45,8 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
         "report": _size_and_hash(folder / "report.json"),
         "files": files,
         "source_format": kissgs.recognise(Path(task["source"])),
-        "count": report["count"],
         "compacted": result.report.compacted,
-        "finetuning": report["finetuning"],
-        "note": report["note"],
-        "invisible": report["invisible"],
-        "cleaned": report["cleaned"],
-        "seconds": report["seconds"],
-        "cpu_seconds": report["cpu_seconds"],
-        "peak_memory": report["peak_memory"],
+        **{name: report[name] for name in REPORTED},
     }
     if report["evaluation"] is not None:
         evaluation = report["evaluation"]

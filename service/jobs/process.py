@@ -121,18 +121,13 @@ class JobProcess:
         self._runner = job_runners
         self._handle: RunHandle | None = None
         self._used = job_runners.local
-        self._killed = False
+        self.killed = False
         self.work: Path | None = None
-        self.ended = asyncio.Event()
-
-    @property
-    def killed(self) -> bool:
-        """Whether :meth:`kill` was called."""
-        return self._killed
+        self.ended = asyncio.Event()  # set by the worker
 
     def kill(self) -> None:
         """Kill the process now, or as soon as it has started."""
-        self._killed = True
+        self.killed = True
         self._end()
 
     def _end(self) -> None:
@@ -140,16 +135,11 @@ class JobProcess:
             self._used.cancel(self._handle.id)
 
     async def run(self, task: dict[str, Any], on_progress: OnProgress) -> Outcome:
-        """Run a task (see :mod:`service.jobs.job_process`) and return its outcome.
-
-        If the caller is cancelled, the process is killed.
-        """
-        if self._killed:
-            self.ended.set()
+        """Run a task (see :mod:`service.jobs.job_process`); if the caller is cancelled, the process is killed."""
+        if self.killed:
             return Outcome("cancelled")
         item, self._used = self._runner.item(task), self._runner.runner_of(task)
         if item.resources.gpus and self._used.refusal(item.resources):
-            self.ended.set()
             return self._refused(item.resources)
         loop, events = asyncio.get_running_loop(), asyncio.Queue[tuple[str, float, str] | None]()
 
@@ -165,7 +155,6 @@ class JobProcess:
         finally:
             self._end()
             await asyncio.wait([outcome])
-            self.ended.set()
         return self._outcome(outcome.result(), task)
 
     def _refused(self, resources: Resources) -> Outcome:

@@ -9,7 +9,6 @@ import logging
 
 from ..core.files import container_file
 from ..core.models import Job, State
-from ..storage.job_files import JobStorage
 from .container import ServiceContainer
 
 log = logging.getLogger("kissgs.service")
@@ -22,7 +21,10 @@ def recover(context: ServiceContainer) -> None:
         _recover_job(context, job)
     known, failed = store.ids(), store.ids(State.FAILED)
     for job_id in sorted(storage.job_ids() & (known - store.ids(State.QUEUED, State.RUNNING, State.SUCCEEDED))):
-        _finish_removal(storage, job_id, failed=job_id in failed)
+        if job_id in failed and storage.result(job_id).exists():
+            storage.set_aside(job_id, "holds a result, although the job failed according to the database,")
+        else:
+            storage.remove_job(job_id)
     storage.set_aside_unknown(store.ids())
 
 
@@ -43,11 +45,3 @@ def _recover_job(context: ServiceContainer, job: Job) -> None:
         completion.fail(job, "crashed", detail)
     elif job.state == State.RUNNING:
         store.move(job.number, State.QUEUED)
-
-
-def _finish_removal(storage: JobStorage, job_id: str, *, failed: bool) -> None:
-    """Remove the files of an ended job; move them to the orphaned folder if a failed job has a result."""
-    if failed and storage.result(job_id).exists():
-        storage.set_aside(job_id, "holds a result, although the job failed according to the database,")
-    else:
-        storage.remove_job(job_id)

@@ -64,7 +64,7 @@ class JobCompletion:
 
         ``job`` is as it was started, ``work`` the folder of this start, if it has got one.
         """
-        self.store.check()  # else files would change without a record in the database
+        self.store.monitor.check_files()  # else files would change without a record in the database
         self.storage.check()
         current = self.store.get(job.id)
         if current is None or current.state not in ACTIVE:  # cancelled or deleted meanwhile, or recorded already

@@ -203,9 +203,7 @@ class NewDatabaseError(SettingsError):
 def connect(file: Path, *, create: bool = True) -> tuple[sa.Engine, Sessions, Sessions]:
     """Open the database, check that it is intact, and ``create`` it and its tables if there are none.
 
-    Returns:
-        The engine; sessions for writing, each with exclusive access from its first statement; and sessions for reading,
-        which wait for no lock.
+    Return the engine, sessions for writing, each with exclusive access, and sessions for reading, which wait for none.
     """
     opened: list[Any] = []
     first = _engine(file, START_SECONDS, opened)

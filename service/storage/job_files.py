@@ -283,11 +283,6 @@ class JobStorage:
                 "folders of jobs that the database does not know were moved to %s: %d", self.orphaned, len(unknown)
             )
 
-    def orphaned_note(self) -> str | None:
-        """Return a sentence about the entries of the orphaned folder; None if it is empty."""
-        count = self.count_orphaned()
-        return f"folders without a job in jobs/{ORPHANED} of the data folder: {count}" if count else None
-
     def count_orphaned(self) -> int:
         """Return the number of entries of the orphaned folder."""
         try:

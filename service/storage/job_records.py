@@ -44,7 +44,7 @@ class Store:
 
     def __init__(self, file: Path, clock: Callable[[], float], *, create: bool = True) -> None:
         self._engine, self._writing, self._reading = connect(file, create=create)
-        self._monitor = DatabaseMonitor(file, self.meta_value(IDENTITY))
+        self.monitor = DatabaseMonitor(file, self.meta_value(IDENTITY))
         self.clock = clock
         self.turns: dict[str, int] = {}  # by owner, the number of the last start of one of its jobs, counted from 1
         self.changes = 0  # of the queue so far
@@ -52,22 +52,14 @@ class Store:
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()
-        self._monitor.close()
+        self.monitor.close()
 
     def abandon(self) -> None:
         """Close without changing the database's files."""
-        self._monitor.abandon()
+        self.monitor.abandon()
         self._engine.dispose()
 
     # The database itself -------------------------------------------------------------------------------------------
-
-    def check(self) -> None:
-        """Check that the database's files are those that were opened; takes microseconds."""
-        self._monitor.check_files()
-
-    def health_problem(self) -> str | None:
-        """Check the database; return the problem, None if there is none."""
-        return self._monitor.health_problem()
 
     def meta_value(self, name: str) -> float | None:
         """Return a row of ``meta``, such as ``identity`` or ``time``; None if it does not exist."""
@@ -78,11 +70,11 @@ class Store:
     @contextlib.contextmanager
     def _write(self) -> Iterator[Session]:
         """Begin a transaction; raise an error if the database is removed or replaced before it ends."""
-        self.check()
+        self.monitor.check_files()
         with self._writing.begin() as session:
-            self._monitor.check_identity(session)
+            self.monitor.check_identity(session)
             yield session
-        self.check()
+        self.monitor.check_files()
 
     # Reading ----------------------------------------------------------------------------------------------------------
 
@@ -141,39 +133,39 @@ class Store:
     def disk_bytes(self) -> int:
         """Return the disk space of all jobs, bytes."""
         with self._reading() as session:
-            return int(session.scalar(sa.select(sa.func.coalesce(sa.func.sum(Job.disk_bytes), 0))) or 0)
+            return session.scalar(sa.select(sa.func.sum(Job.disk_bytes))) or 0
 
-    def rates(self, preset: str, evaluate: bool, limit: int = 21) -> list[float]:
-        """Return seconds per Gaussian of up to ``limit`` recent jobs of a preset, with or without evaluation."""
+    def rates(self, preset: str, evaluate: bool) -> list[float]:
+        """Return seconds per Gaussian of up to 21 recent jobs of a preset, with or without evaluation."""
         kind = Job.preset == preset, Job.evaluate == evaluate, Job.state == State.SUCCEEDED
         query = sa.select(Job.finished_at - Job.started_at, Job.gaussians).where(*kind)
         with self._reading() as session:
-            latest = session.execute(query.order_by(Job.number.desc()).limit(5 * limit)).all()
+            latest = session.execute(query.order_by(Job.number.desc()).limit(5 * 21)).all()
         # In jobs with small scenes, the start of the process dominates.
-        return [spent / count for spent, count in latest if spent and count >= 10_000][:limit]
+        return [spent / count for spent, count in latest if spent and count >= 10_000][:21]
 
     def ids(self, *states: State) -> set[str]:
         """Return the ids of all jobs in ``states``, by default of all jobs."""
         with self._reading() as session:
             return set(session.scalars(sa.select(Job.id).where(Job.state.in_(states or tuple(State)))))
 
-    def due(self, states: Iterable[State], before: float, limit: int = 200) -> list[tuple[int, str]]:
-        """Return number and id of up to ``limit`` jobs in ``states`` that expire before a time."""
+    def due(self, states: Iterable[State], before: float) -> list[tuple[int, str]]:
+        """Return number and id of up to 200 jobs in ``states`` that expire before a time."""
         query = sa.select(Job.number, Job.id).where(Job.state.in_(tuple(states)), Job.expires_at < before)
         with self._reading() as session:
-            return [(number, job_id) for number, job_id in session.execute(query.limit(limit))]
+            return [(number, job_id) for number, job_id in session.execute(query.limit(200))]
 
-    def reclaimable(self, limit: int = 50) -> list[tuple[int, str]]:
-        """Return number and id of up to ``limit`` ended jobs with reclaimable files, oldest first."""
-        query = sa.select(Job.number, Job.id).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
+    def oldest_reclaimable(self) -> Job | None:
+        """Return the oldest ended job with reclaimable files; None if there is none."""
+        query = sa.select(Job).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED)).order_by(Job.number).limit(1)
         with self._reading() as session:
-            return [(number, job_id) for number, job_id in session.execute(query.order_by(Job.number).limit(limit))]
+            return session.scalar(query)
 
     def reclaimable_bytes(self) -> int:
         """Return the bytes of all reclaimable files of ended jobs."""
-        query = sa.select(sa.func.coalesce(sa.func.sum(Job.reclaimable_bytes), 0)).where(Job.reclaimable_bytes > 0)
+        query = sa.select(sa.func.sum(Job.reclaimable_bytes)).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
         with self._reading() as session:
-            return int(session.scalar(query.where(Job.state.in_(ENDED))) or 0)
+            return session.scalar(query) or 0
 
     # Jobs ----------------------------------------------------------------------------------------------------------
 
@@ -258,10 +250,6 @@ class Store:
             session.execute(sa.delete(Job).where(Job.number == number))
 
     # The clock -----------------------------------------------------------------------------------------------------
-
-    def latest_time(self) -> float:
-        """Return the time of the last :meth:`heartbeat`; 0 if there was none."""
-        return self.meta_value("time") or 0.0
 
     def heartbeat(self) -> None:
         """Store the current time, with which the clock of the next start begins; it checks that it can be written."""

@@ -26,10 +26,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_compress_and_decompress(scene: Path, tmp_path: Path) -> None:
-    assert run("compress", scene, "-o", tmp_path / "a.zip").returncode == 0
-    assert run("decompress", tmp_path / "a.zip", "-o", tmp_path / "b.ply").returncode == 0
-    assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(scene).to_zip()
-    assert len(kissgs.load(tmp_path / "b.ply")) == len(kissgs.decompress(tmp_path / "a.zip"))
+    """Regression: square brackets in names were parsed as rich markup."""
+    done = run("compress", scene, "-o", tmp_path / "[red]a.zip")
+    assert done.returncode == 0
+    assert "[red]a.zip" in done.stdout.decode()
+    assert run("decompress", tmp_path / "[red]a.zip", "-o", tmp_path / "b.ply").returncode == 0
+    assert (tmp_path / "[red]a.zip").read_bytes() == kissgs.compress(scene).to_zip()
+    assert len(kissgs.load(tmp_path / "b.ply")) == len(kissgs.decompress(tmp_path / "[red]a.zip"))
+    assert run("sample", tmp_path / "s.ply", "--gaussians", 500).returncode == 0
+    assert len(kissgs.load(tmp_path / "s.ply")) == 500
 
 
 def test_default_outputs_are_next_to_the_input(scene: Path, tmp_path: Path) -> None:
@@ -49,12 +54,16 @@ def test_pipes(scene: Path) -> None:
 
 
 def test_several_files_and_patterns(scene: Path, tmp_path: Path) -> None:
-    for name in ("one.ply", "two.ply"):
+    """One bad file does not stop the others."""
+    for name in ("a.ply", "c.ply"):
         (tmp_path / name).write_bytes(scene.read_bytes())
+    (tmp_path / "b.ply").write_text("not a scene")
     done = run("compress", tmp_path / "*.ply", "-o", f"{tmp_path}/out/", "--json", "-p", "fast")
-    reports = json.loads(done.stdout)
-    assert [Path(report["output"]).name for report in reports] == ["one.zip", "two.zip"]
-    assert all(Path(report["output"]).stat().st_size == report["container_bytes"] for report in reports)
+    assert done.returncode == 2
+    first, second, third = json.loads(done.stdout)
+    assert second["error"]["code"] == "invalid-scene"
+    assert [Path(report["output"]).name for report in (first, third)] == ["a.zip", "c.zip"]
+    assert all(Path(report["output"]).stat().st_size == report["container_bytes"] for report in (first, third))
     assert "cannot all become" in failure("compress", tmp_path / "*.ply", "-o", tmp_path / "x.zip")
     assert "no file matches" in failure("compress", tmp_path / "*.nothing")
 
@@ -122,6 +131,7 @@ def test_errors_are_one_line(scene: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.zip").write_bytes(b"PK\x03\x04 but no more")
     failure("decompress", tmp_path / "bad.zip", "-o", tmp_path / "a.ply")
     failure("info", tmp_path / "none.zip")
+    assert json.loads(run("info", tmp_path / "none.ply", "--json").stdout)["error"]["code"] == "invalid-scene"
     assert "no folder" in failure("compress", scene, "-o", tmp_path / "missing" / "a.zip")
     assert "both write" in failure("compress", scene, "-o", "-", "--json")
     assert "give the output with -o" in failure("compress", "-", stdin=b"")
@@ -153,18 +163,6 @@ def test_errors_are_one_line(scene: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.zip", "text.ply"]
 
 
-def test_one_bad_file_of_several_does_not_stop_the_others(scene: Path, tmp_path: Path) -> None:
-    for name in ("a.ply", "c.ply"):
-        (tmp_path / name).write_bytes(scene.read_bytes())
-    (tmp_path / "b.ply").write_text("not a scene")
-    done = run("compress", tmp_path / "*.ply", "-o", f"{tmp_path}/out/", "--json", "-p", "fast")
-    assert done.returncode == 2
-    first, second, third = json.loads(done.stdout)
-    assert second["error"]["code"] == "invalid-scene"
-    assert Path(first["output"]).is_file()
-    assert Path(third["output"]).is_file()
-
-
 def test_a_folder_as_output_means_into_it_for_one_file_as_for_many(scene: Path, tmp_path: Path) -> None:
     assert "there is no folder new; end it in a slash" in failure("decompress", scene, "-o", "new", cwd=tmp_path)
     assert run("compress", scene, "-o", f"{tmp_path}/new/", "-q").returncode == 0
@@ -175,35 +173,29 @@ def test_a_folder_as_output_means_into_it_for_one_file_as_for_many(scene: Path, 
 
 def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     """Regression: compress -o a.spz made a folder a.spz, and wrote a SOG-XT container into it."""
-    for name in ("a.spz", "a.PLY", "a.glb", "a.webp", "a.Yaml"):
+    for name in ("a.spz", "a.Yaml", "x.usdz", "full.ziip", ".zip", "a.zip.", "v1.2", "new", "new/room"):
         assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
-    for name in ("x.usdz", "full.ziip", "k.ssog", "out.xyz", ".zip", "a.zip.", "v1.2"):
+    for name in ("x.usdz", ".zip", "a.zip.", "v1.2"):
         with pytest.raises(kissgs.UnsupportedError, match=rf"{name} is not the name of .* in \.zip or \.sog, or if"):
             kissgs.compress(scene, tmp_path / name)
-        assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
     for name in ("lod_meta.json", "new/meta.json", "LOD-META.JSON"):
         refused = f"{name} is not the name of a container: end it in .zip or .sog; levels of detail, which "
         assert refused in failure("compress", scene, "-o", name, cwd=tmp_path)
         with pytest.raises(kissgs.UnsupportedError, match=f"^{refused}.* are FOLDER/lod-meta"):
             kissgs.compress(scene, name)
-    for name in ("city/lod-meta.json", "city/levels.json", "city.sogxt"):
+    for name in ("city/lod-meta.json", "city.sogxt"):
         with pytest.raises(
             kissgs.UnsupportedError, match=r"end it in \.zip or \.sog; .*kissgs\.compress_streamed write"
         ):
             kissgs.compress(scene, tmp_path / name)
-    with pytest.raises(kissgs.UnsupportedError, match=r"end it in \.zip or \.sog"):
-        kissgs.compress(scene, tmp_path / "a.spz")
     for name, command in (("a.spz", "convert"), ("a.sog", "compress")):
         sentence = f"{name} has the ending of another format than .ply, which this command writes; use kissgs {command}"
         assert sentence in failure("decompress", scene, "-o", name, cwd=tmp_path)
     assert "end it in .ply, or if it is a folder" in failure("decompress", scene, "-o", "meta.json", cwd=tmp_path)
-    assert "a.sog is the name of a file, but --unpacked" in failure(
-        "compress", scene, "-o", "a.sog", "--unpacked", cwd=tmp_path
-    )
+    unpacked = failure("compress", scene, "-o", "a.sog", "--unpacked", cwd=tmp_path)
+    assert "a.sog is the name of a file, but --unpacked" in unpacked
     assert "would become one file" in failure("compress", scene, scene, "-o", "new/", cwd=tmp_path)
-    for name in ("new", "new/room"):
-        assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == []
+    assert list(tmp_path.iterdir()) == []
     (tmp_path / "c.sog").mkdir()
     assert run("compress", scene, "-o", tmp_path / "c.sog", "-p", "fast", "-q", "--unpacked").returncode == 0
 
@@ -276,17 +268,6 @@ def test_a_disk_that_fills_up_leaves_no_file(
     assert sorted(tmp_path.rglob("*")) == [tmp_path / "new"]  # which another command may be about to write into
 
 
-def test_names_are_printed_as_they_are(scene: Path, tmp_path: Path) -> None:
-    """Regression: square brackets were parsed as rich markup."""
-    done = run("compress", scene, "-o", tmp_path / "[red]x.zip", "-p", "fast")
-    assert "[red]x.zip" in done.stdout.decode()
-
-
-def test_json_errors_have_a_code(tmp_path: Path) -> None:
-    done = run("info", tmp_path / "none.ply", "--json")
-    assert json.loads(done.stdout)["error"]["code"] == "invalid-scene"
-
-
 def test_an_interrupt_inside_a_finalizer_is_not_lost() -> None:
     """Python prints and ignores exceptions of finalizers; numba and torch run such callbacks during imports."""
     lines = (
@@ -317,11 +298,6 @@ def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
     assert process.returncode == 130
     assert message.decode().splitlines()[-1].startswith("kissgs: interrupted")
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
-
-
-def test_sample(tmp_path: Path) -> None:
-    assert run("sample", tmp_path / "s.ply", "--gaussians", 500).returncode == 0
-    assert len(kissgs.load(tmp_path / "s.ply")) == 500
 
 
 def test_help_is_fast() -> None:

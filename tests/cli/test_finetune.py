@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
 from pathlib import Path
 
 import pytest
 from helpers.captured_scene import SCENE, write_capture
-from helpers.command_line import KISSGS, failure, run
-from helpers.held_training import HeldTraining
+from helpers.command_line import failure, run
 
 import kissgs
 from kissgs.cli.options import with_default_values
@@ -62,27 +59,6 @@ def test_the_default_number_of_steps_is_that_of_the_preset() -> None:
     assert with_default_values(["--finetune", "auto"]) == ["--finetune", "auto"]
     for preset, steps in (("fast", 200), ("balanced", 1000), ("small", 2000), ("paper", 4000)):
         assert kissgs.Settings.from_preset(preset, finetune={"enabled": True}).finetune.steps == steps
-
-
-@pytest.mark.quick(0)
-def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene, target, kept = tmp_path / "a.ply", tmp_path / "b.zip", tmp_path / "a.checkpoint-finetune.npz"
-    kissgs.save(SCENE, scene)
-    words = ["compress", scene, "-o", target, "--finetune", "6", "--checkpoint", "--quiet", *OPTIONS]
-    training = HeldTraining(tmp_path_factory.mktemp("hold"), saves=4)
-    program = f"{training.program}\nfrom kissgs.cli.main import main; main()"
-    process = subprocess.Popen([KISSGS.with_name("python"), "-c", program, *map(str, words)], stderr=subprocess.PIPE)
-    training.wait()
-    process.send_signal(signal.SIGINT)
-    assert process.communicate()[1] == b"kissgs: interrupted; no partial file is left\n"
-    assert process.returncode == 130
-    assert sorted(path.name for path in tmp_path.iterdir()) == [kept.name, "a.ply"]
-    other = ["compress", scene, "-o", target, "--finetune", "7", "--checkpoint", *OPTIONS]
-    assert "other work" in failure(*other)
-    training.release()
-    assert run(*words).returncode == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "b.zip"]
-    assert target.read_bytes() == kissgs.compress(SCENE, settings=settings(steps=6)).to_zip()
 
 
 @pytest.mark.parametrize(

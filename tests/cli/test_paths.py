@@ -17,9 +17,8 @@ from helpers.command_line import failure
 import kissgs
 from kissgs.cli.main import main
 
-PLACES = [
+PLACES = [  # of paths that go through one function, one
     "compress BAD",
-    "compress BAD -o out.zip",
     "compress BAD other.ply -o out/",
     "compress BAD --cache",
     "compress BAD --checkpoint --compact 20%",
@@ -27,46 +26,29 @@ PLACES = [
     "compress scene.ply -p fast -o BAD.zip",
     "compress scene.ply -p fast -o BAD --unpacked",
     "compress scene.ply -p paper --evaluate -o out.zip --views BAD",
-    "compress scene.ply -p paper -o out.zip --views BAD",
     "decompress BAD",
-    "decompress BAD -o out.ply",
     "decompress BAD.zip -o out.ply",
-    "decompress scene.zip -o BAD",
     "decompress scene.zip -o BAD.ply",
-    "convert BAD out.spz",
     "convert BAD other.ply out --to spz",
-    "convert scene.ply BAD",
     "convert scene.ply BAD.spz",
     "convert scene.ply BAD --to spz",
-    "info BAD",
-    "info BAD.zip",
     "info BAD BAD",
     "evaluate BAD scene.zip",
     "evaluate scene.ply BAD",
-    "evaluate scene.ply scene.zip --views BAD",
     "evaluate scene.ply scene.zip --views capture --images BAD",
     "evaluate scene.ply scene.zip --html BAD",
     "render BAD",
-    "render BAD -o out.png",
-    "render scene.ply -o BAD",
     "render scene.ply -o BAD.png",
     "render scene.ply --views BAD",
-    "render scene.ply --views capture --images BAD",
     "render scene.ply --view BAD.json",
     "render scene.ply --save-camera BAD -o out.png",
-    "compact BAD --ratio 0.5 -o out.ply",
     "compact BAD --ratio 0.5 --checkpoint -o out.ply",
-    "compact scene.ply --ratio 0.5 -o BAD",
     "compact scene.ply --ratio 0.5 -o BAD.ply",
     "compact scene.ply --ratio 0.5 -o out.ply --views BAD",
-    "sample BAD",
     "sample BAD.ply",
     "bench BAD -p fast",
     "bench scene.ply -p fast -o BAD.csv",
-    "bench scene.ply -p fast --views BAD",
     "remote compress BAD",
-    "remote compress BAD -o out.zip",
-    "remote compress scene.ply -o BAD",
     "remote compress scene.ply -o BAD.zip",
     "remote get 123 -o BAD",
 ]
@@ -175,20 +157,20 @@ def test_a_name_that_is_too_long_with_another_ending(folder: Path, tmp_path: Pat
     assert [path.name for path in tmp_path.iterdir()] == [scene.name]
 
 
-@pytest.mark.parametrize("name", ["a\0b", "a" * 300, "\0.zip", "loop"])
-@pytest.mark.quick(1)
+@pytest.mark.parametrize("name", ["a\0b", "loop", "\0.zip", "a" * 300])
+@pytest.mark.quick(2)
 def test_the_library_raises_its_own_errors(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     kept = "loop/x" if name == "loop" else name  # a link is replaced, wherever it leads
+    few = kissgs.Settings.from_preset("fast", compact={"count": 9})
     for work in (
         lambda: kissgs.load(name),
         lambda: kissgs.decompress(name),
+        lambda: kissgs.decompress("scene.zip", f"{name}.ply" if name != "loop" else "loop/x.ply"),
         lambda: kissgs.compress(name),
         lambda: kissgs.compress(SCENE, name),
         lambda: kissgs.compress(SCENE, cache=kept),
-        lambda: kissgs.compress(
-            SCENE, checkpoint=kept, settings=kissgs.Settings.from_preset("fast", compact={"count": 9})
-        ),
+        lambda: kissgs.compress(SCENE, checkpoint=kept, settings=few),
         lambda: kissgs.save(SCENE, f"{name}/x.ply"),
         lambda: kissgs.load_views(Path(name)),
         lambda: kissgs.read_ply_info(Path(name)),

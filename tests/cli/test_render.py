@@ -195,7 +195,7 @@ def test_impossible_requests_are_refused(folder: Path, tmp_path: Path) -> None:
 def test_an_interrupted_animation_leaves_no_file(folder: Path, tmp_path: Path) -> None:
     words = ["render", folder / "a.ply", "--orbit", "--frames", "3600", "-o", tmp_path / "a.webp"]
     with subprocess.Popen([KISSGS, *map(str, words)], stderr=subprocess.PIPE) as process:
-        time.sleep(4)
+        time.sleep(2)
         process.send_signal(signal.SIGINT)
         _, message = process.communicate(timeout=300)
     assert process.returncode == 130
@@ -233,6 +233,7 @@ def test_the_clock_of_the_progress_bar_runs_through_all_stages(
 
 
 @pytest.mark.parametrize("torch", ["", "import sys; sys.modules['torch'] = None; "], ids=["torch", "no torch"])
+@pytest.mark.quick(1)
 def test_warmup_compiles_all_kernels(torch: str, tmp_path: Path) -> None:
     """A kernel compiles at its first call, so that one that is not loaded here is compiled later."""
     home = Path(kissgs.__file__).parents[1]

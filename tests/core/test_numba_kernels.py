@@ -1,4 +1,4 @@
-"""Kernels are compiled on import or loaded from the cache, and never again while a command works."""
+"""Kernels are compiled by the first process or loaded from the cache, and never again while a command works."""
 
 import os
 import pickle
@@ -26,35 +26,39 @@ class Printer(event.Listener):
 event.register("numba:compile", Printer())
 from helpers.photographed import photographs, with_photographs
 from helpers.training_scenes import cloud
-scene = cloud(150)
+scene = cloud(60)
 with tempfile.TemporaryDirectory() as folder:
     views = photographs(scene, Path(folder))
     kissgs.compress(scene, settings=with_photographs(max_psnr_drop=1, max_ssim_drop=0.05), views=views, evaluate=True)
-tuned = kissgs.Settings.from_preset("small", finetune={"enabled": True, "steps": 2})
+few = {"sensitivity_views": 4, "sensitivity_view_size": 48}
+tuned = kissgs.Settings.research("small", finetune={"enabled": True, "steps": 2, "views": 4, "view_size": 48}, **few)
 kissgs.compress(scene, settings=tuned, container="sog")
-kissgs.compact(scene, settings=kissgs.Settings.from_preset("balanced", compact={"ratio": 0.5, "method": "merge"}))
+merged = kissgs.Settings.research("balanced", compact={"ratio": 0.5, "method": "merge", "views": 4, "view_size": 48})
+kissgs.compact(scene, settings=merged)
 """
 
 
 def test_no_kernel_is_compiled_while_a_scene_is_compressed():
-    """Regression: one without a signature was compiled by every process, which announced that it was cached."""
-    paths = os.pathsep.join(path for path in sys.path if path)
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": paths},
-        check=False,
-    )
-    assert (done.returncode, done.stdout) == (0, ""), done.stderr[-2000:]
+    """Regression: one without a signature was compiled by every process, not only by the first with an empty cache."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, "-c", PROGRAM]
+    for _ in range(2):
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+        assert done.returncode == 0, done.stderr[-2000:]
+        if not done.stdout:
+            return
+    raise AssertionError(done.stdout)
 
 
 GRADIENT = """
-import hashlib, numpy, torch
-from kissgs.rendering.differentiable import photometric_loss
-image, target = torch.from_numpy(numpy.random.default_rng(1).random((2, 2, 72, 96, 3), dtype=numpy.float32))
-photometric_loss(image.requires_grad_(), target, ssim_weight=0.3, mse_weight=0.1).backward()
-print(hashlib.sha256(image.grad.numpy().tobytes()).hexdigest())
+import hashlib, numpy
+from kissgs.core.resources import Workers
+from kissgs.rendering.metrics import differences_and_ssim
+image, target = numpy.random.default_rng(1).random((2, 2, 72, 96, 3), dtype=numpy.float32)
+gradient = numpy.empty_like(image)
+with Workers(1) as pool:
+    differences_and_ssim(image, target, pool, gradient, (0.7, 0.3, 0.1))
+print(hashlib.sha256(gradient.tobytes()).hexdigest())
 """
 
 

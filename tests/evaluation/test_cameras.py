@@ -94,8 +94,7 @@ def test_every_view_shows_something():
     assert min(alpha(SCENE, view) for view in evaluation_views(SCENE, seed=2).test) > MIN_MEAN_ALPHA / 2
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize(("by", "scale"), [(10_000.0, 1.0), (10_000.0, 0.02), (40.0, 0.02)])
+@pytest.mark.parametrize(("seed", "by", "scale"), [(0, 10_000.0, 1.0), (1, 10_000.0, 0.02), (2, 40.0, 0.02)])
 def test_every_cluster_gets_cameras(seed, by, scale):
     """Two objects far apart, or one of them tiny: both get cameras at a distance of about their own size."""
     second = moved(by=(by, 0, 0), scale=scale)

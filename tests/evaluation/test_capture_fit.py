@@ -71,8 +71,17 @@ def write_colmap(folder):
     write_text(folder / "sparse" / "0", {1: ("PINHOLE", *SIZE, (focal, focal, SIZE[0] / 2, SIZE[1] / 2))}, images)
 
 
-@pytest.mark.parametrize("photographs", [True, False])
-@pytest.mark.parametrize("kind", ["transforms", "its file", "applied", "oldest", "colmap"])
+@pytest.mark.parametrize(
+    ("kind", "photographs"),
+    [
+        ("transforms", True),
+        ("transforms", False),
+        ("its file", False),
+        ("applied", True),
+        ("oldest", True),
+        ("colmap", True),
+    ],
+)
 def test_cameras_are_moved_into_nerfstudios_frame_where_the_scene_is_there(tmp_path, kind, photographs):
     """nerfstudio writes the product with applied_transform; its oldest versions left that out."""
     if photographs:

@@ -95,14 +95,14 @@ def test_the_loss_of_any_object_is_visible():
     views = evaluation_views(FIFTY)
     assert 20 < sum(view.added for view in views.test) <= MAX_ADDED
     reference_images, unseen = {}, []
-    for removed in range(0, 50, 5):
+    for removed in range(0, 50, 12):
         rest = FIFTY.select(np.flatnonzero(removed != OBJECT_OF))
         found = compare_images(FIFTY, rest, views, reference_images=reference_images)
         assert found.worst.comparison.candidate_vs_reference.psnr < 20
         unseen.append(
             min(view.comparison.candidate_vs_reference.psnr for view in found.views if not view.view.added) > 20
         )
-    assert sum(unseen) > 3
+    assert sum(unseen) > 1
     assert found.added == found.as_dict()["added"] == len(found.views) - COUNT
     assert f"{found.added} of the views were added for parts that the others overlook" in found.extremes
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers import reference_decoder
-from helpers.codec_scenes import GLANCE, assert_round_trip, assert_within, constant_scene, random_scene, replaced
+from helpers.codec_scenes import GLANCE, assert_round_trip, assert_within, random_scene, replaced
 from helpers.examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -85,21 +85,6 @@ def test_rotations_of_any_length_are_normalised(length):
 
 
 @pytest.mark.parametrize("preset", ["fast", "paper"])
-@pytest.mark.parametrize("scale", [1e-45, 1e-30, 1e-6, 1e6, 1e14])
-@pytest.mark.quick(5)
-def test_worlds_of_any_size(scale, preset):
-    splats = random_scene(60, 0, seed=2)
-    found, _ = check(replaced(splats, means=splats.means / 40 * scale), preset)
-    assert len(found) == 60
-
-
-def test_positions_at_the_limit():
-    means = np.array([[1e15, -1e15, 0], [1e-45, -1e-38, 1e-6], [999, -1e6, 1e6]])
-    check(replaced(random_scene(3, 0), means=means))
-    check(replaced(random_scene(3, 0), means=means), "paper")
-
-
-@pytest.mark.parametrize("preset", ["fast", "paper"])
 @pytest.mark.parametrize(
     ("attribute", "low", "high"),
     [
@@ -128,7 +113,7 @@ def test_whole_attributes_at_the_edge(attribute, low, high, preset):
 
 @pytest.mark.parametrize("attribute", FIELDS)
 @pytest.mark.parametrize("preset", ["fast", "paper"])
-@pytest.mark.quick(7)
+@pytest.mark.quick(6)
 def test_one_outlier_among_thousands(attribute, preset):
     """It stretches the range of its channel for all: the report must say by how much. Positions suffer little."""
     outlier = {"means": 1e6, "quats": -1, "scales": 12, "opacities": 13.8, "sh0": 500, "shN": 500}[attribute]
@@ -143,43 +128,13 @@ def test_one_outlier_among_thousands(attribute, preset):
     assert max(half["f_dc"]) < (1.1 if attribute == "sh0" else 0.03)
 
 
-@pytest.mark.parametrize("preset", ["fast", "small", "paper"])
-@pytest.mark.parametrize("count", [1, 65, 500])
-@pytest.mark.quick(5)
-def test_gaussians_that_are_all_the_same(count, preset):
-    splats = constant_scene(count, 3)
-    found, result = check(splats, preset, prune_threshold_bits=0)
-    assert sorted(result.order) == list(range(count))
-    np.testing.assert_allclose(found.shN, splats.shN, rtol=1e-6)
-    assert max(result.report.max_quantization_error["scales"]) == 0
-
-
-@pytest.mark.parametrize("attribute", FIELDS)
-@pytest.mark.parametrize("value", [-0.0, 1e-45, -7.25])
-@pytest.mark.quick(9)
-def test_constant_attributes(attribute, value):
-    splats = random_scene(40, 1, seed=9)
-    constant = np.full(getattr(splats, attribute).shape, value)
-    found, _ = check(replaced(splats, **{attribute: constant}), prune_invisible=False)
-    if attribute not in ("quats", "means"):
-        assert (getattr(found, attribute) == np.float32(value)).all()
-
-
-@pytest.mark.parametrize("preset", ["fast", "balanced", "small", "paper"])
-@pytest.mark.parametrize("degree", [0, 3])
-@pytest.mark.quick(5)
+@pytest.mark.parametrize(("degree", "preset"), [(0, "fast"), (3, "balanced"), (3, "paper")])
 def test_scenes_of_which_nothing_is_left(degree, preset):
     nothing = replaced(random_scene(5, degree), means=np.full((5, 3), np.nan))
     for splats, removed in ((nothing, 5), (nothing.select(slice(0, 0)), 0)):
         found, result = check(splats, preset)
         assert (len(found), found.sh_degree) == (0, degree)
         assert result.report.cleaned == Cleaned(non_finite=removed)
-
-
-def test_smallest_numbers_everywhere():
-    splats = random_scene(20, 3, seed=1)
-    tiny = {name: getattr(splats, name) * 1e-43 for name in FIELDS}
-    check(replaced(splats, **tiny))
 
 
 def arrays(*shape):
@@ -222,8 +177,7 @@ STRANGE = {
 
 
 @pytest.mark.parametrize("kind", STRANGE)
-@pytest.mark.parametrize("count", [1, 9, 200])
-@pytest.mark.parametrize("preset", ["balanced", "small"])
+@pytest.mark.parametrize(("count", "preset"), [(1, "small"), (9, "balanced"), (200, "balanced")])
 @pytest.mark.quick(6)
 def test_strange_scenes_with_rate_distortion(kind, count, preset):
     splats = random_scene(count, 1, seed=count)

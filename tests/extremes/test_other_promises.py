@@ -5,7 +5,7 @@ import pytest
 import torch
 from helpers.codec_scenes import GLANCE, random_scene, replaced
 from helpers.rasterized import render_tensors
-from helpers.render_scenes import blobs, camera, one, together
+from helpers.render_scenes import blobs, camera, one
 from helpers.training_scenes import cloud
 
 import kissgs
@@ -100,18 +100,6 @@ def test_rendering_with_quaternions_of_any_length(length):
     torch.testing.assert_close(found, wanted, atol=2e-6, rtol=0)
     found.sum().backward()
     assert bool(tensors["quats"].grad.any()) == (length > 1e-12)
-
-
-def test_what_is_nearer_than_the_near_plane_has_no_part_in_it():
-    view = camera()
-    ahead = [(depth, one(mean=view.position + depth * view.viewmat[2, :3])) for depth in (-1, 0, 0.0099, 0.0101, 1)]
-    for depth, splats in ahead:
-        images, alphas, tensors = render_tensors(together(splats, blobs(3, 0)), [view])
-        (images.sum() + alphas.sum()).backward()
-        assert any(bool(tensor.grad[0].any()) for tensor in tensors.values()) == (depth > 0.01), depth
-    with_it, _, _ = render_tensors(together(ahead[2][1], blobs(3, 0)), [view])
-    without, _, _ = render_tensors(blobs(3, 0), [view])
-    assert torch.equal(with_it, without)
 
 
 @pytest.mark.parametrize("size", [1e-6, 1, 1e6])

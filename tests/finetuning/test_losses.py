@@ -121,7 +121,7 @@ def test_the_rate_makes_the_image_of_the_codebook_smaller():
         return len(stored.getvalue())
 
     before = size()
-    for step in range(40):
+    for step in range(25):
         loss.penalty(step, {}).backward()
         scene.step(rates)
     assert size() < 0.9 * before
@@ -213,10 +213,10 @@ def test_total_variation_equals_that_of_the_images(count, preset):
 
 
 def test_total_variation_decreases_in_training():
-    scene = quantized(preset="fast")
-    loss, rates = TotalVariationLoss(scene, 100.0, Pace(1)), {**dict.fromkeys(scene.latents, 0.05), "attraction": 0.0}
+    scene = quantized(100, preset="fast")
+    loss, rates = TotalVariationLoss(scene, 100.0, Pace(1)), {**dict.fromkeys(scene.latents, 0.1), "attraction": 0.0}
     before = value(loss.penalty(1, {}))
-    for _ in range(60):
+    for _ in range(30):
         loss.penalty(1, {}).backward()
         scene.step(rates)
     assert value(loss.penalty(1, {})) < 0.8 * before

@@ -61,13 +61,13 @@ def tuned(
 
 
 def test_fine_tuning_raises_the_psnr_to_the_original_scene():
-    """Mean of scenes with and without SH: with twelve small training images each, single gains are 1.1 to 2.0 dB.
+    """Scenes with and without SH: with twelve small training images each, gains are 1.1 to 2.0 dB.
 
     Bits have no weight, which would trade PSNR for them.
     """
     gains = []
-    for degree, seed in ((2, 0), (2, 1), (0, 0)):
-        encoded, report = tuned(cloud(150, degree, seed), steps=150, rate_weight=0)
+    for degree in (2, 0):
+        encoded, report = tuned(cloud(150, degree), steps=150, rate_weight=0)
         gains.append(report.psnr_after - report.psnr_before)
         assert report.kept
         assert report.target_source == "renderings"
@@ -78,15 +78,15 @@ def test_fine_tuning_raises_the_psnr_to_the_original_scene():
 
 
 def test_with_a_weight_of_bits_both_error_and_bytes_fall():
-    for seed in range(2):
-        _, report = tuned(cloud(150, 2, seed), steps=150)
-        assert report.kept
-        assert report.psnr_after > report.psnr_before
-        assert report.bytes_after < 0.97 * report.bytes_before
+    _, report = tuned(cloud(150, 2), steps=150)
+    assert report.kept
+    assert report.psnr_after > report.psnr_before
+    assert report.bytes_after < 0.97 * report.bytes_before
 
 
-@pytest.mark.parametrize(("preset", "weights"), [("balanced", (0.3, 5.0)), ("paper", (0.2, 0.0))])
-@pytest.mark.parametrize("stage", ["finetune", "compact"])
+@pytest.mark.parametrize(
+    ("preset", "weights", "stage"), [("balanced", (0.3, 5.0), "finetune"), ("paper", (0.2, 0.0), "compact")]
+)
 def test_training_has_the_loss_of_the_settings(preset, weights, stage, monkeypatch):
     plans, scene = [], cloud(40, 1)
     monkeypatch.setattr(f"kissgs.{'finetuning.tune' if stage == 'finetune' else 'training.loop'}.train", capture(plans))
@@ -131,14 +131,6 @@ def test_fine_tuning_of_sog_raises_the_psnr_that_others_measure(degree):
     assert measured.mean.candidate.psnr == pytest.approx(report.psnr_after, abs=1e-6)
 
 
-@pytest.mark.quick(0)
-def test_a_larger_rate_weight_gives_fewer_bytes():
-    scene = cloud(400, 1)
-    found = [tuned(scene, rate_weight=weight, steps=60)[1] for weight in (0.0, 3.0, 30.0)]
-    assert found[2].bytes_after < found[1].bytes_after < found[0].bytes_after
-    assert found[2].psnr_after < found[0].psnr_after
-
-
 @both
 def test_a_worse_container_is_not_kept(container):
     scene = cloud(80)
@@ -151,31 +143,17 @@ def test_a_worse_container_is_not_kept(container):
     assert encoded.files == written(settings, container)(plan, 0, silent).files
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-@pytest.mark.quick(0)
-def test_the_result_depends_on_the_seed_but_not_on_threads(batch):
-    scene = cloud(200, 1)
-    found = []
-    before = torch.get_num_threads()
-    for threads in (1, 2, 3):
-        torch.set_num_threads(threads)
-        work = replace(tuner(scene, batch=batch, size=140, view_size=160, **GENTLE), threads=threads)
-        settings = Settings.research("fast", **COARSE).encode
-        plan = chosen(scene, "fast", **COARSE)
-        found.append(work(plan, plan, scene, written(settings))[0].files)
-    torch.set_num_threads(before)
-    assert found[0] == found[1] == found[2]
-    assert found[0] != tuned(scene, batch=batch, size=140, view_size=160, seed=1, **GENTLE)[0].files
-
-
-@both
-def test_the_result_does_not_depend_on_threads(container):
+@pytest.mark.parametrize(("container", "batch"), [("sogxt", 3), ("sog", 1)])
+def test_the_result_depends_on_the_seed_but_not_on_threads(container, batch):
     scene, found, before = cloud(200, 1), [], torch.get_num_threads()
     for threads in (1, 3):
         torch.set_num_threads(threads)
-        found.append(tuned(scene, container, work=replace(tuner(scene, container), threads=threads))[0].files)
+        work = replace(tuner(scene, container, batch=batch), threads=threads)
+        encoded, report = tuned(scene, container, work=work)
+        found.append((encoded.files, report.psnr_after))
     torch.set_num_threads(before)
     assert found[0] == found[1]
+    assert found[0][1] != tuned(scene, container, batch=batch, seed=1)[1].psnr_after
 
 
 @pytest.mark.parametrize(("steps", "container"), [(5, "sogxt"), (5, "sog"), (0, "sogxt"), (1, "sog"), (12, "sogxt")])
@@ -255,8 +233,7 @@ def test_compress_fine_tunes_and_reports_it(tmp_path):
     assert written_settings.get("finetune_steps", 0) == (12 if report.finetuning.kept else 0)
 
 
-@pytest.mark.parametrize("degree", [3, 0, 1, 2])
-@pytest.mark.quick(2)
+@pytest.mark.parametrize("degree", [3, 0])
 def test_compress_fine_tunes_sog_of_every_degree(tmp_path, degree):
     scene = cloud(120, degree)
     settings = Settings.research("fast", finetune=SHORT, **COARSE)
@@ -390,16 +367,6 @@ def test_a_psnr_goal_is_rejected_if_photographs_are_the_targets(tmp_path):
     settings = Settings.research("balanced", finetune=SHORT, psnr=30.0, sensitivity_views=4, sensitivity_view_size=60)
     with pytest.raises(UnsupportedError, match="give a target size"):
         kissgs.compress(cloud(60), settings=settings, views=Views(tuple(views), (), black(), "photos"))
-
-
-@pytest.mark.parametrize(("count", "container"), [(0, "sogxt"), (1, "sog"), (1, "sogxt"), (2, "sog")])
-@pytest.mark.quick(2)
-def test_scenes_of_few_gaussians(count, container):
-    scene = cloud(9).select(np.arange(count))
-    for preset in ("fast", "balanced"):
-        result = kissgs.compress(scene, settings=Settings.research(preset, finetune=SHORT), container=container)
-        assert (result.report.finetuning is None) == (count == 0)
-        assert len(decompress(result.to_zip())) == count
 
 
 def test_an_antialiased_scene_is_fine_tuned_with_the_opacities_that_its_images_show():

@@ -60,7 +60,7 @@ def finish_a_job(context, state=State.SUCCEEDED):
     result.mkdir()
     (result / "scene.zip").write_bytes(b"PK")
     number = context.store.claim().number
-    context.store.move(number, State.SUCCEEDED, expires_at=context.clock() + 1000, result={"a": "b" * 300})
+    context.store.move(number, State.SUCCEEDED, expires_at=context.clock() + 1000, result={"a": "b" * 1000})
     if state == State.EXPIRED:
         context.store.move(number, state)
     return job_id
@@ -68,10 +68,10 @@ def finish_a_job(context, state=State.SUCCEEDED):
 
 @pytest.fixture(scope="module")
 def sample_folder(tmp_path_factory):
-    """Data folder with 40 succeeded jobs, whose database has several pages."""
+    """Data folder with 12 succeeded jobs, whose database has several pages."""
     folder = tmp_path_factory.mktemp("sample") / "data"
     with service(folder) as context:
-        for _ in range(40):
+        for _ in range(12):
             finish_a_job(context)
     return folder
 

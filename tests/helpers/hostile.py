@@ -9,7 +9,7 @@ from helpers.examples import thorough
 from helpers.memory import takes_less_than
 from kissgs.core.errors import KissgsError
 
-DEFAULT_MUTATIONS, THOROUGH_MUTATIONS = 40, 1000
+DEFAULT_MUTATIONS, THOROUGH_MUTATIONS = 15, 1000
 
 MEMORY = 40_000_000
 """Bytes; the files here hold some dozen Gaussians, so anything near this came from trusting a number."""

@@ -11,6 +11,7 @@ from PIL import Image
 
 from helpers.viewers import chromium
 from helpers.web_tools import ROOT
+from kissgs.core.splats import SH_C0
 
 VENDOR = ROOT / "web_decoder" / "vendor"
 
@@ -174,3 +175,21 @@ def psnr(one, other):
 
 def colours(image):
     return len(np.unique(image.reshape(-1, 3), axis=0))
+
+
+def numbers(text):
+    return [float(part) for part in text.replace("−", "-").replace(",", "").split()]
+
+
+def assert_readout(readout, decoded, index, levels, *, rotation):
+    """Assert that the readout of a plane has the values of a Gaussian; return its entry of the SH codebook."""
+    shown = dict(zip(readout.locator("dt").all_inner_texts(), readout.locator("dd").all_inner_texts(), strict=True))
+    assert numbers(shown["Position"]) == pytest.approx(decoded.means[index], rel=6e-3, abs=1e-9)
+    assert numbers(shown["Deviations"]) == pytest.approx(np.exp(decoded.scales[index]), rel=6e-3)
+    quat = decoded.quats[index] / np.linalg.norm(decoded.quats[index])
+    assert numbers(shown["Quaternion"]) == pytest.approx(quat, abs=rotation)
+    assert numbers(shown["Colour"]) == pytest.approx(255 * (0.5 + SH_C0 * decoded.sh0[index]), abs=0.51)
+    opacity = 100 / (1 + np.exp(-decoded.opacities[index]))
+    assert float(shown["Opacity"].strip("%")) == pytest.approx(opacity, abs=0.06)
+    assert numbers(shown["Levels RGBA"]) == [*levels, 255]
+    return numbers(shown["SH entry"])

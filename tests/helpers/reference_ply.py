@@ -21,8 +21,6 @@ STRUCT_CODES = {
 ENCODINGS = ("ascii", "binary_little_endian", "binary_big_endian")
 REST = {0: 0, 1: 9, 2: 24, 3: 45}
 
-Columns = dict[str, list[float]]
-
 
 def names(degree):
     """Return the property names in INRIA's order, without normals."""

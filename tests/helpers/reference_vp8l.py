@@ -1,9 +1,8 @@
-"""A naive reader and a naive writer of VP8L (RFC 9649), bit by bit, to count features and to write streams."""
+"""A naive writer of VP8L (RFC 9649), bit by bit."""
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -32,147 +31,6 @@ def codes_of(lengths):
 
 def tiles(size, bits):
     return -(-size // (1 << bits))
-
-
-@dataclass
-class Facts:
-    """Counts of the features that occur in a stream."""
-
-    transforms: list = field(default_factory=list)
-    tile_bits: list = field(default_factory=list)
-    palettes: list = field(default_factory=list)
-    caches: list = field(default_factory=list)
-    groups: int = 0
-    longest: int = 0
-    literals: int = 0
-    cached: int = 0
-    near: int = 0
-    far: int = 0
-    single: int = 0
-
-
-class Reader:
-    """Reader of a whole stream, without inverting transforms."""
-
-    def __init__(self, data):
-        self.bits = np.unpackbits(np.frombuffer(stream_of(data), np.uint8), bitorder="little").tolist()
-        self.at = 0
-        self.facts = Facts()
-        assert self.read(8) == 0x2F
-        self.width, self.height = self.read(14) + 1, self.read(14) + 1
-        self.alpha = self.read(1)
-        assert self.read(3) == 0
-        self.run()
-
-    def read(self, count):
-        found = self.bits[self.at : self.at + count]
-        assert len(found) == count
-        self.at += count
-        return sum(bit << i for i, bit in enumerate(found))
-
-    def symbol(self, codes):
-        if len(codes) == 1:
-            return next(iter(codes.values()))
-        code = 0
-        for length in range(1, 16):
-            code = 2 * code + self.read(1)
-            if (length, code) in codes:
-                return codes[length, code]
-        raise AssertionError("no such code")
-
-    def number(self, symbol):
-        if symbol < 4:
-            return symbol + 1
-        extra = (symbol - 2) >> 1
-        return ((2 + (symbol & 1)) << extra) + self.read(extra) + 1
-
-    def run(self):
-        width = self.width
-        while self.read(1):
-            kind = self.read(2)
-            self.facts.transforms.append(kind)
-            if kind == INDEXING:
-                size = self.read(8) + 1
-                self.image(size, 1)
-                self.facts.palettes.append(size)
-                width = tiles(width, 0 if size > 16 else 1 if size > 4 else 2 if size > 2 else 3)
-            elif kind != SUBTRACT_GREEN:
-                bits = self.read(3) + 2
-                self.facts.tile_bits.append(bits)
-                self.image(tiles(width, bits), tiles(self.height, bits))
-        self.image(width, self.height, main=True)
-
-    def lengths(self, size):
-        lengths = [0] * size
-        if self.read(1):
-            two = self.read(1)
-            symbols = [self.read(8 if self.read(1) else 1)] + ([self.read(8)] if two else [])
-            for symbol in symbols:
-                lengths[symbol] = 1
-            return lengths
-        of_lengths = [0] * 19
-        for symbol in ORDER[: self.read(4) + 4]:
-            of_lengths[symbol] = self.read(3)
-        codes = codes_of(of_lengths)
-        left = 2 + self.read(2 + 2 * self.read(3)) if self.read(1) else size
-        at, last = 0, 8
-        while at < size and left:
-            left -= 1
-            length = self.symbol(codes)
-            if length < 16:
-                lengths[at] = length
-                last = length or last
-                at += 1
-                continue
-            count = self.read({16: 2, 17: 3, 18: 7}[length]) + {16: 3, 17: 3, 18: 11}[length]
-            lengths[at : at + count] = [last if length == 16 else 0] * count
-            at += count
-        assert len(lengths) == size
-        return lengths
-
-    def image(self, width, height, main=False):
-        cache_bits = self.read(4) if self.read(1) else 0
-        facts, groups, choice, bits = self.facts, 1, [0], 14
-        if main:
-            facts.caches.append(cache_bits)
-            if self.read(1):
-                bits = self.read(3) + 2
-                choice = [pixel >> 8 & 0xFFFF for pixel in self.image(tiles(width, bits), tiles(height, bits))]
-                groups = max(choice) + 1
-            facts.groups = groups
-        codes = []
-        for _ in range(groups):
-            sizes = (280 + (1 << cache_bits if cache_bits else 0), 256, 256, 256, 40)
-            codes.append([codes_of(self.lengths(size)) for size in sizes])
-            facts.single += sum(len(code) == 1 for code in codes[-1])
-            facts.longest = max(facts.longest, *(length for code in codes[-1] for length, _ in code))
-        pixels, cache, kept = [], [0] * (1 << cache_bits), 0
-        while len(pixels) < width * height:
-            y, x = divmod(len(pixels), width)
-            green, red, blue, alpha, distance = codes[choice[(y >> bits) * tiles(width, bits) + (x >> bits)]]
-            symbol = self.symbol(green)
-            if symbol < 256:
-                facts.literals += 1
-                pixel = symbol << 8 | self.symbol(red) << 16
-                pixels.append(pixel | self.symbol(blue) | self.symbol(alpha) << 24)
-            elif symbol < 280:
-                length = self.number(symbol - 256)
-                code = self.number(self.symbol(distance))
-                if code > 120:
-                    facts.far, back = facts.far + 1, code - 120
-                else:
-                    left, up = NEAR[code - 1]
-                    facts.near, back = facts.near + 1, max(left + up * width, 1)
-                for _ in range(length):
-                    pixels.append(pixels[-back])
-            else:
-                facts.cached += 1
-                for pixel in pixels[kept:]:
-                    cache[(0x1E35A7BD * pixel & 0xFFFFFFFF) >> (32 - cache_bits)] = pixel
-                kept = len(pixels)
-                pixels.append(cache[symbol - 280])
-        assert len(pixels) == width * height
-        return pixels
 
 
 # In the order of RFC 9649: columns to the left, rows up.

@@ -5,8 +5,6 @@ import numpy as np
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
 from kissgs.rendering.camera import look_at
 
-SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (3,)}
-
 
 def blobs(count, degree=1, seed=0, spread=0.8, log_scale=-1.5):
     """Return Gaussians around the origin with random shapes, rotations (not normalised), opacities and colours."""

@@ -18,8 +18,11 @@ import time
 from pathlib import Path
 
 import httpx
+import pytest
 
 import kissgs
+import kissgs.runners
+from helpers.thread_runner import HELD_SEED, ThreadRunner
 from kissgs.io.ply import write_ply
 from service.core.settings import ServiceSettings
 from service.http.app import create_app
@@ -36,27 +39,28 @@ def scene_bytes(gaussians=300, degree=1, seed=0):
 
 
 SMALL = scene_bytes()
-"""Scene whose job takes hardly longer than the start of its process."""
+"""Scene whose job takes hardly longer than its start."""
 
 FAST = json.dumps({"preset": "fast"})
 SLOW = json.dumps(
-    {"preset": "paper", "encode": {"plas_radius_decay": 0.99, "sh_kmeans_iterations": 50}, "for_research": True}
+    {
+        "preset": "paper",
+        "encode": {"seed": HELD_SEED, "plas_radius_decay": 0.99, "sh_kmeans_iterations": 50},
+        "for_research": True,
+    }
 )
-"""Settings that keep a worker busy."""
+"""Settings that keep a worker busy: a process for long, a thread until the job is cancelled."""
 
 
 class Service:
     """Service for use as ``with Service(folder, KISSGS_X=…) as service``; ``service.http`` is its HTTP client.
 
-    It runs in a thread of this process, with a server and job processes as ``kissgs-serve`` has them. Settings in small
-    letters are constants of ``ServiceSettings``, such as ``sync_seconds=2``.
+    It runs in a thread of this process, with a server as ``kissgs-serve`` has it; its jobs are threads, too, or with
+    ``processes`` processes. Settings in small letters are constants of ``ServiceSettings``, such as ``sync_seconds=2``.
     """
 
-    workers = 1
-    """Number of jobs that run simultaneously."""
-
-    def __init__(self, folder: Path, **settings: object) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, *, processes: bool = False, **settings: object) -> None:
+        self.folder, self.processes = folder, processes
         self.constants = {name: value for name, value in settings.items() if name.islower()}
         self.settings = {
             "KISSGS_PORT": 0,
@@ -81,7 +85,10 @@ class Service:
         logger = logging.getLogger("kissgs")
         logger.addHandler(self._handler)
         logger.setLevel(logging.INFO)
-        app = create_app(settings)
+        with pytest.MonkeyPatch.context() as patch:
+            if not self.processes:
+                patch.setattr(kissgs.runners, "LocalRunner", ThreadRunner)
+            app = create_app(settings)
         listener = listen(settings)
         self._server = _Server(app, app.state.context)
         self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [listener]})
@@ -153,21 +160,21 @@ class Service:
         return self.http.get(status["links"]["result"]).content
 
     def running(self, job: dict, stage: str | None = None, seconds: float = 300) -> dict:
-        """Wait until the job's process runs, in ``stage`` if given; return the status."""
+        """Wait until the job runs, in ``stage`` if given; return the status."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             status = self.status(job)
             progress = status.get("progress")
-            if status["state"] == "running" and progress and stage in (None, progress["stage"]) and self.children():
+            started = status["state"] == "running" and progress and stage in (None, progress["stage"])
+            if started and (not self.processes or self.children()):
                 return status
             assert status["state"] in ("queued", "running"), status
             time.sleep(0.02)
         raise AssertionError(f"job {job['id']} does not run: {status}\n{self.log.read_text()[-3000:]}")
 
-    def occupy(self) -> list[dict]:
-        """Submit a long job for each worker, and return them once all are running."""
-        jobs = [self.submit(scene_bytes(20_000, 3), SLOW) for _ in range(self.workers)]
-        return [self.running(job) for job in jobs]
+    def hold(self) -> dict:
+        """Submit a job that keeps the worker busy, and return its status once it runs."""
+        return self.running(self.submit(scene_bytes(20_000, 3) if self.processes else SMALL, SLOW))
 
     def children(self) -> list[int]:
         """Return the ids of all job processes, which work in the folders of their jobs."""
@@ -216,6 +223,9 @@ class ServiceProcess(Service):
     """Service in a process of its own, ``python -m service``, which can be killed and started again."""
 
     process: subprocess.Popen | None = None
+
+    def __init__(self, folder: Path, **settings: object) -> None:
+        super().__init__(folder, processes=True, **settings)
 
     def start(self) -> Service:
         begin = self.log.stat().st_size if self.log.exists() else 0

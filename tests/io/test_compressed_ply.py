@@ -34,9 +34,9 @@ def random_gaussians(count, rest_count):
     ]
 
 
-@pytest.mark.parametrize("rest_count", [0, 9, 24, 45])
-@pytest.mark.parametrize("colour_bounds", [True, False])
-@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    ("rest_count", "colour_bounds", "order"), [(0, True, "<"), (9, False, ">"), (24, True, ">"), (45, False, "<")]
+)
 def test_within_half_a_step(rest_count, colour_bounds, order, monkeypatch):
     """Three chunks, the last one partly filled, and as many blocks."""
     monkeypatch.setattr(ply_body, "BLOCK_BYTES", 5000)

@@ -1,4 +1,4 @@
-"""Agreement with readers and writers that others wrote (docs/reference/formats.md has the table of all such tests).
+"""Agreement with readers and writers that others wrote (docs/reference/formats.md lists all such tests).
 
 Oracles: splat-transform (``.ply``, ``.compressed.ply``, SOG), the library of ``.spz``, GaussianSplats3D (``.ksplat``,
 ``.splat``), three.js, Cesium and Khronos' validator (``.glb``). Scenes have degrees 0 to 3 and the ends of every
@@ -34,8 +34,8 @@ from kissgs.io.splat import read_splat, write_splat
 from kissgs.io.spz import read_spz, write_spz
 from kissgs.sog.decode import decode
 
-COUNTS = [1, 65]
-DEGREES = [0, 1, 2, 3]
+SCENES = pytest.mark.parametrize(("count", "degree"), [(65, 3), (1, 0), (65, 1), (65, 2)])
+"""Scenes of every degree; the quick one is the first."""
 
 
 def odd_scene(count, degree):
@@ -68,9 +68,8 @@ def written(writer, scene, path, **options):
 
 
 @needs_splat_transform
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.quick(2)
+@SCENES
+@pytest.mark.quick(1)
 def test_ply(count, degree, tmp_path):
     """The tool's table has every number of our file, bit by bit, and we read its file as it does."""
     scene = odd_scene(count, degree)
@@ -94,9 +93,8 @@ def test_ply(count, degree, tmp_path):
 
 
 @needs_splat_transform
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("count", [*COUNTS, 300])
-@pytest.mark.quick(2)
+@pytest.mark.parametrize(("count", "degree"), [(300, 3), (1, 0), (65, 1), (65, 2)])
+@pytest.mark.quick(1)
 def test_compressed_ply_of_splat_transform(count, degree, tmp_path):
     packed = convert(ply_of(odd_scene(count, degree), tmp_path / "a.ply"), tmp_path / "a.compressed.ply")
     theirs = read_ply(convert(packed, tmp_path / "b.ply"))
@@ -104,18 +102,16 @@ def test_compressed_ply_of_splat_transform(count, degree, tmp_path):
 
 
 @needs_splat_transform
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.quick(1)
-def test_sog_of_splat_transform(degree, tmp_path):
-    packed = convert(ply_of(odd_scene(65, degree), tmp_path / "a.ply"), tmp_path / "a.sog", "-i", "2")
-    assert_alike(decode(packed), read_ply(convert(packed, tmp_path / "b.ply")), rtol=1e-6, atol=1e-6)
+@pytest.mark.parametrize(("degree", "name"), [(3, "a.sog"), (1, "folder/meta.json")])
+def test_sog_of_splat_transform(degree, name, tmp_path):
+    packed = convert(ply_of(odd_scene(65, degree), tmp_path / "a.ply"), tmp_path / name, "-i", "2")
+    source = packed if packed.suffix == ".sog" else packed.parent
+    assert_alike(decode(source), read_ply(convert(packed, tmp_path / "b.ply")), rtol=1e-6, atol=1e-6)
 
 
 @needs_foreign_formats
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize("version", [2, 3, 4])
-@pytest.mark.quick(4)
+@pytest.mark.parametrize(("version", "count", "degree"), [(2, 65, 3), (3, 65, 2), (3, 1, 0), (4, 65, 1), (4, 65, 3)])
+@pytest.mark.quick(3)
 def test_spz_of_its_library(version, count, degree, tmp_path):
     """Differences are those of floats: the library has them where we have doubles."""
     path = tmp_path / "a.spz"
@@ -127,8 +123,7 @@ def test_spz_of_its_library(version, count, degree, tmp_path):
 
 
 @needs_foreign_formats
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("count", COUNTS)
+@SCENES
 @pytest.mark.quick(1)
 def test_spz_of_version_1(count, degree, tmp_path):
     """The library reads it, but does not write it."""
@@ -151,9 +146,8 @@ def test_axes_of_spz(frame, tmp_path):
 
 
 @needs_foreign_formats
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.quick(2)
+@SCENES
+@pytest.mark.quick(1)
 def test_our_spz_in_its_library(count, degree, tmp_path):
     scene = made_scene(count, degree)
     path = written(write_spz, scene, tmp_path / "a.spz")
@@ -176,10 +170,10 @@ def in_steps_of_spz(found, wanted):
 
 
 @needs_foreign_formats
-@pytest.mark.parametrize("degree", [0, 1, 2])
-@pytest.mark.parametrize("count", [0, *COUNTS, 300])
-@pytest.mark.parametrize("level", [0, 1, 2])
-@pytest.mark.quick(4)
+@pytest.mark.parametrize(
+    ("level", "count", "degree"), [(0, 65, 2), (0, 0, 1), (1, 300, 1), (1, 1, 0), (2, 65, 2), (2, 300, 0)]
+)
+@pytest.mark.quick(3)
 def test_ksplat_of_its_own_tool(level, count, degree, tmp_path):
     """The tool writes degrees up to 2."""
     path = tmp_path / "a.ksplat"
@@ -202,8 +196,7 @@ def test_ksplat_of_several_sections(level, tmp_path):
 
 
 @needs_foreign_formats
-@pytest.mark.parametrize("count", [0, *COUNTS])
-@pytest.mark.parametrize("ours", [True, False])
+@pytest.mark.parametrize(("count", "ours"), [(65, True), (0, True), (1, False), (65, False)])
 @pytest.mark.quick(2)
 def test_splat(ours, count, tmp_path):
     """Files of ours and of a naive writer."""
@@ -223,9 +216,8 @@ def columns_of(found):
 
 
 @needs_foreign_formats
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.quick(2)
+@SCENES
+@pytest.mark.quick(1)
 def test_our_glb_in_three_js(count, degree, tmp_path):
     scene = odd_scene(count, degree)
     found = columns_of(foreign("read-glb", written(write_glb, scene, tmp_path / "a.glb")))
@@ -238,7 +230,7 @@ def test_our_glb_in_three_js(count, degree, tmp_path):
 
 @needs_splat_transform
 @needs_foreign_formats
-@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("degree", [3, 0, 1, 2])
 @pytest.mark.quick(1)
 def test_glb_of_splat_transform(degree, tmp_path):
     """Compared are our reading of its file and that of three.js, in glTF's axes."""
@@ -249,9 +241,8 @@ def test_glb_of_splat_transform(degree, tmp_path):
 
 
 @needs_foreign_formats
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.quick(2)
+@SCENES
+@pytest.mark.quick(1)
 def test_our_spz_inside_glb(count, degree, tmp_path):
     """The library of .spz turns what three.js finds in the file to glTF's axes, as the extension's text has it."""
     scene = made_scene(count, degree)
@@ -276,9 +267,8 @@ def test_our_spz_inside_glb(count, degree, tmp_path):
 
 
 @needs_foreign_formats
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.quick(2)
+@SCENES
+@pytest.mark.quick(1)
 def test_our_spz_inside_glb_in_cesium(count, degree, tmp_path):
     """Cesium takes the axes as they are stored, which is half a turn about the vertical axis from the extension's."""
     scene = made_scene(count, degree)

@@ -14,6 +14,7 @@ from helpers.reference_spz import spz_bytes
 
 from kissgs.io.gltf import read_gltf
 from kissgs.io.ksplat import read_ksplat
+from kissgs.io.ply import read_ply
 from kissgs.io.scene_format import ReadOptions
 from kissgs.io.splat import read_splat
 from kissgs.io.spz import read_spz
@@ -24,7 +25,7 @@ LIMITED = ReadOptions(max_gaussians=LIMIT)
 SCENE = made_scene(20, 1)
 EXTENSION = struct.pack("<III", 0xADBE0003, 4, 6)
 
-READERS = {"splat": read_splat, "ksplat": read_ksplat, "spz": read_spz, "gltf": read_gltf}
+READERS = {"ply": read_ply, "splat": read_splat, "ksplat": read_ksplat, "spz": read_spz, "gltf": read_gltf}
 FILES = {
     **{f"ply, {encoding}": ("ply", ply_bytes(random_columns(3, 1), encoding)) for encoding in ENCODINGS},
     "compressed.ply": ("ply", compressed_header(3, 9) + bytes(range(72)) + bytes(range(75))),
@@ -38,9 +39,9 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize("name", [name for name, (kind, _) in FILES.items() if kind != "ply"])
+@pytest.mark.parametrize("name", FILES)
 def test_damaged_files(name):
-    """Damaged .ply files are in test_ply_fuzz.py."""
+    """Headers of .ply files that are damaged line by line are in test_ply_fuzz.py."""
     kind, data = FILES[name]
     check_all(data, lambda damaged: READERS[kind](damaged, max_gaussians=LIMIT))
 

@@ -1,4 +1,4 @@
-"""Oracle: the naive writer (helpers/reference_splat.py) and splat-transform's reading."""
+"""Oracle: the naive writer (helpers/reference_splat.py)."""
 
 import io
 
@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from helpers.format_scenes import made_scene
 from helpers.reference_splat import SH_C0, splat_bytes
-from helpers.splat_transform import convert, needs_splat_transform
 
-from kissgs.core.splats import ATTRIBUTES, Splats, clean
+from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.io import splat
-from kissgs.io.ply import read_ply
 from kissgs.io.splat import ROW, read_splat, write_splat
 
 
@@ -65,19 +63,3 @@ def test_huge_and_tiny_values_make_no_warning():
     found = read_splat(written(scene)[0])
     assert len(found) == 4
     assert all(np.isfinite(getattr(found, name)).all() for name in ATTRIBUTES)
-
-
-@needs_splat_transform
-@pytest.mark.parametrize("count", [65, 1])
-@pytest.mark.quick(1)
-def test_splat_transform_reads_what_we_write(count, tmp_path):
-    path = tmp_path / "a.splat"
-    path.write_bytes(written(made_scene(count, 1))[0])
-    theirs, ours = read_ply(convert(path, tmp_path / "b.ply")), read_splat(path)
-    assert isinstance(theirs, Splats)
-    np.testing.assert_array_equal(theirs.means, ours.means)
-    np.testing.assert_allclose(theirs.scales, ours.scales, atol=1e-5)
-    np.testing.assert_allclose(theirs.sh0, ours.sh0, atol=1e-5)
-    np.testing.assert_allclose(theirs.opacities, ours.opacities, atol=0.015)
-    # The tool takes b / 255 * 2 - 1 for the bytes of rotations.
-    assert (np.abs((ours.quats * theirs.quats).sum(axis=1)) > 1 - 5e-4).all()

@@ -1,4 +1,4 @@
-"""Oracle: the naive writer (helpers/reference_spz.py), bytes encoded by hand, splat-transform's reading."""
+"""Oracle: the naive writer (helpers/reference_spz.py), and bytes encoded by hand."""
 
 import gzip
 import io
@@ -6,13 +6,11 @@ import struct
 
 import numpy as np
 import pytest
-from helpers.format_scenes import assert_alike, made_scene
+from helpers.format_scenes import made_scene
 from helpers.reference_spz import streams
-from helpers.splat_transform import convert, needs_splat_transform
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
-from kissgs.io.ply import read_ply
 from kissgs.io.spz import (
     SpzInfo,
     encode_colors,
@@ -37,9 +35,9 @@ def replaced(splats, **arrays):
     return Splats(**{name: arrays.get(name, getattr(splats, name)) for name in ATTRIBUTES})
 
 
-@pytest.mark.parametrize("raw_axes", [False, True])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [1, 65])
+@pytest.mark.parametrize(
+    ("degree", "count", "raw_axes"), [(0, 1, False), (1, 65, True), (2, 1, True), (3, 65, False), (3, 65, True)]
+)
 def test_all_streams_but_sh_are_those_of_the_reference(degree, count, raw_axes):
     scene = made_scene(count, degree)
     scene.quats[:4] = np.float32([0.9, 0.1, 0.3, -0.3])  # no two components equally large
@@ -61,22 +59,6 @@ def test_all_streams_but_sh_are_those_of_the_reference(degree, count, raw_axes):
         assert np.abs(found.astype(int) - np.frombuffer(wanted, np.uint8)).max(initial=0) <= 1
         assert (found == np.frombuffer(wanted, np.uint8)).mean() > 0.99
     assert len(body) == 3 * count * (0, 3, 8, 15)[degree]
-
-
-@pytest.mark.parametrize("raw_axes", [False, True])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_read_back_within_half_a_step(degree, raw_axes):
-    scene = clean(made_scene(300, degree, extremes=False))[0]
-    scene.shN[:] = np.clip(scene.shN, -1, 0.9)
-    found = read_spz(written(scene, raw_axes=raw_axes)[0], raw_axes=raw_axes)
-    np.testing.assert_allclose(found.means, scene.means, atol=2**-13 * 1.01)
-    np.testing.assert_allclose(found.scales, np.clip(scene.scales, -10, 5.9375), atol=1 / 32 * 1.01)
-    np.testing.assert_allclose(found.sh0, np.clip(scene.sh0, -3.34, 3.34), atol=0.5 / 255 / 0.15 * 1.01)
-    np.testing.assert_allclose(found.shN[:, :3], scene.shN[:, :3], atol=(2 + 0.5) / 128)
-    np.testing.assert_allclose(found.shN[:, 3:], scene.shN[:, 3:], atol=(4 + 0.5) / 128)
-    a, b = (1 / (1 + np.exp(-s.opacities.astype(float))) for s in (found, scene))
-    np.testing.assert_allclose(a, b, atol=0.51 / 255)
-    assert (np.abs((found.quats.astype(float) * scene.quats).sum(axis=1)) > 1 - 1e-5).all()
 
 
 def test_values_by_hand():
@@ -105,7 +87,7 @@ def test_fractional_bits_follow_the_extent(reach, bits):
     assert fractional_bits_for(reach) == bits
 
 
-@pytest.mark.parametrize("reach", [0.01, 0.5, 100, 2048, 5000, 3e5, 8e6])
+@pytest.mark.parametrize("reach", [0.01, 100, 2048, 8e6])
 def test_scenes_of_any_extent(reach):
     scene = made_scene(100, 0, extremes=False)
     scene.means[:] = scene.means / np.abs(scene.means).max() * np.float32(reach)
@@ -157,14 +139,3 @@ def test_bytes_are_the_same_again_and_the_scene_is_unchanged():
     assert struct.unpack_from("<I", data, 4) == (0,), "gzip's time"
     for name, values in before.items():
         np.testing.assert_array_equal(getattr(scene, name), values)
-
-
-@needs_splat_transform
-@pytest.mark.parametrize(("count", "degree"), [(65, 3), (1, 0), (300, 1), (65, 2)])
-@pytest.mark.quick(2)
-def test_splat_transform_reads_what_we_write(count, degree, tmp_path):
-    """The tool reads the axes of a .ply."""
-    path = tmp_path / "a.spz"
-    path.write_bytes(written(made_scene(count, degree), raw_axes=True)[0])
-    theirs = read_ply(convert(path, tmp_path / "b.ply"))
-    assert_alike(read_spz(path, raw_axes=True), theirs, atol=1e-6)

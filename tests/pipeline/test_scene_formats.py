@@ -132,6 +132,22 @@ def test_levels_of_a_streamed_scene(kind, tmp_path):
         describe(folder, ReadOptions(level=2))
 
 
+@pytest.mark.parametrize("ending", [".ply", ".zip"])
+def test_a_scene_without_levels_has_no_other_level_than_the_finest(ending, tmp_path):
+    scene, target = tmp_path / f"scene{ending}", tmp_path / "levels/lod-meta.json"
+    sample = kissgs.sample_scene(50)
+    if ending == ".ply":
+        kissgs.save(sample, scene)
+    else:
+        kissgs.compress(sample, scene, settings=Settings.from_preset("fast"))
+    with pytest.raises(KissgsError, match="there is no level 1: this scene has no levels of detail"):
+        kissgs.load(scene, level=1)
+    with pytest.raises(KissgsError, match="there is no level -1"):
+        describe(scene, ReadOptions(level=-1))
+    with pytest.raises(KissgsError, match="there is no level 1"):
+        kissgs.compress_streamed(scene, target, reading=ReadOptions(level=1))
+
+
 @pytest.mark.parametrize("container", ["sogxt", "sog"])
 def test_a_limit_of_gaussians_holds_for_descriptions_of_containers(container, tmp_path):
     kissgs.compress(

@@ -22,8 +22,7 @@ def order_of(settings, sensitivity, groups):
     return write_files(plan, settings)
 
 
-@pytest.mark.parametrize("order", ["hilbert", "refined"])
-@pytest.mark.parametrize("classes", [None, 1, 3])
+@pytest.mark.parametrize(("classes", "order"), [(None, "hilbert"), (1, "refined"), (3, "hilbert"), (3, "refined")])
 def test_groups_follow_one_another(classes, order):
     """Without sensitivity, and with one or several classes of steps inside each group."""
     settings, sensitivity = Settings.research("fast", order=order).encode, None

@@ -67,8 +67,7 @@ def test_labels_are_the_nearest_of_all_where_reach_is_unlimited(offset):
     np.testing.assert_allclose(found, distances.min(axis=1), atol=1e-5 * (1 + offset**2))
 
 
-@pytest.mark.parametrize("size", [64, 128])
-@pytest.mark.parametrize("made", ["noise", "sh"])
+@pytest.mark.parametrize(("made", "size"), [("noise", 64), ("sh", 128)])
 def test_as_good_as_plain_lloyd(made, size):
     if made == "noise":
         vectors = np.random.default_rng(0).normal(size=(2000, 6)).astype(np.float32)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from helpers.codec_scenes import random_scene
 from helpers.random_sensitivity import random_sensitivity
 
 import kissgs
@@ -107,7 +106,7 @@ def test_gaussians_at_one_position_keep_their_order():
 
 @pytest.mark.parametrize("with_sensitivity", [False, True])
 def test_the_scene_is_the_same_in_fewer_bytes(with_sensitivity):
-    splats = kissgs.clean(kissgs.sample_scene(4000, sh_degree=1))[0]
+    splats = kissgs.clean(kissgs.sample_scene(2000, sh_degree=1))[0]
     sensitivity = random_sensitivity(splats) if with_sensitivity else None
     decoded, sizes = [], []
     for order in ("hilbert", "refined"):
@@ -126,14 +125,3 @@ def test_the_scene_is_the_same_in_fewer_bytes(with_sensitivity):
         sizes.append(sum(map(len, result.files.values())))
     np.testing.assert_array_equal(*decoded)
     assert sizes[1] < 0.99 * sizes[0]
-
-
-@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 700])
-def test_the_plan_stays_consistent(count):
-    """Every Gaussian decodes near itself; labels are compared above."""
-    splats = kissgs.clean(random_scene(count, 2, seed=count))[0]
-    result = encode(splats, Settings.from_preset("balanced").encode)
-    found = kissgs.decompress(result.files)
-    np.testing.assert_allclose(found.means, splats.means[result.order], atol=0.05)
-    np.testing.assert_allclose(found.opacities, splats.opacities[result.order], atol=0.2)
-    np.testing.assert_allclose(found.sh0, splats.sh0[result.order], atol=0.1)

@@ -127,8 +127,7 @@ def blurred(image, radius):
     return np.array([[wide[y : y + size, x : x + size].mean(axis=(0, 1)) for x in range(width)] for y in range(height)])
 
 
-@pytest.mark.parametrize("channels", [1, 3, 4, 7])
-@pytest.mark.parametrize(("side", "radius"), [(8, 1), (8, 3), (9, 4), (16, 7), (24, 5)])
+@pytest.mark.parametrize(("side", "radius", "channels"), [(8, 1, 1), (8, 3, 4), (9, 4, 7), (16, 7, 3), (24, 5, 4)])
 def test_the_filter_is_a_box_that_wraps_sideways_and_mirrors_up_and_down(side, radius, channels):
     image = np.random.default_rng(side).random((side, side, channels), np.float32)
     wanted = blurred(image, radius)

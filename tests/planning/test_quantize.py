@@ -185,25 +185,6 @@ def test_positions_share_one_range_of_all_axes():
     np.testing.assert_allclose(quantized.high, np.full(3, math.log(101)), rtol=1e-7)
 
 
-@pytest.mark.parametrize("tolerance", [0.01, 0.04, 0.5])
-@pytest.mark.parametrize("seed", range(5))
-def test_means_bits_keep_the_median_gaussian_in_its_place(seed, tolerance):
-    """Half the Gaussians move by at most ``tolerance`` of their size with the bits found; with one bit less they may
-    move further. Size is the geometric mean of the two longest axes."""
-    splats = random_scene(501, 0, seed=seed)
-    splats = replaced(splats, scales=splats.scales + seed)
-    bits = means_bits(splats, np.arange(501), tolerance)
-    logs = signed_log(splats.means)
-    size = np.exp(np.sort(splats.scales.astype(np.float64), axis=1)[:, 1:].mean(axis=1))
-
-    def median_shift(bits):
-        half = np.ptp(logs) / 65535 * 2 ** (16 - bits) / 2
-        return np.median(half * (1 + np.abs(splats.means).max(axis=1)) / size)
-
-    assert median_shift(bits) <= tolerance * 1.0001 or bits == 16
-    assert median_shift(bits - 1) > tolerance or bits == 8
-
-
 def test_means_bits_of_odd_scenes():
     few = random_scene(4, 0)
     assert means_bits(few, np.array([], dtype=int), 0.04) == 16

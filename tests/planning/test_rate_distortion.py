@@ -14,11 +14,8 @@ from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.sogxt.encode import encode
 
-RD_PRESETS = ["balanced", "small"]
 
-
-@pytest.mark.parametrize("degree", [0, 1, 3])
-@pytest.mark.parametrize("count", [1, 7, 8, 9, 65, 2000])
+@pytest.mark.parametrize(("count", "degree"), [(1, 0), (7, 1), (8, 3), (9, 0), (65, 1), (1000, 3)])
 @pytest.mark.quick(3)
 def test_round_trips(count, degree):
     splats = clean(random_scene(count, degree, seed=count))[0]
@@ -92,11 +89,8 @@ def torture():
 
 
 @pytest.mark.parametrize(("splats", "sensitivity"), torture())
-@pytest.mark.parametrize("preset", RD_PRESETS)
-@pytest.mark.quick(4)
-def test_scenes_that_break_weights(splats, sensitivity, preset):
-    once, again = (encode(splats, Settings.from_preset(preset).encode, sensitivity=sensitivity) for _ in range(2))
-    assert once.files == again.files
+def test_scenes_that_break_weights(splats, sensitivity):
+    once = encode(splats, Settings.from_preset("balanced").encode, sensitivity=sensitivity)
     found = decompress(once.files)
     reference_decoder.assert_equal_scenes(found, reference_decoder.decode(once.files), once.files)
     assert len(found) == len(once.order) > 0
@@ -160,7 +154,7 @@ def test_many_gaussians_that_were_dropped_are_noted_in_the_report(superfluous, m
         scene = kissgs.Splats(
             **{name: np.concatenate([getattr(scene, name), getattr(more, name)]) for name in ATTRIBUTES}
         )
-    settings = kissgs.Settings.research("balanced", sensitivity_views=8, sensitivity_view_size=96)
+    settings = kissgs.Settings.research("balanced", sensitivity_views=4, sensitivity_view_size=96)
     report = kissgs.compress(scene, settings=settings).report
     assert (report.pruned_by_rd > 0.2 * len(scene)) == many
     assert bool(report.note) == many

@@ -79,8 +79,9 @@ def arguments(count, degree, dilation=0.3):
     }
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize(("degree", "dilation"), [(0, 0.3), (1, 0.03), (2, 1.0), (3, 0.3)])
+@pytest.mark.parametrize(
+    ("degree", "dilation", "antialiased"), [(0, 0.3, False), (1, 0.03, True), (2, 1.0, False), (3, 0.3, True)]
+)
 def test_gsplat_gets_the_arguments_of_the_same_image(gsplat, degree, dilation, antialiased):
     given = {**arguments(30, degree, dilation), "antialiased": antialiased}
     images, alphas = rasterize_on_cuda(**given)

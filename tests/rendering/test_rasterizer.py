@@ -137,7 +137,7 @@ def test_off_axis_principal_points_and_unequal_focal_lengths():
 @pytest.mark.quick(1)
 def test_gradients_agree_with_finite_differences(device):
     for seed, degree in enumerate([0, 1, 2, 3]):
-        check_gradients(blobs(10, degree, seed=seed), camera(25, 19, seed=seed), device, seed)
+        check_gradients(blobs(6, degree, seed=seed), camera(21, 17, seed=seed), device, seed)
 
 
 @pytest.mark.parametrize(
@@ -223,19 +223,6 @@ def test_render_and_rasterize_agree_exactly():
     images, alphas, _ = render_tensors(splats, [view], backgrounds=[(1.0, 1.0, 1.0)])
     assert np.array_equal(image, images[0].detach().numpy())
     assert np.array_equal(alpha, alphas[0].detach().numpy())
-
-
-def test_arrays_of_a_scene_need_not_be_contiguous():
-    splats, view = blobs(40, 2), camera()
-    every_other = splats.select(slice(None, None, 2))
-    image, _ = render(every_other, view)
-    assert np.array_equal(image, render(splats.select(np.arange(0, 40, 2)), view)[0])
-
-
-def test_tensors_share_the_memory_of_the_scene():
-    splats = blobs(5)
-    tensors = tensors_of(splats)
-    assert tensors["means"].data_ptr() == splats.means.ctypes.data
 
 
 def test_a_parameter_changed_before_the_backward_pass_is_an_error():

@@ -67,9 +67,9 @@ def test_a_folder_that_was_removed_is_not_made_again(folders):
 
 @pytest.fixture
 def work(tmp_path):
-    """A folder that no node sees, with 20 MB, and an item that needs them."""
+    """A folder that no node sees, with 9 MB, and an item that needs them."""
     (tmp_path / "job").mkdir()
-    (tmp_path / "job" / "scene").write_bytes(os.urandom(20_000_000))
+    (tmp_path / "job" / "scene").write_bytes(os.urandom(9_000_000))
     starts = tmp_path / "starts"
     return tmp_path / "job", item("digest", starts=str(starts), folder=str(tmp_path / "job"), files=("scene",))
 
@@ -86,6 +86,7 @@ def test_an_item_whose_node_is_killed_leaves_its_checkpoint(whole_cluster, ray_r
     assert outcome.result["folder"].startswith(str(whole_cluster.folder))
     digest = hashlib.sha256((folder / "scene").read_bytes()).hexdigest()
     assert contents(folder / "made") == {"digest": digest.encode()}
+    assert len((folder.parent / "starts").read_text().splitlines()) == 2
     wait_until(lambda: whole_cluster.left_by_items() == [])
 
 

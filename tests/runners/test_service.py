@@ -4,20 +4,21 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from helpers.ray_cluster import NODE_MEMORY, PATHS
+from helpers.ray_cluster import NODE_MEMORY
 from helpers.ray_service import RayService
 from helpers.running import is_alive, processors, wait_until
-from helpers.service import FAST, SLOW, SMALL, ServiceProcess, events, scene_bytes
+from helpers.service import FAST, SLOW, SMALL, Service, ServiceProcess, events, scene_bytes
 
 import kissgs
+from service.core.settings import ServiceSettings, SettingsError
+from service.http.app import create_app
 
 MEDIUM = scene_bytes(4000, 2)
+ON_THIS_MACHINE = {"KISSGS_JOB_MEMORY": NODE_MEMORY, "KISSGS_WORKERS": 2, "KISSGS_JOB_THREADS": 1}
 
 
 def compressed(scene):
@@ -25,28 +26,24 @@ def compressed(scene):
 
 
 @pytest.fixture(scope="module")
-def settings_of(ray_cluster, ray_runner):
-    """Settings of a service by runner, with which two jobs run at a time."""
-    common = {"KISSGS_JOB_MEMORY": NODE_MEMORY, "KISSGS_WORKERS": 2, "KISSGS_JOB_THREADS": 1}
+def on_the_cluster(ray_cluster, ray_runner):
+    """Settings of a service whose jobs run on the cluster, once it has both nodes."""
     wait_until(lambda: processors(ray_runner) == 2)
-    return {
-        "local": common,
-        "ray": {**common, "KISSGS_RUNNER": ray_cluster.address},
-    }
+    return {**ON_THIS_MACHINE, "KISSGS_RUNNER": ray_cluster.address}
 
 
 @pytest.fixture(scope="module", params=["local", "ray", "ray without a shared folder"])
-def service(request, settings_of, ray_cluster, tmp_path_factory):
+def service(request, tmp_path_factory):
     """A service with each runner, on a cluster with and without a folder that all nodes see."""
     folder = tmp_path_factory.mktemp("data")
+    if request.param == "local":
+        made = ServiceProcess(folder / "a", **ON_THIS_MACHINE)
+    else:
+        request.getfixturevalue("on_the_cluster")
+        made = RayService(folder / "a", request.getfixturevalue("ray_cluster"))
     if request.param == "ray":
         (folder / "shared").touch()
-    on_this_machine = request.param == "local"
-    with (
-        ServiceProcess(folder / "a", **settings_of["local"])
-        if on_this_machine
-        else RayService(folder / "a", ray_cluster) as it
-    ):
+    with made as it:
         yield it
 
 
@@ -151,12 +148,13 @@ def test_a_service_is_killed_at_any_moment(service, moment):
 
 @pytest.mark.quick(0)
 @pytest.mark.parametrize("runner", ["local", "ray"])
-def test_the_limits_of_jobs(settings_of, tmp_path, runner):
-    with ServiceProcess(tmp_path / "a", **{**settings_of[runner], "KISSGS_JOB_MEMORY": "256MiB"}) as service:
+def test_the_limits_of_jobs(request, tmp_path, runner):
+    settings = ON_THIS_MACHINE if runner == "local" else request.getfixturevalue("on_the_cluster")
+    with ServiceProcess(tmp_path / "a", **{**settings, "KISSGS_JOB_MEMORY": "256MiB"}) as service:
         problem = service.ended(service.submit(scene_bytes(200_000, 3), json.dumps({"preset": "balanced"})))["problem"]
         assert problem["code"] == "memory-limit"
         assert "fewer Gaussians" in problem["detail"]
-    with ServiceProcess(tmp_path / "b", **{**settings_of[runner], "KISSGS_JOB_SECONDS": 1.5}) as service:
+    with ServiceProcess(tmp_path / "b", **{**settings, "KISSGS_JOB_SECONDS": 1.5}) as service:
         problem = service.ended(service.submit(scene_bytes(20_000, 3), SLOW))["problem"]
         assert problem["code"] == "time-limit"
         assert "1.5 s" in problem["detail"]
@@ -173,8 +171,8 @@ def test_a_job_whose_node_is_killed_runs_elsewhere(whole_cluster, tmp_path):
         assert service.leftovers() == []
 
 
-def test_no_job_starts_without_a_node_that_is_large_enough(settings_of, whole_cluster, tmp_path):
-    with ServiceProcess(tmp_path / "data", **{**settings_of["ray"], "KISSGS_JOB_MEMORY": "2GB"}) as service:
+def test_no_job_starts_without_a_node_that_is_large_enough(on_the_cluster, whole_cluster, tmp_path):
+    with Service(tmp_path / "data", **{**on_the_cluster, "KISSGS_JOB_MEMORY": "2GB"}) as service:
         job = service.submit()
         ready = service.http.get("/readyz")
         assert ready.status_code == 503
@@ -184,25 +182,16 @@ def test_no_job_starts_without_a_node_that_is_large_enough(settings_of, whole_cl
         wait_until(lambda: f"no job is started: {expected}" in service.log.read_text())
 
 
-def test_training_without_the_gpu_that_it_requests_fails_and_does_not_wait(settings_of, tmp_path):
-    with ServiceProcess(tmp_path / "data", **settings_of["ray"], KISSGS_JOB_GPUS=1) as service:
+@pytest.mark.quick(0)  # with a cluster of its own making, in tests/service/test_lost_starts.py
+def test_training_without_the_gpu_that_it_requests_fails_and_does_not_wait(on_the_cluster, tmp_path):
+    with Service(tmp_path / "data", **on_the_cluster, KISSGS_JOB_GPUS=1) as service:
         status = service.ended(service.submit(SMALL, json.dumps({"preset": "fast", "finetune": {"enabled": True}})))
         assert (status["state"], status["problem"]["code"]) == ("failed", "unsupported")
         assert "no node has 1 CPUs and 1 GB of memory and 1 GPUs" in status["problem"]["detail"]
         assert result_of(service, service.submit()) == compressed(SMALL)
 
 
-def test_a_cluster_that_cannot_be_reached_is_a_problem_of_the_settings(ray_cluster, tmp_path):
-    variables = {"KISSGS_RUNNER": "127.0.0.1:1", "KISSGS_DATA_DIR": str(tmp_path / "data")}
-    command = [sys.executable, "-P", "-m", "service"]
-    done = subprocess.run(
-        command,
-        check=False,
-        env={**os.environ, **variables, "PYTHONPATH": PATHS},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 2
-    assert "no Ray cluster answers at 127.0.0.1:1" in done.stderr
-    assert "Traceback" not in done.stderr
+def test_a_cluster_that_cannot_be_reached_is_a_problem_of_the_settings(tmp_path):
+    pytest.importorskip("ray")
+    with pytest.raises(SettingsError, match=r"no Ray cluster answers at 127\.0\.0\.1:1"):
+        create_app(ServiceSettings(runner="127.0.0.1:1", data_dir=tmp_path / "data"))

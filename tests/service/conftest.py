@@ -1,4 +1,7 @@
-"""Fixtures: a service that tests share, and new ones. How jobs run on other machines is tested in tests/runners."""
+"""Fixtures: a service that tests share, and new ones, whose jobs are threads.
+
+How they run in processes, and on other machines, is tested in tests/runners and test_faults.py.
+"""
 
 import pytest
 from helpers.data_folders import jobs_folder, no_variables, sample_folder  # noqa: F401
@@ -30,7 +33,7 @@ def local():
 
 @pytest.fixture
 def start(tmp_path):
-    """``start(KISSGS_X=…)`` starts a service, which ends with the test."""
+    """``start(KISSGS_X=…)`` starts a service, with ``processes=True`` one with job processes."""
     yield from _starter(tmp_path, Service)
 
 

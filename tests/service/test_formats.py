@@ -1,8 +1,6 @@
 """Uploads of other formats; oracle: the library's own compression of the same file."""
 
-import io
 import json
-import zipfile
 
 import pytest
 from helpers.format_scenes import made_scene
@@ -51,27 +49,18 @@ def test_uploads_of_every_format(service, name, tmp_path):
 def test_a_splat_that_begins_like_json(service):
     """The first byte of the file is a brace, and none of its first 512 bytes is zero."""
     data = b"{" + bytes(range(1, 32)) * 17
-    data = data[: 16 * 32]
-    assert b"\0" not in data
-    answer = service.http.post("/v1/jobs", files={"file": ("a.splat", data)}, data={"options": FAST})
-    assert answer.status_code == 202, answer.text
+    answer = service.http.post("/v1/jobs", files={"file": ("a.splat", data[: 16 * 32])}, data={"options": FAST})
     assert service.ended(answer.json())["source_format"] == "splat"
 
 
 ROOT, BUFFER = document(attributes(SCENE))
 TEXT = json.dumps({**ROOT, "buffers": [{"byteLength": len(BUFFER), "uri": data_uri(BUFFER)}]}).encode()
 
-REFUSED = {
+REFUSED = {  # what is damaged is tested in tests/io; here, that the sentence names the upload and not its path
     **{f"a zip of levels, {name}": ("a.zip", zip_of(kind.files([[SCENE]]))) for name, kind in KINDS.items()},
     "a container": ("a.zip", kissgs.compress(SCENE, settings=Settings.from_preset("fast")).to_zip()),
-    "another zip": ("a.sog", zip_of({"notes.txt": b"hello"})),
-    "text": ("a.gltf", TEXT),
     "text with the name of a .glb": ("a.glb", TEXT),
-    "text without a name": ("a", TEXT),
     "a .splat without its name": ("a.bin", splat_bytes(SCENE)),
-    "half a .splat": ("a.splat", splat_bytes(SCENE)[:-1]),
-    "half a .ksplat": ("a.ksplat", FILES["a.ksplat"][1][:-1]),
-    "half a .glb": ("a.glb", FILES["a.glb"][1][:-1]),
     "half a .sog": ("a.sog", FILES["a.sog"][1][:-40]),
     "too many": ("a.spz", FILES["a4.spz"][1][:8] + (30_000).to_bytes(4, "little") + FILES["a4.spz"][1][12:]),
 }
@@ -102,5 +91,3 @@ def test_the_limits_name_the_formats(service):
     assert service.http.get("/v1/limits").json()["formats"] == [
         "ply", "sog", "spz", "splat", "ksplat", "glb", "compressed.ply", "spz.glb",
     ]  # fmt: skip
-    with zipfile.ZipFile(io.BytesIO(FILES["a.sog"][1])) as archive:
-        assert "meta.json" in archive.namelist()

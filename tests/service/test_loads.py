@@ -14,7 +14,7 @@ import uuid
 import pytest
 import uvicorn
 from helpers.running import wait_until
-from helpers.service import SLOW, SMALL, events, problem, read_response, scene_bytes
+from helpers.service import SLOW, SMALL, problem, read_response, scene_bytes
 
 from service.core.metrics import Metrics
 from service.core.problems import ProblemError
@@ -60,34 +60,13 @@ def test_idle_connections_do_not_fail_jobs(start_process):
 @pytest.mark.quick(0)
 def test_abandoned_long_polls_cost_nothing(start):
     service = start(drain_seconds=1)
-    job = service.submit(BIG, SLOW)
-    service.running(job)
+    job = service.hold()
     for _ in range(300):
         with service.raw(b"GET /v1/jobs/%b?wait=30 HTTP/1.1\r\nHost: localhost\r\n\r\n" % job["id"].encode()):
             pass
     assert slowest(service) < 10
     service.interrupt()
     service.join(25)  # it waits for the job only
-
-
-@pytest.mark.quick(0)
-def test_many_event_streams_are_equal(start):
-    service = start()
-    job = service.submit(scene_bytes(4_000, 1))
-    streams = [None] * 30
-
-    def follow(i):
-        streams[i] = service.http.get(job["links"]["events"]).text
-
-    threads = [threading.Thread(target=follow, args=(i,)) for i in range(30)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    # The status in a state event depends on when it was sent.
-    found = [[(number, kind, {**data, "job": None}) for number, kind, data in events(text)] for text in streams]
-    assert all(stream == found[0] for stream in found)
-    assert found[0][-1][2]["state"] == "succeeded"
 
 
 def test_bodies_in_single_bytes_are_rejected(start):
@@ -120,30 +99,16 @@ def test_announced_bodies_reserve_no_disk_space(start):
         with service.raw(
             b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % size
         ) as connection:
-            connection.settimeout(1)
+            connection.settimeout(0.3)
             with contextlib.suppress(TimeoutError):
                 assert b"507" in read_response(connection)
     assert service.http.get(job["links"]["source"]).status_code == 200
-
-
-@pytest.mark.quick(0)
-def test_decoded_scenes_are_reclaimable(start):
-    service = start(KISSGS_MAX_DISK_BYTES=5 * len(SMALL))
-    jobs = [service.ended(service.submit(scene_bytes(300, 1, seed))) for seed in range(2)]
-    for job in jobs:
-        assert service.http.get(job["links"]["decoded"]).status_code == 200
-    assert service.ended(service.submit(scene_bytes(800, 1)))["state"] == "succeeded"
-    assert service.http.get(jobs[0]["links"]["decoded"]).status_code in (200, 507)
-
-
-def test_a_form_reserves_only_its_size(start):
-    service = start(KISSGS_MAX_DISK_BYTES=4 * len(SMALL))
     assert service.http.post("/v1/jobs", files={"file": ("x.ply", SMALL)}).status_code == 202
 
 
 @pytest.mark.quick(0)
 def test_a_decoding_ends_with_its_job(start):
-    service = start()
+    service = start(processes=True)
     job = service.ended(service.submit(scene_bytes(120_000, 3)))
     answers = []
     requesting = threading.Thread(target=lambda: answers.append(service.http.get(job["links"]["decoded"])))
@@ -190,7 +155,7 @@ def test_an_error_in_the_job_process_is_internal(tmp_path):
 @pytest.mark.quick(0)
 def test_a_signal_to_the_process_group_requeues_the_job(start):
     """Some supervisors signal the job process, too."""
-    service = start(drain_seconds=0.5)
+    service = start(processes=True, drain_seconds=0.5)
     job = service.submit(BIG, SLOW)
     service.running(job)
     (child,) = service.children()
@@ -205,23 +170,11 @@ def test_a_signal_to_the_process_group_requeues_the_job(start):
     assert (status["state"] in ("queued", "running"), status["starts"] <= 1) == (True, True)
 
 
-@pytest.mark.quick(0)
-def test_a_second_signal_stops_the_service_at_once(start):
-    service = start(drain_seconds=3600)
-    job = service.submit(BIG, SLOW)
-    service.running(job)
-    service.interrupt()
-    time.sleep(0.5)
-    service.interrupt()
-    service.join()
-    service.restart()
-    assert service.status(job)["state"] in ("queued", "running")
-
-
 @pytest.mark.parametrize("more", [0, 100_000])
 def test_an_upload_while_the_service_stops(start, more):
-    """A stalled upload does not delay the end, either."""
-    service = start()
+    """A stalled upload does not delay the end, either, nor does a job after a second signal."""
+    service = start(drain_seconds=3600 * more)
+    job = service.hold()
     head = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(BIG)
     with service.raw(head + BIG[:100_000]) as connection:
         wait_until(lambda: "kissgs_uploads_in_flight 1.0" in service.http.get("/metrics").text)
@@ -231,7 +184,11 @@ def test_an_upload_while_the_service_stops(start, more):
         answer = read_response(connection)
     assert answer.startswith(b"HTTP/1.1 503")
     assert b'"stopping"' in answer
+    if more:
+        service.interrupt()
     service.join()
+    service.restart()
+    assert service.status(job)["state"] in ("queued", "running")
 
 
 def test_clients_cannot_add_log_lines_or_metric_labels(service):
@@ -278,7 +235,7 @@ def test_refused_methods_list_the_allowed_ones(service):
 
 @pytest.mark.quick(0)
 def test_events_continue_after_a_restart(start):
-    service = start()
+    service = start(processes=True)
     job = service.submit(scene_bytes(6_000, 2))
     service.running(job)
     seen = []

@@ -5,10 +5,8 @@ import json
 
 import pytest
 from helpers.preview_browser import VENDOR
-from helpers.service import FAST, SLOW, SMALL, scene_bytes
+from helpers.service import FAST, SLOW, SMALL
 from helpers.viewers import NO_GPU, chromium
-
-import kissgs
 
 
 @pytest.fixture(scope="module")
@@ -48,54 +46,8 @@ def newest(service):
     return service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
 
 
-def test_upload_compression_and_download(visit, service, tmp_path):
-    page = visit()
-    choose(page)
-    page.get_by_text("300 Gaussians").wait_for()
-    page.get_by_label("Fast").check()
-    page.get_by_role("button", name="Compress").click()
-    page.get_by_text("smaller").first.wait_for()
-    job = newest(service)
-    assert (job["name"], job["options"]["preset"], job["state"]) == ("my scene", "fast", "succeeded")
-    assert f"{job['sizes']['ratio']:#.3g}×" in page.locator("#job").inner_text()
-    preview = page.get_by_role("link", name="Preview")
-    assert (preview.get_attribute("href"), preview.get_attribute("target")) == (job["links"]["preview"], None)
-    with page.expect_download() as download:
-        page.get_by_role("link", name="Download container").click()
-    download.value.save_as(tmp_path / "x.zip")
-    assert download.value.suggested_filename == "my scene.zip"
-    assert (tmp_path / "x.zip").read_bytes() == kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast")).to_zip()
-    with page.expect_download() as download:
-        page.get_by_role("link", name="Decoded .ply").click()
-    assert download.value.suggested_filename == "my scene.decoded.ply"
-
-
-def test_the_choice_of_the_format(visit, service, tmp_path):
-    page = visit()
-    choose(page)
-    page.get_by_text("300 Gaussians").wait_for()
-    page.get_by_label("Fast").check()
-    formats = page.get_by_label("Format", exact=True)
-    assert formats.locator("option").all_inner_texts() == ["SOG-XT (.zip)", "SOG (.sog)"]
-    assert "kissgs" in page.locator("#format-note").inner_text()
-    formats.select_option("SOG (.sog)")
-    assert "other viewers" in page.locator("#format-note").inner_text()
-    page.get_by_role("button", name="Compress").click()
-    page.get_by_text("smaller").first.wait_for()
-    assert newest(service)["options"]["format"] == "sog"
-    assert page.locator(".facts > div", has_text="Format").inner_text().split("\n")[-1] == "SOG (.sog)"
-    rows = page.locator("table.planes tbody th").all_inner_texts()
-    assert {"Colours, opacities", "Rotations", "SH codebook", "SH labels", "Metadata"} <= set(rows)
-    assert not [row for row in rows if "webp" in row]
-    with page.expect_download() as download:
-        page.get_by_role("link", name="Download container (.sog)").click()
-    assert download.value.suggested_filename == "my scene.sog"
-    download.value.save_as(tmp_path / "x.sog")
-    fast = kissgs.Settings(preset="fast")
-    assert (tmp_path / "x.sog").read_bytes() == kissgs.compress(SMALL, settings=fast, container="sog").to_zip()
-
-
-def test_keyboard_operation(visit, service):
+def test_upload_compression_and_download(visit, service, local, tmp_path):
+    """Everything by the keyboard."""
     page = visit()
     choose(page)
     page.get_by_text("300 Gaussians").wait_for()
@@ -106,10 +58,40 @@ def test_keyboard_operation(visit, service):
         page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     page.get_by_text("smaller").first.wait_for()
-    assert newest(service)["options"]["preset"] == "fast"
+    job = newest(service)
+    assert (job["name"], job["options"]["preset"], job["state"]) == ("my scene", "fast", "succeeded")
+    assert f"{job['sizes']['ratio']:#.3g}×" in page.locator("#job").inner_text()
+    preview = page.get_by_role("link", name="Preview")
+    assert (preview.get_attribute("href"), preview.get_attribute("target")) == (job["links"]["preview"], None)
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download container").click()
+    download.value.save_as(tmp_path / "x.zip")
+    assert download.value.suggested_filename == "my scene.zip"
+    assert (tmp_path / "x.zip").read_bytes() == local.to_zip()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Decoded .ply").click()
+    assert download.value.suggested_filename == "my scene.decoded.ply"
+    page.goto(service.url)
+    choose(page)
+    page.get_by_label("Fast").check()
+    formats = page.get_by_label("Format", exact=True)
+    assert formats.locator("option").all_inner_texts() == ["SOG-XT (.zip)", "SOG (.sog)"]
+    assert "kissgs" in page.locator("#format-note").inner_text()
+    formats.select_option("SOG (.sog)")
+    assert "other viewers" in page.locator("#format-note").inner_text()
+    page.get_by_role("button", name="Compress").click()
+    page.get_by_role("link", name="Download container (.sog)").wait_for()
+    assert newest(service)["options"]["format"] == "sog"
+    assert page.locator(".facts > div", has_text="Format").inner_text().split("\n")[-1] == "SOG (.sog)"
+    rows = page.locator("table.planes tbody th").all_inner_texts()
+    assert {"Colours, opacities", "Rotations", "SH codebook", "SH labels", "Metadata"} <= set(rows)
+    assert not [row for row in rows if "webp" in row]
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download container (.sog)").click()
+    assert download.value.suggested_filename == "my scene.sog"
 
 
-def test_goals(visit, service):
+def test_goals_and_a_time_limit(visit, service):
     page = visit()
     choose(page)
     page.get_by_text("300 Gaussians").wait_for()
@@ -127,26 +109,7 @@ def test_goals(visit, service):
     assert (page.locator("#amount").input_value(), page.locator("#unit").inner_text()) == ("0.1", "dB")
     goal.select_option("Preset default")
     assert keep.input_value() == ""
-    goal.select_option("Maximum size")
-    page.locator("#amount").fill("0.008")
-    page.get_by_role("button", name="Compress").click()
-    page.locator("#job-title").wait_for()
-    job = newest(service)
-    service.cancel(job)
-    assert job["options"]["encode"]["target_size"] == 8000
-    assert (job["options"]["compact"]["auto_count"], job["options"]["finetune"]["enabled"]) == (False, False)
-
-
-def facts_of(page):
-    return dict(text.split("\n", 1) for text in page.locator("#job .facts > div").all_inner_texts())
-
-
-def test_a_time_limit(visit, service):
-    page = visit()
-    choose(page)
-    page.get_by_text("300 Gaussians").wait_for()
-    limit, keep = page.get_by_label("Time limit"), page.get_by_label("Gaussians", exact=True)
-    note = page.locator("#time-note")
+    limit, note = page.get_by_label("Time limit"), page.locator("#time-note")
     assert limit.locator("option").all_inner_texts() == ["None", "30 s", "1 min", "2 min", "5 min", "10 min", "30 min"]
     keep.select_option("Keep half")
     assert limit.is_disabled()
@@ -155,7 +118,7 @@ def test_a_time_limit(visit, service):
     limit.select_option("30 s")
     assert keep.get_by_role("option", name="half").is_disabled()
     assert "left is used for fine-tuning. If the preset takes longer, Fast is used" in note.inner_text()
-    page.get_by_label("Goal").select_option("Maximum size")
+    goal.select_option("Maximum size")
     assert "not before the goal is met" in note.inner_text()
     page.locator("#amount").fill("0.008")
     keep.select_option("As many as the goal needs")
@@ -165,36 +128,37 @@ def test_a_time_limit(visit, service):
     page.get_by_label("Fine-tune").uncheck()
     keep.select_option("Keep all")
     page.get_by_role("button", name="Compress").click()
-    page.get_by_text("smaller").first.wait_for()
+    page.locator("#job-title").wait_for()
     job = newest(service)
+    service.cancel(job)
     assert (job["options"]["time_limit"], job["options"]["encode"]["target_size"]) == (30, 8000)
-    found = facts_of(page)
-    assert found["Goal"] == "At most 8.00 kB"
-    assert "limit 30 s" in found["Time"]
+    assert (job["options"]["compact"]["auto_count"], job["options"]["finetune"]["enabled"]) == (False, False)
 
 
-def test_time_limits_are_shorter_than_jobs_may_take(visit, start):
-    page = visit(start(KISSGS_JOB_SECONDS=100))
-    page.locator("#drop").wait_for()
-    assert page.get_by_label("Time limit").locator("option").all_inner_texts() == ["None", "30 s", "1 min"]
-
-
-def test_a_result_that_time_has_changed_says_so(visit, service):
+def test_a_result_shows_its_goal_and_what_time_has_changed(visit, service):
     job = service.ended(service.submit(options=json.dumps({"time_limit": 0.01})))
     assert "encoded with the preset fast" in job["note"]
+    few = {"target_size": 8000, "sensitivity_views": 4, "sensitivity_view_size": 48}
+    options = {"time_limit": 30, "encode": few, "finetune": {"enabled": False}, "for_research": True}
+    limited = service.ended(service.submit(options=json.dumps(options)))
     page = visit()
     page.goto(f"{service.url}/#{job['id']}")
     page.get_by_text("Encoded with the preset fast: balanced would take about").wait_for()
+    page.goto(f"{service.url}/#{limited['id']}")
+    page.locator("#job .facts > div", has_text="At most 8.00 kB").wait_for()
+    facts = dict(text.split("\n", 1) for text in page.locator("#job .facts > div").all_inner_texts())
+    assert facts["Goal"] == "At most 8.00 kB"
+    assert "limit 30 s" in facts["Time"]
 
 
+SEVERAL_GOALS = {
+    "encode": {"target_size": "9kB", "max_psnr_drop": 0.5, "max_ssim_drop": 0.01},
+    "compact": {"auto_count": True},
+    "time_limit": "90s",
+    "format": "sog",
+    "evaluate": True,
+}
 REPEATED = {
-    "several goals": {
-        "encode": {"target_size": "9kB", "max_psnr_drop": 0.5, "max_ssim_drop": 0.01},
-        "compact": {"auto_count": True},
-        "time_limit": "90s",
-        "format": "sog",
-        "evaluate": True,
-    },
     "psnr": {"encode": {"psnr": 38}, "finetune": {"enabled": True}},
     "loss and time": {"encode": {"max_psnr_drop": 0.25}, "time_limit": "1min"},
     "share": {"preset": "fast", "compact": {"ratio": 0.125}},
@@ -220,9 +184,12 @@ def repeat(visit, service):
 
 
 @pytest.mark.parametrize("name", REPEATED)
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_a_repeated_job_has_the_same_options(repeat, service, name):
-    job, page = repeat(REPEATED[name])
+    assert_options_are_kept(service, *repeat(REPEATED[name]))
+
+
+def assert_options_are_kept(service, job, page):
     choose(page)
     page.get_by_text("300 Gaussians").wait_for()
     page.get_by_role("button", name="Compress").click()
@@ -232,8 +199,8 @@ def test_a_repeated_job_has_the_same_options(repeat, service, name):
     assert (again["id"] != job["id"], again["options"]) == (True, job["options"])
 
 
-def test_goals_that_the_form_lacks_are_described_and_can_be_replaced(repeat):
-    _, page = repeat(REPEATED["several goals"])
+def test_goals_that_the_form_lacks_are_described_and_can_be_replaced(repeat, service):
+    job, page = repeat(SEVERAL_GOALS)
     goal, limit = page.locator("#goal"), page.locator("#time")
     label = "As in the earlier job"
     assert goal.evaluate("field => field.selectedOptions[0].text") == label
@@ -246,23 +213,19 @@ def test_goals_that_the_form_lacks_are_described_and_can_be_replaced(repeat):
     assert page.locator("#amount").input_value() == "0.1"
     goal.select_option(label)
     assert page.locator("#amount").is_hidden()
+    assert_options_are_kept(service, job, page)
 
 
-@pytest.mark.parametrize(
-    ("data", "message"), [(b"hello " * 99, "ply"), (SMALL.replace(b"vertex 300\n", b"vertex 99999\n"), "99,999")]
-)
-def test_unsuitable_files_are_rejected_before_the_upload(visit, service, data, message):
-    before = newest(service)["id"] if service.http.get("/v1/jobs").json()["jobs"] else None
+def test_unsuitable_files_are_rejected(visit, service):
     page = visit()
-    choose(page, data)
-    page.locator("#file-error", has_text=message).wait_for()
-    page.get_by_role("button", name="Compress").click()
-    assert before is None or newest(service)["id"] == before
-
-
-def test_refusals_are_shown(visit):
-    page = visit()
-    choose(page, SMALL.replace(b"opacity", b"opaqity"))
+    sent = []
+    page.on("request", lambda request: sent.append(request.method) if "/v1/jobs" in request.url else None)
+    for data, message in ((b"hello " * 99, "ply"), (SMALL.replace(b"vertex 300\n", b"vertex 99999\n"), "99,999")):
+        choose(page, data)
+        page.locator("#file-error", has_text=message).wait_for()
+        page.get_by_role("button", name="Compress").click()
+        assert "POST" not in sent
+    choose(page, SMALL.replace(b"opacity", b"opaqity"))  # found by the service
     page.get_by_role("button", name="Compress").click()
     page.get_by_role("alert").filter(has_text="opacity").wait_for()
 
@@ -270,7 +233,7 @@ def test_refusals_are_shown(visit):
 def test_reload_and_cancel(visit, start):
     service = start()
     page = visit(service)
-    job = service.submit(scene_bytes(20_000, 3), SLOW)
+    job = service.submit(options=SLOW)
     page.goto(f"{service.url}/#{job['id']}")
     page.get_by_role("button", name="Cancel job").wait_for()
     page.reload()
@@ -291,10 +254,14 @@ def test_training_notes_are_shown(visit, start):
     assert "loss" not in page.locator("#live").inner_text()  # screen readers announce only the stage
 
 
-def test_deletion_must_be_confirmed(visit, start):
+def test_deletion_must_be_confirmed_and_names_are_text(visit, start):
     service = start()
-    job = service.ended(service.submit())
+    name = "<img src=x onerror=alert(1)>"
+    job = service.ended(service.http.post("/v1/jobs", content=SMALL, params={"name": name, "options": FAST}).json())
     page = visit(service)
+    page.locator("#recent-list li").first.wait_for()
+    assert page.locator("#recent-list img").count() == 0
+    assert "img src=x" in page.locator("#recent-list").inner_text()
     page.get_by_role("button", name="Delete").first.click()
     page.get_by_role("button", name="Keep it").click()
     assert service.status(job)["state"] == "succeeded"
@@ -304,20 +271,8 @@ def test_deletion_must_be_confirmed(visit, start):
     assert service.http.get("/v1/jobs").json() == {"jobs": []}
 
 
-def test_names_are_inserted_as_text(visit, start):
-    service = start()
-    answer = service.http.post(
-        "/v1/jobs", content=SMALL, params={"name": "<img src=x onerror=alert(1)>", "options": FAST}
-    )
-    service.ended(answer.json())
-    page = visit(service)
-    page.locator("#recent-list li").first.wait_for()
-    assert page.locator("#recent-list img").count() == 0
-    assert "img src=x" in page.locator("#recent-list").inner_text()
-
-
 def test_key_form(visit, start):
-    service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
+    service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}", KISSGS_JOB_SECONDS=100)
     page = visit(service)
     page.get_by_role("textbox", name="Key").fill("wrong")
     page.get_by_role("button", name="Continue").click()
@@ -325,6 +280,8 @@ def test_key_form(visit, start):
     page.get_by_role("textbox", name="Key").fill("secret")
     page.get_by_role("button", name="Continue").click()
     choose(page)
+    times = page.get_by_label("Time limit").locator("option").all_inner_texts()
+    assert times == ["None", "30 s", "1 min"]  # none is longer than jobs may take
     page.get_by_label("Fast").check()
     page.get_by_role("button", name="Compress").click()
     page.get_by_text("smaller").first.wait_for()
@@ -335,11 +292,13 @@ def test_key_form(visit, start):
 
 
 def test_no_horizontal_overflow(visit, service, job):
-    for width, scheme in ((360, "light"), (768, "dark"), (1400, "light")):
-        page = visit(viewport={"width": width, "height": 800}, color_scheme=scheme)
-        for address in ("", f"#{job['id']}"):
-            page.goto(f"{service.url}/{address}")
-            page.locator("#recent-list li").first.wait_for()
+    page = visit()
+    for address in ("", f"#{job['id']}"):
+        page.goto(f"{service.url}/{address}")
+        page.locator("#recent-list li").first.wait_for()
+        for width, scheme in ((360, "light"), (768, "dark"), (1400, "light")):
+            page.emulate_media(color_scheme=scheme)
+            page.set_viewport_size({"width": width, "height": 800})
             assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 

@@ -39,6 +39,14 @@ def test_choosing_files(preview, service):
     code = re.compile(f"blob:|data:|{service.url}/preview/[a-z]+[.]js$")  # of workers
     assert [url for method, url in tab.requests[asked:] if method != "GET" or not code.match(url)] == []
     assert not any("/v1/" in url for _, url in tab.requests)
+    assert not page.locator("#problem").is_visible()
+    page.evaluate(
+        "document.querySelector('#viewport').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
+    )
+    tab.error_message("graphics driver has reset", "reload the page")
+    tab.drop(("a.zip", ZIP))
+    tab.fact("Gaussians", f"{COUNT:,}")
+    tab.error_message("graphics driver has reset")
 
 
 @pytest.mark.quick(0)
@@ -120,7 +128,9 @@ def test_accessibility(preview, service, scheme):
     assert [node for node in controls(tab) if not node[1]] == []
     tab.drop(("a.zip", ZIP), ("a.ply", PLY))
     page.get_by_role("slider").wait_for()
-    tab.shown(COUNT)
+    tab.fact("Gaussians", f"{COUNT:,}")
+    page.locator("#loading").wait_for(state="hidden")
+    assert_focus_is_visible(page)
     tab.drop(("letter.txt", b"Dear reader"))
     tab.error_message("zip")
     found = controls(tab)
@@ -132,6 +142,30 @@ def test_accessibility(preview, service, scheme):
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/[0-9]+/g).map(Number)")
     assert (np.mean(dark) < 60) == (scheme == "dark")
     assert page.evaluate(ANIMATED) == []
+
+
+def assert_focus_is_visible(page):
+    """Assert that the tabulator key reaches every control, and that its focus is seen."""
+    page.locator("#home").focus()
+    seen = []
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        name, outline = page.evaluate(
+            """() => {
+              const at = document.activeElement;
+              const seen = at.classList.contains("handle") ? at.querySelector("span") : at;
+              const { outlineStyle, outlineWidth } = getComputedStyle(seen);
+              return [at.id || at.className || at.tagName, outlineStyle === "none" ? "0" : outlineWidth];
+            }"""
+        )
+        if name == "BODY":
+            break
+        assert re.fullmatch(r"[2-9]px", outline), name
+        seen.append(name)
+    wanted = {"open", "viewport", "handle", "compare", "reset", "background", "fullscreen", "panels", "help", "thumb"}
+    assert wanted <= set(seen)
+    assert seen.count("thumb") == 9
+    assert "file" not in seen
 
 
 def controls(tab):
@@ -175,46 +209,20 @@ ANIMATED = """() => [...document.querySelectorAll("*")].filter((element) => {
 }).map((element) => element.outerHTML)"""
 
 
-def test_every_control_gets_a_visible_focus(preview, service):
-    tab = preview().open(service)
-    tab.drop(("a.zip", ZIP), ("a.ply", PLY))
-    tab.page.get_by_role("slider").wait_for()
-    tab.shown(COUNT)
-    tab.page.locator("#home").focus()
-    seen = []
-    for _ in range(40):
-        tab.page.keyboard.press("Tab")
-        name, outline = tab.page.evaluate(
-            """() => {
-              const at = document.activeElement;
-              const seen = at.classList.contains("handle") ? at.querySelector("span") : at;
-              const { outlineStyle, outlineWidth } = getComputedStyle(seen);
-              return [at.id || at.className || at.tagName, outlineStyle === "none" ? "0" : outlineWidth];
-            }"""
-        )
-        if name == "BODY":
-            break
-        assert re.fullmatch(r"[2-9]px", outline), name
-        seen.append(name)
-    wanted = {"open", "viewport", "handle", "compare", "reset", "background", "fullscreen", "panels", "help", "thumb"}
-    assert wanted <= set(seen)
-    assert seen.count("thumb") == 9
-    assert "file" not in seen
-
-
-@pytest.mark.parametrize("width", [360, 1400])
-@pytest.mark.quick(1)
-def test_no_horizontal_overflow_of_the_preview(preview, service, width):
-    tab = preview(viewport={"width": width, "height": 500}).open(service)
-    assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
+def test_no_horizontal_overflow_of_the_preview(preview, service):
+    tab = preview(viewport={"width": 360, "height": 500}).open(service)
+    assert tab.page.evaluate("document.documentElement.scrollWidth") <= 360
     tab.drop((f"{'a-very-long-name' * 9}.zip", OTHER))
-    tab.shown(OTHERS)
-    assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
-    panel = tab.page.locator("#panel")
-    assert panel.evaluate("(it) => it.scrollWidth <= it.clientWidth")
-    tools = tab.page.locator("#tools").bounding_box()
-    assert tools["x"] >= 0
-    assert tools["x"] + tools["width"] <= width
+    tab.fact("Gaussians", f"{OTHERS:,}")
+    tab.page.locator("#loading").wait_for(state="hidden")
+    for width in (360, 1400):
+        tab.page.set_viewport_size({"width": width, "height": 500})
+        assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
+        panel = tab.page.locator("#panel")
+        assert panel.evaluate("(it) => it.scrollWidth <= it.clientWidth")
+        tools = tab.page.locator("#tools").bounding_box()
+        assert tools["x"] >= 0
+        assert tools["x"] + tools["width"] <= width
 
 
 def served(tab, service, data, name="garden.zip"):
@@ -242,31 +250,38 @@ def test_an_address_and_a_file_have_the_same_statistics(preview, service):
     assert statistics(tab) == remote
 
 
-def test_invalid_addresses(preview, service):
+def test_what_cannot_be_shown(preview, service):
+    """Invalid addresses, a scene without Gaussians, and a small file that claims to be a large scene."""
     tab = preview()
     for address in ("%25E0%25A4%25A.zip", "http://[bad"):
         tab.open(service, f"?src={address}").error_message("not an address")
         assert tab.page.locator("#empty").is_visible()
-
-
-def test_an_empty_scene(preview, service):
+    tab.open(service)
+    assert_progress_never_decreases(tab.page)
     none = kissgs.compress(scene_bytes(0, 0), settings=kissgs.Settings(preset="fast")).to_zip()
-    tab = preview().open(service)
     tab.drop(("none.zip", none))
     tab.shown(0)
     tab.fact("Per Gaussian", "none")
     assert not tab.page.locator("#problem").is_visible()
-
-
-def test_a_small_file_cannot_claim_a_large_scene(preview, service):
     file = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(ZIP)) as original, zipfile.ZipFile(file, "w") as other:
         meta = json.loads(original.read("meta.json")) | {"count": 11_000_000, "gridSide": 3400}
         for name in original.namelist():
             other.writestr(name, json.dumps(meta) if name == "meta.json" else original.read(name))
-    tab = preview().open(service)
     tab.drop(("large.zip", file.getvalue()))
     assert "10000000" in re.sub("[ ,]", "", tab.error_message("arger than", "Gaussians"))
+
+
+def assert_progress_never_decreases(page):
+    states = [(0, 400, 0), (200, 400, 0), (200, 4000, 0), (400, 4000, 3), (4500, 4000, 9)]
+    shares, texts = zip(*page.evaluate(PROGRESS, states), strict=True)
+    assert shares == (None, 0.25, 0.25, 0.25, 1)
+    assert texts[1] == "200 bytes of 400 bytes · 0 of 9 planes"
+    assert page.evaluate(PROGRESS, [(0, 0, 0), (0, 0, 3), (70, 0, 6)]) == [
+        [None, "0 of 9 planes"],
+        [pytest.approx(1 / 3), "3 of 9 planes"],
+        [pytest.approx(2 / 3), "70 bytes · 6 of 9 planes"],
+    ]
 
 
 PROGRESS = """async (states) => {
@@ -280,34 +295,6 @@ PROGRESS = """async (states) => {
   done();
   return seen;
 }"""
-
-
-def test_progress_never_decreases(preview, service):
-    tab = preview().open(service)
-    states = [(0, 400, 0), (200, 400, 0), (200, 4000, 0), (400, 4000, 3), (4500, 4000, 9)]
-    shares, texts = zip(*tab.page.evaluate(PROGRESS, states), strict=True)
-    assert [share or 0 for share in shares] == sorted(share or 0 for share in shares)
-    assert shares == (None, 0.25, 0.25, 0.25, 1)
-    assert texts[1] == "200 bytes of 400 bytes · 0 of 9 planes"
-    assert tab.page.evaluate(PROGRESS, [(0, 0, 0), (0, 0, 3), (70, 0, 6)]) == [
-        [None, "0 of 9 planes"],
-        [pytest.approx(1 / 3), "3 of 9 planes"],
-        [pytest.approx(2 / 3), "70 bytes · 6 of 9 planes"],
-    ]
-
-
-def test_a_lost_webgl_context_is_reported(preview, service):
-    tab = preview().open(service)
-    tab.drop(("a.zip", ZIP))
-    tab.shown(COUNT)
-    assert not tab.page.locator("#problem").is_visible()
-    tab.page.evaluate(
-        "document.querySelector('#viewport').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
-    )
-    tab.error_message("graphics driver has reset", "reload the page")
-    tab.drop(("b.zip", OTHER))
-    tab.fact("Gaussians", f"{OTHERS:,}")
-    tab.error_message("graphics driver has reset")
 
 
 def levels_of(file):

@@ -10,6 +10,7 @@ import zipfile
 
 import httpx
 import pytest
+from helpers.running import wait_until
 from helpers.service import FAST, SMALL, problem, read_response, scene_bytes
 
 from service.core.problems import PROBLEM_TYPES, ProblemError
@@ -33,9 +34,8 @@ def header(count, properties="property float x\n", kind="binary_little_endian"):
 
 FULL = SMALL[: SMALL.index(b"end_header\n") + 11]
 
-HOSTILE = {
+HOSTILE = {  # what is no .ply scene is tested in tests/io; here, what a server makes of any bytes
     "empty": b"",
-    "text": b"hello " * 1000,
     "no end of header": b"ply\n" + b"comment x\n" * 100_000,
     "one endless line": b"ply\ncomment " + b"x" * 1_000_000,
     "zip bomb": bomb(),
@@ -43,17 +43,10 @@ HOSTILE = {
     "html": b"<!doctype html><p>sign in",
     "git lfs": b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 3\n",
     "point cloud": header(3, "property float x\nproperty float y\nproperty float z\n") + bytes(36),
-    "a list": FULL.replace(b"property float x\n", b"property list uchar int x\n") + bytes(99999),
     "truncated": SMALL[:-1],
     "header alone": FULL,
-    "wrong count": SMALL.replace(b"vertex 300\n", b"vertex 301\n"),
     "enormous count": SMALL.replace(b"vertex 300\n", b"vertex 999999999999999999\n"),
-    "count no number": SMALL.replace(b"vertex 300\n", b"vertex 3e2\n"),
-    "negative count": SMALL.replace(b"vertex 300\n", b"vertex -1\n"),
-    "two vertex elements": FULL.replace(b"end_header", b"element vertex 3\nend_header") + bytes(99999),
-    "unknown type": SMALL.replace(b"property float x\n", b"property quux x\n"),
     "nul bytes": b"ply\n" + bytes(70_000),
-    "carriage returns": b"ply\rformat ascii 1.0\relement vertex 0\rend_header\r",
 }
 
 
@@ -130,11 +123,8 @@ def test_too_large(service, chunked):
     answer = submit(service, iter([data[:70_000], *([bytes(100_000)] * 50)]) if chunked else data)
     assert "4,000,000 bytes" in problem(answer, 413, "too-large")["detail"]
     assert service.uploads() == []
-
-
-def test_too_large_uploads_are_refused_before_the_body(service):
     with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000000\r\n\r\n") as connection:
-        assert read_response(connection).startswith(b"HTTP/1.1 413")
+        assert read_response(connection).startswith(b"HTTP/1.1 413")  # before the body
 
 
 INVALID_OPTIONS = [
@@ -158,15 +148,10 @@ def test_invalid_options(service, options, form):
     assert found["errors"][0]["message"]
 
 
-@pytest.mark.parametrize(
-    "kind", ["text/plain", "application/json", "application/x-www-form-urlencoded", "image/png", "x"]
-)
+@pytest.mark.parametrize("kind", ["text/plain", "application/json", "application/x-www-form-urlencoded", "x"])
 def test_unsupported_media_types(service, kind):
     found = problem(submit(service, headers={"Content-Type": kind}), 415, "media-type")
     assert "curl -F" in found["detail"]
-
-
-def test_unsupported_content_encodings(service):
     problem(submit(service, gzip.compress(SMALL), headers={"Content-Encoding": "gzip"}), 415, "media-type")
 
 
@@ -189,22 +174,17 @@ FORMS = {
     "long options": (FORM["Content-Type"], PART % (b"options", b" " * 70_000)),
     "scene twice": (FORM["Content-Type"], (PART % (b"file", SMALL)) * 2 + b"--b--\r\n"),
     "truncated scene": (FORM["Content-Type"], (PART % (b"file", SMALL))[:-2]),
+    "options in two places": (FORM["Content-Type"], OPTIONS + (PART % (b"file", SMALL)) + b"--b--\r\n"),
 }
 
 
 @pytest.mark.parametrize("kind", FORMS)
 def test_invalid_forms(service, kind):
     content_type, body = FORMS[kind]
-    answer = submit(service, body, headers={"Content-Type": content_type}, params={})
+    params = {"options": "{}"} if kind == "options in two places" else {}
+    answer = submit(service, body, headers={"Content-Type": content_type}, params=params)
     problem(answer, 422, "invalid-request")
     assert service.uploads() == []
-
-
-def test_options_in_two_places(service):
-    answer = service.http.post(
-        "/v1/jobs", params={"options": "{}"}, files={"options": (None, "{}"), "file": ("x.ply", SMALL)}
-    )
-    problem(answer, 422, "invalid-request")
 
 
 @pytest.mark.parametrize("key", ["x" * 256, "a b", "é"])
@@ -233,12 +213,6 @@ def test_unknown_resources(service, method, path, status, code):
     problem(service.http.request(method, path), status, code)
 
 
-def test_invalid_waits(service):
-    job = service.submit()
-    for wait in (31, -1, "nan", "soon"):
-        problem(service.http.get(f"/v1/jobs/{job['id']}", params={"wait": wait}), 422, "invalid-request")
-
-
 def test_every_code_is_described(service):
     listed = service.http.get("/v1/problems").json()
     assert [kind["code"] for kind in listed] == list(PROBLEM_TYPES)
@@ -246,11 +220,11 @@ def test_every_code_is_described(service):
         assert service.http.get(f"/v1/problems/{kind['code']}").json() == kind
 
 
-def test_a_full_queue(start):
-    service = start(KISSGS_MAX_QUEUE=2)
-    service.occupy()
-    for _ in range(2):
-        service.submit()
+def test_idempotency_keys_work_with_a_full_queue(start):
+    service = start(KISSGS_MAX_QUEUE=1)
+    service.hold()
+    first = service.submit(**{"Idempotency-Key": "k"})
+    assert service.submit(**{"Idempotency-Key": "k"})["id"] == first["id"]
     answer = submit(service)
     assert problem(answer, 429, "queue-full")["retryable"]
     assert 1 <= int(answer.headers["retry-after"]) <= 300
@@ -258,20 +232,13 @@ def test_a_full_queue(start):
         assert read_response(connection).startswith(b"HTTP/1.1 429")  # before the body
 
 
-def test_idempotency_keys_work_with_a_full_queue(start):
-    service = start(KISSGS_MAX_QUEUE=1)
-    service.occupy()
-    first = service.submit(**{"Idempotency-Key": "k"})
-    assert service.submit(**{"Idempotency-Key": "k"})["id"] == first["id"]
-
-
 def test_too_many_uploads(start):
     service = start(KISSGS_MAX_UPLOADS=1)
     with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\nply\n"):
         http = httpx.Client(base_url=service.url, trust_env=False)
-        wait_for(lambda: "kissgs_uploads_in_flight 1.0" in http.get("/metrics").text)
+        wait_until(lambda: "kissgs_uploads_in_flight 1.0" in http.get("/metrics").text)
         problem(http.post("/v1/jobs", content=SMALL), 429, "too-many-uploads")
-    wait_for(lambda: http.post("/v1/jobs", content=SMALL).status_code == 202)
+    wait_until(lambda: http.post("/v1/jobs", content=SMALL).status_code == 202)
     http.close()
 
 
@@ -300,20 +267,17 @@ def test_minimum_free_disk_space(start):
     assert service.http.get("/livez").status_code == 200
 
 
-def test_a_stalled_upload(start):
-    service = start(upload_idle_seconds=0.5)
-    with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\nply\n") as connection:
+def test_stalled_and_slow_uploads(start):
+    """Single bytes do not keep an upload alive."""
+    service = start(upload_idle_seconds=0.4)
+    head = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\n"
+    with service.raw(head + b"ply\n") as connection:
         answer = read_response(connection)
         assert answer.startswith(b"HTTP/1.1 408")
         assert b"upload-timeout" in answer
     assert service.uploads() == []
-
-
-def test_a_slow_upload(start):
-    """Single bytes do not keep an upload alive."""
-    service = start(upload_idle_seconds=1)
-    connection = service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\n")
-    connection.settimeout(0.2)
+    connection = service.raw(head)
+    connection.settimeout(0.05)
     answer, begun = b"", time.monotonic()
     for byte in SMALL:
         with contextlib.suppress(TimeoutError, ConnectionError):
@@ -336,16 +300,9 @@ def test_a_client_that_disconnects(service):
         b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\n" + SMALL[:30_000]
     ) as connection:
         connection.shutdown(socket.SHUT_RDWR)
-    wait_for(lambda: not service.uploads())
+    wait_until(lambda: not service.uploads())
     assert latest() == before
-    wait_for(lambda: "kissgs_uploads_in_flight 0.0" in service.http.get("/metrics").text)
-
-
-def wait_for(condition, seconds=10):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_until(lambda: "kissgs_uploads_in_flight 0.0" in service.http.get("/metrics").text)
 
 
 def test_invalid_http(service):

@@ -56,10 +56,6 @@ def test_simultaneous_requests_with_one_idempotency_key(start):
     assert service.ended(jobs[0])["state"] == "succeeded"
     assert len(list((service.folder / "jobs").iterdir())) == 1
     assert service.leftovers() == []
-
-
-def test_two_services_cannot_share_a_folder(start):
-    service = start()
     with pytest.raises(SettingsError, match="another service is using"):
         create_app(ServiceSettings(data_dir=service.folder))
     assert service.http.get("/livez").status_code == 200

@@ -32,7 +32,7 @@ def test_a_folder_of_an_earlier_version(jobs_folder):
         database(jobs_folder, f"INSERT INTO meta VALUES ('{name}', 123)")
     with service(jobs_folder) as context:
         assert context.storage.job_ids() == context.store.ids()
-        assert context.store.health_problem() is None
+        assert context.store.monitor.health_problem() is None
         assert finish_a_job(context) in context.store.ids()
 
 
@@ -44,7 +44,7 @@ def test_a_start_after_the_jobs_were_moved_away(jobs_folder):
         finish_a_job(context)
     with service(jobs_folder) as context:
         assert len(context.store.ids()) == 1
-    assert len(list((jobs_folder / "old").iterdir())) == 40
+    assert len(list((jobs_folder / "old").iterdir())) == 12
 
 
 def test_no_jobs_and_a_new_database(tmp_path):
@@ -52,7 +52,7 @@ def test_no_jobs_and_a_new_database(tmp_path):
         pass
     (tmp_path / "data" / "jobs.sqlite").unlink()
     with service(tmp_path / "data") as context:
-        assert context.store.health_problem() is None
+        assert context.store.monitor.health_problem() is None
 
 
 # Orphaned folders ---------------------------------------------------------------------------------------------------

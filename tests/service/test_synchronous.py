@@ -7,28 +7,28 @@ import subprocess
 from urllib.parse import quote
 
 import pytest
-from helpers.service import FAST, ROOT, SLOW, SMALL, problem, scene_bytes
+from helpers.service import FAST, ROOT, SLOW, SMALL, problem
 
 from service.http.routes.common import accepts
 
 
 def test_synchronous_compression(service, local):
-    answer = service.http.post("/v1/compress", content=SMALL, params={"options": FAST})
-    assert (answer.status_code, answer.content) == (200, local.to_zip())
-    job = service.http.get(answer.headers["link"].split(";")[0].strip("<>")).json()
-    assert job["links"]["result"] == answer.headers["content-location"]
-
-
-def test_conditions_are_for_reading(service, local):
-    """Oracle: RFC 9110 13.1.2 and 14.2, 304 and ranges answer GET and HEAD only."""
+    """Oracle for the headers: RFC 9110 13.1.2 and 14.2, 304 and ranges answer GET and HEAD only."""
     headers = {"If-None-Match": "*", "Range": "bytes=0-9"}
     answer = service.http.post("/v1/compress", content=SMALL, params={"options": FAST}, headers=headers)
     assert (answer.status_code, answer.content) == (200, local.to_zip())
+    job = service.http.get(answer.headers["link"].split(";")[0].strip("<>")).json()
+    assert job["links"]["result"] == answer.headers["content-location"]
+    sog = json.dumps({"preset": "fast", "format": "sog"})
+    for options, ending, kind in ((FAST, ".zip", "application/zip"), (sog, ".sog", "application/octet-stream")):
+        answer = service.http.post("/v1/compress", files={"file": ("garden.ply", SMALL)}, data={"options": options})
+        assert (answer.status_code, answer.headers["content-type"]) == (200, kind)
+        assert f'filename="garden{ending}"' in answer.headers["content-disposition"]
 
 
 def test_synchronous_compression_becomes_a_job_after_the_time_limit(start):
-    service = start(sync_seconds=0.5)
-    answer = service.http.post("/v1/compress", content=scene_bytes(20_000, 3), params={"options": SLOW})
+    service = start(sync_seconds=0.3)
+    answer = service.http.post("/v1/compress", content=SMALL, params={"options": SLOW})
     assert answer.status_code == 202
     assert answer.headers["location"] == answer.json()["links"]["self"]
     assert answer.json()["state"] in ("queued", "running")
@@ -85,7 +85,7 @@ def test_the_documented_command_never_overwrites_a_good_container(start, local, 
         line = command.replace("localhost:8000/v1/compress", address)
         return subprocess.run(["sh", "-c", line], cwd=tmp_path, capture_output=True, check=False).returncode
 
-    for scene, options, code in ((scene_bytes(20_000, 3), SLOW, "not-finished"), (b"ply\n", FAST, "invalid-scene")):
+    for scene, options, code in ((SMALL, SLOW, "not-finished"), (b"ply\n", FAST, "invalid-scene")):
         assert run(hasty, scene, options) != 0
         assert target.read_bytes() == b"a good container"
         assert json.loads((tmp_path / "scene.zip.part").read_text())["code"] == code

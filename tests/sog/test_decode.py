@@ -14,7 +14,7 @@ from PIL import Image
 
 from kissgs.core.errors import InvalidContainerError, KissgsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.io.ply import read_ply, write_ply
+from kissgs.io.ply import read_ply
 from kissgs.sog.decode import decode
 
 
@@ -232,23 +232,7 @@ def test_images_far_larger_than_the_scene_take_no_memory():
 
 
 @needs_splat_transform
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [1, 65])
-@pytest.mark.parametrize("name", ["a.sog", "folder/meta.json"])
-@pytest.mark.quick(2)
-def test_splat_transform_writes_what_we_read(name, degree, count, tmp_path):
-    with (tmp_path / "a.ply").open("wb") as file:
-        write_ply(file, made_scene(count, degree))
-    packed = convert(tmp_path / "a.ply", tmp_path / name, "-i", "2")
-    theirs = read_ply(convert(packed, tmp_path / "b.ply"))
-    assert_alike(decode(packed if packed.suffix == ".sog" else packed.parent), theirs, rtol=1e-6, atol=1e-6)
-
-
-@needs_splat_transform
-@pytest.mark.parametrize("version", [1, 2])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [1, 65])
-@pytest.mark.quick(4)
+@pytest.mark.parametrize(("version", "degree", "count"), [(1, 3, 65), (2, 0, 1), (2, 3, 65)])
 def test_splat_transform_reads_the_reference_files_as_we_do(version, degree, count, tmp_path):
     path = tmp_path / "a.sog"
     path.write_bytes(zip_of(sog_files(made_scene(count, degree), version=version)))

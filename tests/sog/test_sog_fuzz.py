@@ -16,19 +16,12 @@ from kissgs.sog.decode import decode
 
 LIMIT = 100_000
 LIMITED = ReadOptions(max_gaussians=LIMIT)
-SOURCES = {version: sog_files(made_scene(20, 1), version=version) for version in (1, 2)}
+FILES = sog_files(made_scene(20, 1))
+FIRST_VERSION = sog_files(made_scene(20, 1), version=1)
 STREAMED = {
     name: kind.files([[made_scene(10, 1)], [made_scene(3, 0)]], environment=made_scene(2, 1))
     for name, kind in KINDS.items()
 }
-
-
-@pytest.mark.parametrize("version", [1, 2])
-@pytest.mark.parametrize("name", ["meta.json", "quats.webp", "means_u.webp", "shN_centroids.webp", "shN_labels.webp"])
-@pytest.mark.quick(5)
-def test_damaged_files(version, name):
-    files = SOURCES[version]
-    check_all(files[name], lambda damaged: decode({**files, name: damaged}, max_gaussians=LIMIT, threads=1))
 
 
 def png(webp):
@@ -38,17 +31,22 @@ def png(webp):
     return file.getvalue()
 
 
-@pytest.mark.parametrize("name", ["quats.webp", "sh0.webp", "means_u.webp", "shN_centroids.webp", "shN_labels.webp"])
-@pytest.mark.quick(2)
-def test_damaged_png(name):
-    files = SOURCES[2]
-    check_all(png(files[name]), lambda damaged: decode({**files, name: damaged}, max_gaussians=LIMIT, threads=1))
+PNG = {name: png(FILES[name]) for name in ("quats.webp", "shN_labels.webp")}
+DAMAGED = {
+    **{f"{name} of version 2": (FILES, name, FILES[name]) for name in FILES if name != "means_l.webp"},
+    **{f"{name} of version 1": (FIRST_VERSION, name, FIRST_VERSION[name]) for name in ("meta.json", "scales.webp")},
+    **{f"{name} as PNG": (FILES, name, data) for name, data in PNG.items()},
+}
+
+
+@pytest.mark.parametrize(("files", "name", "data"), DAMAGED.values(), ids=DAMAGED)
+def test_damaged_files(files, name, data):
+    check_all(data, lambda damaged: decode({**files, name: damaged}, max_gaussians=LIMIT, threads=1))
 
 
 def test_damage_inside_png():
     """Flipped bits end at the checksums of the chunks; here the damage is in what is compressed."""
-    files = SOURCES[2]
-    data = png(files["quats.webp"])
+    data = PNG["quats.webp"]
     start = data.index(b"IDAT") + 4
     size = int.from_bytes(data[start - 8 : start - 4], "big")
     rows = zlib.decompress(data[start : start + size])
@@ -58,19 +56,17 @@ def test_damage_inside_png():
         chunk = b"IDAT" + packed
         middle = len(packed).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
         image = data[: start - 8] + middle + data[start + size + 4 :]
-        return decode({**files, "quats.webp": image}, max_gaussians=LIMIT, threads=1)
+        return decode({**FILES, "quats.webp": image}, max_gaussians=LIMIT, threads=1)
 
     check_all(rows, read)
 
 
-@pytest.mark.parametrize("source", [SOURCES[2], *STREAMED.values()], ids=["one scene", *STREAMED])
+@pytest.mark.parametrize("source", [FILES, *STREAMED.values()], ids=["one scene", *STREAMED])
 def test_damaged_zips(source):
     check_all(zip_of(source), lambda damaged: read_scene(damaged, LIMITED, threads=1))
 
 
-@pytest.mark.parametrize("level", [0, 1])
-@pytest.mark.parametrize("name", STREAMED)
-@pytest.mark.quick(2)
+@pytest.mark.parametrize(("name", "level"), [("streamed-sog", 0), ("streamed-sogxt", 1)])
 def test_damaged_trees(name, level):
     kind, files = KINDS[name], STREAMED[name]
 

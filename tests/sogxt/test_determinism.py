@@ -45,18 +45,19 @@ def test_threads_and_repetition_do_not_change_a_byte(scene, preset):
 
 
 @pytest.mark.quick(0)
-def test_another_process_gives_the_same_bytes(scene):
+def test_another_process_gives_the_same_bytes():
     """Nothing may hang on the order of sets, on addresses, or on the number of BLAS threads."""
     program = (
-        "import hashlib, kissgs; scene = kissgs.sample_scene(3000, sh_degree=3, seed=1); "
-        "print(hashlib.sha256(kissgs.compress(scene, threads=2).to_zip()).hexdigest())"
+        "import hashlib, kissgs, sys; scene = kissgs.sample_scene(3000, sh_degree=3, seed=1); "
+        "print(hashlib.sha256(kissgs.compress(scene, threads=int(sys.argv[1])).to_zip()).hexdigest())"
     )
-    home = str(Path(kissgs.__file__).parents[1])
-    environment = os.environ | {"PYTHONPATH": home, "PYTHONHASHSEED": "7", "OPENBLAS_NUM_THREADS": "2"}
-    run = subprocess.run(
-        [sys.executable, "-P", "-c", program], env=environment, capture_output=True, text=True, check=True
-    )
-    assert run.stdout.strip() == hashlib.sha256(compress(scene, threads=1).to_zip()).hexdigest()
+    home, found = str(Path(kissgs.__file__).parents[1]), []
+    for threads, seed in (("1", "0"), ("2", "7")):
+        environment = os.environ | {"PYTHONPATH": home, "PYTHONHASHSEED": seed, "OPENBLAS_NUM_THREADS": threads}
+        command = [sys.executable, "-P", "-c", program, threads]
+        found.append(subprocess.run(command, env=environment, capture_output=True, check=True).stdout)
+    assert found[0] == found[1]
+    assert len(found[0]) > 64
 
 
 def test_another_seed_gives_other_bytes_and_the_same_positions(scene):
@@ -66,7 +67,7 @@ def test_another_seed_gives_other_bytes_and_the_same_positions(scene):
     assert not changed & {f"{name}.webp" for name in PLANES if not name.startswith("f_rest")}
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", ["fast", "balanced", "paper"])
 def test_the_input_is_not_modified(preset):
     splats = random_scene(200, 2, seed=3)
     before = {name: getattr(splats, name).copy() for name in ATTRIBUTES}
@@ -77,7 +78,7 @@ def test_the_input_is_not_modified(preset):
 
 
 def test_decoding_does_not_modify_the_files_and_owns_its_arrays():
-    files = compress(random_scene(100, 3)).files
+    files = compress(random_scene(100, 3), settings=Settings.from_preset("fast")).files
     before = dict(files)
     first, second = decompress(files), decompress(files)
     assert files == before

@@ -63,14 +63,14 @@ def test_whole_decoding_of_damaged_metadata(name):
     """Only what :func:`meaning` reads must be unchanged: checksums of images may be lost, or wrong."""
     files = dict(FILES) if name == YAML_NAME else {key: data for key, data in FILES.items() if key != YAML_NAME}
     refused = 0
-    for at in np.random.default_rng(3).integers(0, 8 * len(FILES[name]), 150):
+    for at in np.random.default_rng(3).integers(0, 8 * len(FILES[name]), 60):
         text = bytearray(FILES[name])
         text[at // 8] ^= 1 << at % 8
         try:
             assert_same(decompress({**files, name: bytes(text)}))
         except KissgsError:
             refused += 1
-    assert refused > 50
+    assert refused > 20
 
 
 def test_the_checksum_is_the_one_that_the_format_describes():

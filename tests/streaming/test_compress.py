@@ -25,9 +25,12 @@ from kissgs.streaming.levels import bounds
 COUNT = 3000
 
 
+SIZES = {"chunk": 800, "leaf": 150, "coarsest": 500}
+
+
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    small_sizes(monkeypatch, chunk=800, leaf=150, coarsest=500)
+    small_sizes(monkeypatch, **SIZES)
 
 
 @pytest.fixture(scope="module")
@@ -40,28 +43,82 @@ def target(request, tmp_path):
     return tmp_path / request.param
 
 
+@pytest.fixture(scope="module")
+def written(scene, tmp_path_factory):
+    """``written(name)`` returns a manifest that is written once, the report, and the progress by stages."""
+    made = {}
+
+    def write(name):
+        if name not in made:
+            target, stages = tmp_path_factory.mktemp("written") / name, {}
+
+            def progress(stage, fraction, note=""):
+                stages.setdefault(stage, []).append(fraction)
+
+            with pytest.MonkeyPatch.context() as patch:
+                small_sizes(patch, **SIZES)
+                made[name] = target, compress_streamed(scene, target, settings=FAST, progress=progress), stages
+        return made[name]
+
+    return write
+
+
+@pytest.fixture
+def copied(written, target):
+    """A copy of a streamed scene that a test may change."""
+    shutil.copytree(written("/".join(target.parts[-2:]))[0].parent, target.parent)
+    return target
+
+
+@pytest.mark.parametrize("name", TARGETS)
 @pytest.mark.quick(1)
-def test_every_level_is_read_and_every_leaf_has_every_level(scene, target):
-    report = compress_streamed(scene, target, settings=FAST)
+def test_every_level_is_read_and_every_leaf_has_every_level(scene, written, name):
+    target, report, stages = written(name)
     original = kissgs.load(scene)
     document = json.loads(target.read_bytes())
     assert document["lodLevels"] == len(report.counts) == 4
     assert document.get("format") == ("sog-xt" if target.name == "levels.json" else None)
     leaves = tree_leaves(document["tree"])
     assert all(sorted(leaf["lods"]) == ["0", "1", "2", "3"] for leaf in leaves)
+    for leaf in leaves:  # whose errors rise with the level
+        assert leaf["errors"][0] == 0 < leaf["errors"][1]
+        assert leaf["errors"] == sorted(leaf["errors"])
+        assert leaf["errors"][-1] < 0.5
     for level in range(4):
         found = kissgs.load(target, level=level)
         assert len(found) == report.counts[level] == document["counts"][level]
         assert abs(len(found) - len(original) / 2**level) < 0.02 * COUNT + len(leaves)
     assert report.total_bytes == sum(map(len, files_of(target.parent).values()))
     assert not target.parent.with_name(f"{target.parent.name}.partial").exists()
+    distances = np.linalg.norm(kissgs.load(target).means[:, None] - original.means[None], axis=2)
+    assert len(set(distances.argmin(axis=1))) > 0.98 * len(original)
+    assert np.median(distances.min(axis=1)) < 0.1 * np.median(np.sort(distances, axis=1)[:, 1])
+    assert_items_report_within(stages)
+
+
+def assert_items_report_within(stages):
+    """Assert that chunks and files, of which there are four and more, report more than their beginnings, in order."""
+    for stage, items in (("merge", 4), ("images", 5)):
+        own = stages[stage]
+        assert own == sorted(own)
+        for item in range(items - 1):
+            assert any(item / items < fraction < (item + 1) / items for fraction in own)
 
 
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
 @pytest.mark.quick(1)
-def test_rows_of_a_leaf_are_those_of_its_part_of_space(scene, target, preset):
+def test_rows_of_a_leaf_are_those_of_its_part_of_space(scene, written, tmp_path, preset):
     """Leaves are cells between cuts, so that no Gaussian of a leaf, merged or not, is between those of another."""
-    report = compress_streamed(scene, target, settings=Settings.from_preset(preset))
+    if preset == "fast":
+        target, report, _ = written("city/lod-meta.json")
+    else:
+        target, stages = tmp_path / "city" / "lod-meta.json", {}
+
+        def progress(stage, fraction, note=""):
+            stages.setdefault(stage, []).append(fraction)
+
+        report = compress_streamed(scene, target, settings=Settings.from_preset(preset), progress=progress)
+        assert_items_report_within(stages)
     document = json.loads(target.read_bytes())
     decoded = [kissgs.load(target.parent / name) for name in document["filenames"]]
     assert sum(map(len, decoded)) == sum(report.counts)
@@ -85,22 +142,15 @@ def test_rows_of_a_leaf_are_those_of_its_part_of_space(scene, target, preset):
         assert (overlap.min(axis=1) < 0.05 * np.minimum(sides[one], sides[other])).all()
 
 
-@pytest.mark.quick(1)
-def test_the_finest_level_has_every_gaussian_in_its_leaf(scene, target):
-    compress_streamed(scene, target, settings=FAST)
-    found, source = kissgs.load(target).means, kissgs.load(scene).means
-    distances = np.linalg.norm(found[:, None] - source[None], axis=2)
-    assert len(set(distances.argmin(axis=1))) > 0.98 * len(source)
-    assert np.median(distances.min(axis=1)) < 0.1 * np.median(np.sort(distances, axis=1)[:, 1])
-
-
 class Stop(Exception):
     pass
 
 
 @pytest.mark.quick(1)
-def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(scene, target, tmp_path):
-    compress_streamed(scene, tmp_path / "whole" / target.name, settings=FAST)
+def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(target, tmp_path, monkeypatch):
+    kissgs.save(kissgs.sample_scene(1000, sh_degree=0, seed=3), tmp_path / "scene.ply")
+    small_sizes(monkeypatch, chunk=400, leaf=150, coarsest=300)
+    compress_streamed(tmp_path / "scene.ply", tmp_path / "whole" / target.name, settings=FAST)
     expected = files_of(tmp_path / "whole")
     events = 0
     while True:
@@ -112,7 +162,7 @@ def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(scene, target, tm
                 raise Stop
 
         try:
-            compress_streamed(scene, target, settings=FAST, progress=stop)
+            compress_streamed(tmp_path / "scene.ply", target, settings=FAST, progress=stop)
         except Stop:
             events += 1
             assert not target.exists()
@@ -122,11 +172,12 @@ def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(scene, target, tm
     assert files_of(target.parent) == expected
 
 
-def test_work_of_other_settings_or_for_another_container_is_not_continued(scene, tmp_path):
+def test_work_is_continued_with_the_same_settings_for_the_same_container_alone(scene, tmp_path, monkeypatch):
+    """Work that goes on needs no room for what is done: new files take the place of others."""
     target = tmp_path / "city" / "lod-meta.json"
 
     def stop(stage, fraction, note=""):
-        if stage == "images":
+        if stage == "images" and fraction > 0.5:
             raise Stop
 
     with pytest.raises(Stop):
@@ -135,8 +186,23 @@ def test_work_of_other_settings_or_for_another_container_is_not_continued(scene,
     for destination, settings in ((target, other), (target.with_name("levels.json"), FAST)):
         with pytest.raises(OutputError, match=r"city\.partial belongs to other or older work; delete it"):
             compress_streamed(scene, destination, settings=settings)
-    shutil.rmtree(tmp_path / "city.partial")
-    compress_streamed(scene, target, settings=other)
+
+    def again(stage, fraction, note=""):
+        with pytest.raises(OutputError, match="another process works in"):
+            compress_streamed(scene, target, settings=FAST)
+
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100_000))
+    compress_streamed(scene, target, settings=FAST, progress=again)
+    assert len(kissgs.load(target)) > 0
+
+
+@pytest.mark.parametrize("name", ["lod-meta.json", "levels.json"])
+@pytest.mark.quick(0)
+def test_the_number_of_threads_does_not_matter(scene, tmp_path, name):
+    for threads in (1, 3):
+        compress_streamed(scene, tmp_path / str(threads) / name, settings=FAST, threads=threads)
+    assert files_of(tmp_path / "1") == files_of(tmp_path / "3")
 
 
 def test_what_cannot_be_read_leaves_no_work_folder(scene, tmp_path):
@@ -156,23 +222,8 @@ def test_a_full_disk_is_noticed_before_any_work(scene, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_resumed_work_needs_no_room_for_what_is_done(scene, tmp_path, monkeypatch):
-    """Files that are written from then on take the place of others."""
-
-    def stop(now, fraction, note=""):
-        if now == "images" and fraction > 0.5:
-            raise Stop
-
-    with pytest.raises(Stop):
-        compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST, progress=stop)
-    usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100_000))
-    compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST)
-    assert len(kissgs.load(tmp_path / "city" / "lod-meta.json")) > 0
-
-
 def test_invisible_gaussians_are_left_out_and_counted(tmp_path):
-    made = kissgs.sample_scene(COUNT, sh_degree=0, seed=3)
+    made = kissgs.sample_scene(800, sh_degree=0, seed=3)
     opacities, means = made.opacities.copy(), made.means.copy()
     opacities[::7], means[5] = -9.0, np.nan
     kissgs.save(replace(made, opacities=opacities, means=means), tmp_path / "scene.ply")
@@ -180,50 +231,44 @@ def test_invisible_gaussians_are_left_out_and_counted(tmp_path):
     untiled = kissgs.compress(tmp_path / "scene.ply", settings=FAST).report
     assert report.changed["invisible"] == untiled.invisible > len(opacities[::7])
     assert (report.changed["non_finite"], report.changed["pruned_by_rd"]) == (1, 0)
-    assert (report.source_count, report.counts[0]) == (COUNT, untiled.count)
-
-
-def test_leaves_have_errors_that_rise_with_the_level(scene, tmp_path):
-    compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST)
-    leaves = tree_leaves(json.loads((tmp_path / "city" / "lod-meta.json").read_bytes())["tree"])
-    for leaf in leaves:
-        assert leaf["errors"][0] == 0 < leaf["errors"][1]
-        assert leaf["errors"] == sorted(leaf["errors"])
-        assert leaf["errors"][-1] < 0.5
+    assert (report.source_count, report.counts[0]) == (800, untiled.count)
 
 
 @needs_splat_transform
-def test_splat_transform_reads_every_level(scene, tmp_path):
-    target = tmp_path / "city" / "lod-meta.json"
-    report = compress_streamed(scene, target, settings=FAST)
+def test_splat_transform_reads_every_level(written, tmp_path):
+    target, report, _ = written("city/lod-meta.json")
     for level in range(len(report.counts)):
         theirs = kissgs.load(convert(target, tmp_path / f"{level}.ply", "-L", str(level)))
         assert_alike(kissgs.load(target, level=level), theirs, rtol=1e-6, atol=1e-6)
 
 
-def test_other_files_are_never_replaced(scene, target, tmp_path):
+def test_other_files_are_never_replaced(scene, copied, tmp_path):
     """Neither in another folder, nor beside the files of a streamed scene, nor in the work folder."""
-    folder = target.parent
-    folder.mkdir()
-    (folder / "mine.txt").write_text("mine")
-    with pytest.raises(OutputError, match="holds other files"):
-        compress_streamed(scene, target, settings=FAST, overwrite=True)
-    (folder / "mine.txt").unlink()
-    compress_streamed(scene, target, settings=FAST)
-    mine = folder / "0_0" / "mine.txt"
-    mine.parent.mkdir(exist_ok=True)
-    mine.write_text("mine")
+    inner, mine = copied.parent / "0_0" / "mine.txt", copied.parent / "mine.txt"
+    inner.parent.mkdir(exist_ok=True)
+    inner.write_text("mine")
     with pytest.raises(OutputError, match=r"holds other files \(0_0"):
-        compress_streamed(scene, target, settings=FAST, overwrite=True)
+        compress_streamed(scene, copied, settings=FAST, overwrite=True)
+    assert inner.read_text() == "mine"
+    inner.unlink()
+    document = json.loads(copied.read_bytes())
+    document["filenames"] += ["mine.txt", "../mine.txt", "/etc/hosts", "sub/mine.txt"]
+    copied.write_text(json.dumps(document))  # a manifest that names files beside its containers
+    mine.write_text("mine")
+    with pytest.raises(OutputError, match=r"holds other files \(mine\.txt\)"):
+        compress_streamed(scene, copied, settings=FAST, overwrite=True)
     assert mine.read_text() == "mine"
-    (tmp_path / "town.partial").mkdir()
-    (tmp_path / "town.partial" / "mine.txt").write_text("mine")
-    with pytest.raises(OutputError, match=r"town\.partial holds other files"):
-        compress_streamed(scene, tmp_path / "town" / target.name, settings=FAST)
-    assert [path.name for path in (tmp_path / "town.partial").iterdir()] == ["mine.txt"]
+    for folder, named in (("empty", "holds other files"), ("town.partial", r"town\.partial holds other files")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.txt").write_text("mine")
+        target = tmp_path / folder.removesuffix(".partial") / copied.name
+        with pytest.raises(OutputError, match=named):
+            compress_streamed(scene, target, settings=FAST, overwrite=True)
+        assert [path.name for path in (tmp_path / folder).iterdir()] == ["mine.txt"]
 
 
 @pytest.mark.parametrize("problem", ["too deep", "too large"])
+@pytest.mark.quick(2)
 def test_what_is_no_manifest_is_never_replaced(scene, target, problem):
     deep, large = b"[" * 100_000, b'{"filenames": []}' + b" " * MAX_TREE_BYTES
     target.parent.mkdir()
@@ -234,41 +279,28 @@ def test_what_is_no_manifest_is_never_replaced(scene, target, problem):
     assert target.stat().st_size == size
 
 
-def test_what_a_manifest_names_beside_its_containers_is_never_replaced(scene, target):
-    compress_streamed(scene, target, settings=FAST)
-    document = json.loads(target.read_bytes())
-    document["filenames"] += ["mine.txt", "../mine.txt", "/etc/hosts", "sub/mine.txt"]
-    target.write_text(json.dumps(document))
-    (target.parent / "mine.txt").write_text("mine")
-    with pytest.raises(OutputError, match=r"holds other files \(mine\.txt\)"):
-        compress_streamed(scene, target, settings=FAST, overwrite=True)
-    assert (target.parent / "mine.txt").read_text() == "mine"
-
-
 @pytest.mark.quick(0)
-def test_a_streamed_scene_is_replaced_only_if_allowed(scene, target, tmp_path):
+def test_a_streamed_scene_is_replaced_only_if_allowed(scene, copied, tmp_path):
     """A scene of the other kind in the same folder is one too."""
-    compress_streamed(scene, target, settings=FAST)
     with pytest.raises(OutputError, match="exists already"):
-        compress_streamed(scene, target, settings=FAST)
+        compress_streamed(scene, copied, settings=FAST)
     other = Settings.research("fast", sh0_step=0.1)
     for name in ("lod-meta.json", "levels.json", "lod-meta.json"):
-        compress_streamed(scene, target.parent / name, settings=other, overwrite=True)
+        compress_streamed(scene, copied.parent / name, settings=other, overwrite=True)
         shutil.rmtree(tmp_path / "new", ignore_errors=True)
         compress_streamed(scene, tmp_path / "new" / name, settings=other)
-        assert files_of(target.parent) == files_of(tmp_path / "new")
+        assert files_of(copied.parent) == files_of(tmp_path / "new")
 
 
-def test_the_folder_of_levels_of_sogxt_is_named_by_its_ending(scene, tmp_path):
+def test_the_folder_of_levels_of_sogxt_is_named_by_its_ending(scene, written, tmp_path):
     compress_streamed(scene, f"{tmp_path}/city.sogxt/", settings=FAST)
-    compress_streamed(scene, tmp_path / "city" / "levels.json", settings=FAST)
-    assert files_of(tmp_path / "city.sogxt") == files_of(tmp_path / "city")
-    assert "0_0.zip" in files_of(tmp_path / "city")
+    assert files_of(tmp_path / "city.sogxt") == files_of(written("city.sogxt/levels.json")[0].parent)
+    assert "0_0.zip" in files_of(tmp_path / "city.sogxt")
     with pytest.raises(OutputError, match=r"town is no name of a streamed scene"):
         compress_streamed(scene, tmp_path / "town", settings=FAST)
 
 
-@pytest.mark.parametrize("name", ["lod-meta.json", "levels.json", "inner/../lod-meta.json"])
+@pytest.mark.parametrize("name", ["lod-meta.json", "inner/../lod-meta.json"])
 def test_the_current_folder_is_not_replaced(scene, tmp_path, monkeypatch, name):
     (tmp_path / "here" / "inner").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here")
@@ -279,18 +311,6 @@ def test_the_current_folder_is_not_replaced(scene, tmp_path, monkeypatch, name):
     with pytest.raises(OutputError, match=rf"replaced as a whole, but has the current folder in it; {name_it}"):
         compress_streamed(scene, Path("..", name), settings=FAST)
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
-
-
-def test_two_processes_do_not_work_in_one_folder(scene, tmp_path):
-    target = tmp_path / "city" / "lod-meta.json"
-
-    def again(stage, fraction, note=""):
-        if stage == "merge":
-            with pytest.raises(OutputError, match="another process works in"):
-                compress_streamed(scene, target, settings=FAST)
-
-    compress_streamed(scene, target, settings=FAST, progress=again)
-    assert len(kissgs.load(target)) > 0
 
 
 @pytest.mark.parametrize("made", ["link", "mount point", "file"])
@@ -342,29 +362,3 @@ def test_a_missing_folder_above_is_named(scene, tmp_path):
 def test_settings_that_do_not_fit_are_refused(scene, tmp_path, changes):
     with pytest.raises(UnsupportedError):
         compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=Settings.research("fast", **changes))
-
-
-@pytest.mark.parametrize("name", ["lod-meta.json", "levels.json"])
-@pytest.mark.quick(0)
-def test_the_number_of_threads_does_not_matter(scene, tmp_path, name):
-    for threads in (1, 3):
-        compress_streamed(scene, tmp_path / str(threads) / name, settings=FAST, threads=threads)
-    assert files_of(tmp_path / "1") == files_of(tmp_path / "3")
-
-
-@pytest.mark.parametrize("preset", ["fast", "balanced"])
-@pytest.mark.quick(1)
-def test_items_report_within(scene, tmp_path, preset):
-    """Every chunk and file, of which there are four and more, reports more than its beginning, and never goes back."""
-    found = {}
-
-    def progress(stage, fraction, note=""):
-        found.setdefault(stage, []).append(fraction)
-
-    settings = Settings.from_preset(preset)
-    compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=settings, progress=progress)
-    for stage, items in (("merge", 4), ("images", 5)):
-        own = found[stage]
-        assert own == sorted(own)
-        for item in range(items - 1):
-            assert any(item / items < fraction < (item + 1) / items for fraction in own)

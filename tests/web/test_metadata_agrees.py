@@ -59,9 +59,9 @@ def test_odd_spellings():
 
 
 def test_no_changed_byte_changes_the_scene():
-    """Each bit of each byte is flipped, and each byte is replaced by some others."""
+    """Each byte has some of its bits flipped, and is replaced by some others."""
     text = FILES["meta.json"].decode("ascii")
     found = json.loads(run_node("damage_metadata.mjs", text))
     assert found["other"] == []
-    assert found["refused"] > found["same"] > 1000
-    assert found["refused"] + found["same"] == 12 * len(text)
+    assert found["refused"] > found["same"] > 300
+    assert found["refused"] + found["same"] == 4 * len(text)

@@ -13,7 +13,6 @@ from helpers.web_scenes import (
     container,
     in_node,
     job,
-    scene_of,
     ulps,
     with_meta,
     without_checksums,
@@ -36,9 +35,7 @@ def site():
     site.close()
 
 
-@pytest.mark.parametrize(
-    ("preset", "degree"), [*(("fast", d) for d in range(4)), ("balanced", 3), ("small", 1), ("paper", 2)]
-)
+@pytest.mark.parametrize(("preset", "degree"), KINDS)
 @pytest.mark.quick(2)
 def test_every_preset_degree_and_count(preset, degree):
     files = [container(preset, degree, count) for count in COUNTS]
@@ -47,36 +44,6 @@ def test_every_preset_degree_and_count(preset, degree):
         assert sorted(report["planes"]) == sorted(IMAGES)
         assert assert_scene(report, some) <= MAX_ULPS
         assert_progress(report)
-
-
-def extremes():
-    rng = np.random.default_rng(3)
-    count = 100
-    far = rng.normal(size=(count, 3)) * 10.0 ** rng.integers(-6, 7, (count, 1))
-    far[0] = 1e6, -1e6, 1e6
-    wild = np.where(rng.random((count, 3)) < 0.5, -30, 30)
-    infinite = np.resize([np.inf, -np.inf, 0, 3], count)
-    one = scene_of(1, 3)
-    return {
-        "far": scene_of(count, 1, means=far),
-        "tiny": scene_of(count, 0, means=far * 1e-20),
-        "beyond": scene_of(count, 1, means=far * 1e30),
-        "wild": scene_of(count, 2, scales=wild),
-        "infinite": scene_of(count, 0, opacities=infinite),
-        "flat": scene_of(count, 3, means=rng.normal(size=(count, 3)) * [1, 0, 0], sh0=np.zeros((count, 3))),
-        "the same": one.select(np.zeros(count, np.int64)),
-        "dark": scene_of(count, 3, shN=np.zeros((count, 15, 3))),
-        "bright": scene_of(count, 3, shN=rng.normal(size=(count, 15, 3)) * 1e5, sh0=rng.normal(size=(count, 3)) * 1e9),
-    }
-
-
-@pytest.mark.parametrize("preset", ["fast", "paper"])
-def test_extreme_values(preset):
-    files = [
-        dict(kissgs.compress(scene, settings=kissgs.Settings(preset=preset)).files) for scene in extremes().values()
-    ]
-    found = in_node(*(job(some) for some in files))
-    assert max(assert_scene(report, some) for report, some in zip(found, files, strict=True)) <= MAX_ULPS
 
 
 def test_every_kind_of_source(site):

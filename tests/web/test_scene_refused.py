@@ -34,13 +34,13 @@ def without(name):
     return {key: data for key, data in FILES.items() if key != name}
 
 
-@pytest.mark.parametrize("name", ["meta.json", "active_mask.webp", "f_rest_centroids.webp", "means_bytes_0.webp"])
-def test_a_missing_file(name, site):
-    from_zip, from_folder = refusals(
-        job(without(name)), job(site.put(f"without {name}".replace(" ", "-"), without(name)))
+def test_a_missing_file(site):
+    names = ["meta.json", "active_mask.webp", "f_rest_centroids.webp", "means_bytes_0.webp"]
+    found = refusals(
+        *(job(without(name)) for name in names), *(job(site.put(f"without-{name}", without(name))) for name in names)
     )
-    assert from_zip == f"this is no SOG-XT container: it has no {name}"
-    assert from_folder == f"{name} cannot be fetched: the server answers with status 404"
+    assert found[:4] == [f"this is no SOG-XT container: it has no {name}" for name in names]
+    assert found[4:] == [f"{name} cannot be fetched: the server answers with status 404" for name in names]
 
 
 def test_no_server_and_no_address():
@@ -59,7 +59,7 @@ def test_a_damaged_image_is_named():
     """Any flipped bit of the stream makes it undecodable, or changes the checksum of the pixels."""
     cases = []
     for name in (name for name in FILES if name.endswith(".webp")):
-        bits = np.random.default_rng(0).integers(25 * 8, (len(FILES[name]) - 2) * 8, 12)
+        bits = np.random.default_rng(0).integers(25 * 8, (len(FILES[name]) - 2) * 8, 4)
         cases += [(name, flipped(FILES[name], int(bit))) for bit in bits]
     found = in_node(*(job({**FILES, name: data}) for name, data in cases))
     for report, (name, data) in zip(found, cases, strict=True):
@@ -242,8 +242,8 @@ def test_invalid_zips_are_refused():
 
 
 def test_a_zip_bomb_is_not_unpacked():
-    """The file has 256 MiB of zeros and declares them, or declares 5000 bytes; streams may be a few blocks ahead."""
-    bomb = zipped({**FILES, "f_dc.webp": bytes(1 << 28)}, zipfile.ZIP_DEFLATED)
+    """The file has 64 MiB of zeros and declares them, or declares 5000 bytes; streams may be a few blocks ahead."""
+    bomb = zipped({**FILES, "f_dc.webp": bytes(1 << 26)}, zipfile.ZIP_DEFLATED)
     at = central(bomb)
     found = in_node(job(bomb), job(patched(bomb, at + 24, "<I", 5000)))
     assert "more than the" in found[0]["error"]["message"]
@@ -256,23 +256,6 @@ def test_the_most_entries_and_the_longest_comment():
     zips = [zipped({**FILES, **more}), zipped(FILES, comment=b"x" * 65535), zipped(FILES, comment=b"")]
     for report in in_node(*map(job, zips)):
         assert assert_scene(report, FILES) <= 1
-
-
-@pytest.mark.quick(0)
-def test_damage_anywhere_in_a_zip():
-    """Any changed byte gives the same scene or an error of one sentence."""
-    rng = np.random.default_rng(0)
-    zips = [flipped(data, int(bit)) for data in (ZIP, DEFLATED) for bit in rng.integers(0, 8 * len(data), 150)]
-    zips += [data[: int(at)] for data in (ZIP, DEFLATED) for at in rng.integers(0, len(data), 30)]
-    table = ZIP.find(b"PK\1\2")
-    zips += [flipped(ZIP, int(bit)) for bit in rng.integers(8 * table, 8 * len(ZIP), 300)]
-    expected, *found = in_node(job(ZIP), *map(job, zips))
-    assert assert_scene(expected, FILES) <= 1
-    for report in found:
-        if "error" in report:
-            assert report["error"]["name"] == "SogxtError"
-        else:
-            assert report["arrays"] == expected["arrays"]
 
 
 def test_a_number_and_a_list_of_one_number_are_equivalent():

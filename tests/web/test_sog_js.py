@@ -60,7 +60,7 @@ def ours(preset, degree, count):
     return dict(kissgs.compress(scene_of(count, degree), settings=settings, container="sog").files)
 
 
-@pytest.mark.parametrize(("preset", "degree"), [*(("fast", degree) for degree in range(4)), ("balanced", 3)])
+@pytest.mark.parametrize(("preset", "degree"), [("fast", 0), ("fast", 1), ("balanced", 3), ("fast", 2), ("fast", 3)])
 @pytest.mark.quick(2)
 def test_our_containers(preset, degree):
     files = [ours(preset, degree, count) for count in (1, 65, 1000)]
@@ -150,12 +150,12 @@ def test_planes_may_be_png(degree):
 def test_the_filters_of_png():
     """Noise and gradients, for which encoders choose all filters."""
     rng = np.random.default_rng(0)
-    rows = [[min(255, 2 * (i % 90) + i // 90), (i // 90) * 2, int(rng.integers(256))] for i in range(90 * 90)]
+    rows = [[min(255, 4 * (i % 50) + i // 50), (i // 50) * 4, int(rng.integers(256))] for i in range(50 * 50)]
     scene = made_scene(1, 0)
-    files = sog_files(scene.select(np.zeros(90 * 90, np.int64)))
+    files = sog_files(scene.select(np.zeros(50 * 50, np.int64)))
     for channels in (3, 4):
         name = "scales.webp" if channels == 3 else "sh0.webp"
-        files[name] = png(webp([[*row, 255 - row[0]][:channels] for row in rows], 90, 90, channels), compress_level=9)
+        files[name] = png(webp([[*row, 255 - row[0]][:channels] for row in rows], 50, 50, channels), compress_level=9)
     (report,) = in_node(sog_job(files))
     assert_equal(report, files)
 

@@ -1,4 +1,4 @@
-"""Rendering by Spark; reference: ``kissgs.render``, and textbook spherical harmonics for colours.
+"""Rendering by Spark; reference: ``kissgs.render``.
 
 ``pytest --log-cli-level INFO`` shows how close they are.
 """
@@ -6,16 +6,14 @@
 import base64
 import logging
 from dataclasses import replace
-from math import factorial
 
 import numpy as np
 import pytest
 from helpers.viewers import chromium, pinhole, psnr
 from helpers.web_tools import DECODER, Site
-from scipy.special import lpmv
 
 import kissgs
-from kissgs.core.splats import ATTRIBUTES, SH_C0, SH_REST_COUNTS, Splats
+from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
 from kissgs.rendering.camera import Camera, look_at
 
 pytestmark = pytest.mark.skipif(not (DECODER / "vendor").exists(), reason="scripts/vendor has not run")
@@ -141,7 +139,7 @@ FRONT = seen_from((1.2, -2.2, -5.2))
 SIDE = skewed(seen_from((-4.5, -2.6, 2.0)))
 
 
-@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("degree", [3, 1])
 @pytest.mark.quick(1)
 def test_images_agree_with_the_rasteriser(page, degree):
     splats = kissgs.sample_scene(5000, sh_degree=degree)
@@ -210,42 +208,6 @@ def test_an_antialiased_scene_is_drawn_with_compensated_opacities(page, ending, 
     assert psnr(expected(splats, FRONT), expected(classic, FRONT)) < 30
     (again,) = draw(page, classic, [FRONT])
     assert psnr(again, expected(classic, FRONT)) > 40
-
-
-def spherical_harmonic(degree, order, direction):
-    """Return the real spherical harmonic with the Condon-Shortley phase, by associated Legendre functions."""
-    x, y, z = direction
-    size = abs(order)
-    scale = np.sqrt((2 * degree + 1) / (4 * np.pi) * factorial(degree - size) / factorial(degree + size))
-    wave = np.cos if order >= 0 else np.sin
-    return (np.sqrt(2) if order else 1) * scale * lpmv(size, degree, z) * wave(size * np.arctan2(y, x))
-
-
-@pytest.mark.parametrize("degree", [1, 2, 3])
-def test_colours_of_one_gaussian_from_all_sides(page, degree):
-    rng = np.random.default_rng(degree)
-    bands = [(band, order) for band in range(1, degree + 1) for order in range(-band, band + 1)]
-    strength = np.array([0.6 / band for band, _ in bands], np.float32)
-    shN = rng.choice([-1, 1], (1, len(bands), 3)) * rng.uniform(0.5, 1, (1, len(bands), 3)) * strength[:, None]
-    one = Splats(
-        means=np.array([[0.3, -0.2, 0.5]], np.float32),
-        quats=np.array([[0.5, -0.5, 0.5, 0.5]], np.float32),
-        scales=np.log(np.array([[0.1, 0.2, 0.3]], np.float32)),
-        opacities=np.array([12.0], np.float32),
-        sh0=np.array([[0.2, -0.1, 0.1]], np.float32),
-        shN=shN.astype(np.float32),
-    )
-    sides = rng.normal(size=(6, 3))
-    sides /= np.linalg.norm(sides, axis=1)[:, None]
-    cameras = [seen_from(one.means[0] - 4 * side, one.means[0], (41, 41), 0.3) for side in sides]
-    worst = 0
-    for side, image in zip(sides, draw(page, one, cameras), strict=True):
-        basis = np.array([spherical_harmonic(band, order, side) for band, order in bands])
-        colour = 0.5 + SH_C0 * one.sh0[0] + basis @ one.shN[0]
-        worst = max(worst, np.abs(image[20, 20] - colour.clip(0, 1)).max())
-        assert np.ptp(colour) > 0.05
-    log.info("degree %d: colours within %.1f of 255", degree, 255 * worst)
-    assert worst < 3 / 255
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -26,31 +26,35 @@ def argb(count, seed=0):
     return np.random.default_rng(seed).integers(0, 1 << 32, count).tolist()
 
 
-def check_like_pillow(folder, *writers, channels=4):
+ACCEPTED = []
+REFUSED = []
+
+
+def accepted(make):
+    """Register streams that both decoders read to the same pixels."""
+    ACCEPTED.append(make)
+    return make
+
+
+def refused(why):
+    """Register streams that both decoders refuse, this one with these words."""
+
+    def register(make):
+        REFUSED.append((make, why))
+        return make
+
+    return register
+
+
+def assert_like_pillow(name, data, got, channels=4):
     """Check that both decoders return the same pixels or refuse the file."""
-    files = [writer.file() for writer in writers]
-    for number, (data, got) in enumerate(zip(files, decode_all(folder, files, pixels=True), strict=True)):
-        wanted = pillow(data)
-        if wanted is None:
-            assert got["name"] == "WebPError", (number, got)
-            continue
-        assert "rgba" in got, (number, got)
-        found = np.frombuffer(base64.b64decode(got["rgba"]), np.uint8).reshape(got["height"], got["width"], 4)
-        assert (found[:, :, :channels] == wanted[:, :, :channels]).all(), number
-
-
-def accepted(folder, *writers, channels=4):
-    assert all(pillow(writer.file()) is not None for writer in writers)
-    check_like_pillow(folder, *writers, channels=channels)
-
-
-def refused(folder, *writers, why=""):
-    """Check that both decoders refuse the files."""
-    files = [writer.file() for writer in writers]
-    assert [pillow(data) for data in files] == [None] * len(files)
-    for got in decode_all(folder, files):
-        assert got.get("name") == "WebPError", got
-        assert why in got["error"]
+    wanted = pillow(data)
+    if wanted is None:
+        assert got["name"] == "WebPError", (name, got)
+        return
+    assert "rgba" in got, (name, got)
+    found = np.frombuffer(base64.b64decode(got["rgba"]), np.uint8).reshape(got["height"], got["width"], 4)
+    assert (found[:, :, :channels] == wanted[:, :, :channels]).all(), name
 
 
 def plain(width, height, seed=0):
@@ -70,20 +74,25 @@ def with_tiles(kind, bits, width, height, pixel):
     return writer
 
 
-def test_plain_noise(tmp_path):
-    accepted(tmp_path, plain(1, 1), plain(5, 3), plain(33, 17))
+@accepted
+def plain_noise():
+    return [plain(1, 1), plain(5, 3), plain(33, 17)]
 
 
-def test_every_predictor_of_noise(tmp_path):
+@accepted
+def every_predictor_of_noise():
     """Modes 14 and 15 mean black; other bits of the tiles are ignored; narrow images have no pixel to the right."""
-    sizes = (40, 19), (1, 9), (2, 9), (9, 1), (17, 33)
+    writers = []
     for mode in range(16):
         tile = 0xFF0000FF | mode << 8
-        writers = [with_tiles(PREDICTOR, 4, *size, lambda _, tile=tile: tile) for size in sizes]
-        accepted(tmp_path, *writers, with_tiles(PREDICTOR, 3, 30, 30, lambda i, mode=mode: (0xF0 | mode) << 8 | i))
+        sizes = (40, 19), (1, 9), (2, 9), (9, 1), (17, 33)
+        writers += [with_tiles(PREDICTOR, 4, *size, lambda _, tile=tile: tile) for size in sizes]
+        writers.append(with_tiles(PREDICTOR, 3, 30, 30, lambda i, mode=mode: (0xF0 | mode) << 8 | i))
+    return writers
 
 
-def test_every_size_of_tiles(tmp_path):
+@accepted
+def every_size_of_tiles():
     writers = []
     for bits in range(2, 10):
         side = (1 << bits) + 5 if bits < 8 else 40
@@ -92,15 +101,13 @@ def test_every_size_of_tiles(tmp_path):
             with_tiles(CROSS_COLOUR, bits, side, 21, lambda i: i * 2654435761 & 0xFFFFFFFF),
             with_tiles(PREDICTOR, bits, 21, side, lambda i: i % 14 << 8),
         ]
-    accepted(tmp_path, *writers)
+    return writers
 
 
-def test_every_factor_of_cross_colour(tmp_path):
+@accepted
+def every_factor_of_cross_colour():
     """Factors are signed bytes from -128 to 127, two tiles of each."""
-    accepted(
-        tmp_path,
-        *(with_tiles(CROSS_COLOUR, 2, 64, 64, lambda i, at=at: (i % 256) << at) for at in (0, 8, 16)),
-    )
+    return [with_tiles(CROSS_COLOUR, 2, 64, 64, lambda i, at=at: (i % 256) << at) for at in (0, 8, 16)]
 
 
 def made_transforms_in_any_order(order):
@@ -114,8 +121,9 @@ def made_transforms_in_any_order(order):
     return writer
 
 
-def test_transforms_in_any_order(tmp_path):
-    accepted(tmp_path, *map(made_transforms_in_any_order, [(2, 0, 1), (1, 2, 0), (0, 1, 2), (0, 2), (1, 0), (2, 1)]))
+@accepted
+def transforms_in_any_order():
+    return list(map(made_transforms_in_any_order, [(2, 0, 1), (1, 2, 0), (0, 1, 2), (0, 2), (1, 0), (2, 1)]))
 
 
 def made_palette(size, before, others):
@@ -142,16 +150,18 @@ def made_palette(size, before, others):
     return writer
 
 
-def test_palettes_with_indices_beyond_their_end(tmp_path):
+@accepted
+def palettes_with_indices_beyond_their_end():
     """Transforms after a palette apply to packed pixels."""
     sizes, others = (
         (1, 2, 3, 4, 5, 15, 16, 17, 200, 256),
         ((), (SUBTRACT_GREEN,), (PREDICTOR,), (CROSS_COLOUR, PREDICTOR)),
     )
-    accepted(tmp_path, *(made_palette(*case) for case in itertools.product(sizes, (True, False), others)))
+    return [made_palette(*case) for case in itertools.product(sizes, (True, False), others)]
 
 
-def test_codes_of_one_and_two_symbols(tmp_path):
+@accepted
+def codes_of_one_and_two_symbols():
     """Codes are simple or not, of one symbol of any length, of two equal symbols, or of a one-bit first symbol."""
 
     def green_of(write):
@@ -169,14 +179,13 @@ def test_codes_of_one_and_two_symbols(tmp_path):
     def only(length, symbol):
         return lambda writer: writer.code([0] * symbol + [length], 280)
 
-    accepted(
-        tmp_path,
+    return [
         *(green_of(lambda writer, pair=pair: writer.simple(*pair)) for pair in [(3,), (3, 200), (200, 3), (0, 1)]),
         green_of(lambda writer: writer.simple(9, 9)),
         green_of(one_bit),
         *(green_of(only(length, 77)) for length in (1, 2, 8, 15)),
         green_of(lambda writer: writer.code([0] * 50 + [1, 1], 280)),
-    )
+    ]
 
 
 def made_codes_up_to_15_bits(longest):
@@ -192,12 +201,14 @@ def made_codes_up_to_15_bits(longest):
     return writer
 
 
-def test_codes_up_to_15_bits(tmp_path):
+@accepted
+def codes_up_to_15_bits():
     """One symbol of each length gives the longest possible codes, with one or two tables."""
-    accepted(tmp_path, *map(made_codes_up_to_15_bits, range(1, 16)))
+    return list(map(made_codes_up_to_15_bits, range(1, 16)))
 
 
-def test_code_lengths_in_all_encodings(tmp_path):
+@accepted
+def code_lengths_in_all_encodings():
     """Repeats 16, 17 and 18, also at the beginning (16 repeats 8 there), and a number of lengths."""
     writer = Writer(16, 16)
     writer.put(0, 3)
@@ -228,7 +239,7 @@ def test_code_lengths_in_all_encodings(tmp_path):
     for value in range(256):
         writer.symbol(green, value)
     assert len(rest) == 4
-    accepted(tmp_path, writer)
+    return [writer]
 
 
 def made_colour_caches(bits):
@@ -254,12 +265,14 @@ def made_colour_caches(bits):
     return writer
 
 
-def test_colour_caches(tmp_path):
+@accepted
+def colour_caches():
     """Caches of all sizes, with pixels from filled and from empty slots, which are transparent black."""
-    accepted(tmp_path, *map(made_colour_caches, range(1, 12)))
+    return list(map(made_colour_caches, range(1, 12)))
 
 
-def test_a_colour_from_an_empty_slot_is_put_into_the_cache(tmp_path):
+@accepted
+def a_colour_from_an_empty_slot_is_put_into_the_cache():
     """The colour of an empty slot is 0, which then replaces the colour in slot 0."""
     bits = 1
     kept = next(value for value in range(0xFF000001, 0xFFFFFFFF) if (0x1E35A7BD * value & 0xFFFFFFFF) >> 31 == 0)
@@ -272,7 +285,7 @@ def test_a_colour_from_an_empty_slot_is_put_into_the_cache(tmp_path):
     writer.pixel(codes, kept)
     writer.symbol(codes[0], 281)
     writer.symbol(codes[0], 280)
-    accepted(tmp_path, writer)
+    return [writer]
 
 
 def made_every_distance_and_length(width):
@@ -314,9 +327,10 @@ def made_every_distance_and_length(width):
     return writer
 
 
-def test_every_distance_and_length(tmp_path):
+@accepted
+def every_distance_and_length():
     """Includes the 120 near distances; those that are not positive mean the previous pixel."""
-    accepted(tmp_path, *map(made_every_distance_and_length, [1, 2, 5, 9, 40]))
+    return list(map(made_every_distance_and_length, [1, 2, 5, 9, 40]))
 
 
 def made_groups_of_codes(bits):
@@ -336,12 +350,14 @@ def made_groups_of_codes(bits):
     return writer
 
 
-def test_groups_of_codes(tmp_path):
+@accepted
+def groups_of_codes():
     """Each tile has a group, whose number takes both bytes; some groups are never used."""
-    accepted(tmp_path, *map(made_groups_of_codes, range(2, 10)))
+    return list(map(made_groups_of_codes, range(2, 10)))
 
 
-def test_groups_of_codes_that_are_not_used(tmp_path):
+@accepted
+def groups_of_codes_that_are_not_used():
     """All tiles use group 300, so that 301 groups are written and one is used."""
     writer = Writer(9, 9)
     writer.put(0, 2)
@@ -351,7 +367,7 @@ def test_groups_of_codes_that_are_not_used(tmp_path):
     for i in range(301):
         for symbol in (i & 255, 1, 2, 255, 0):
             writer.simple(symbol)
-    accepted(tmp_path, writer)
+    return [writer]
 
 
 @pytest.mark.parametrize("hint", [0, 1])
@@ -361,9 +377,9 @@ def test_alpha_does_not_depend_on_the_hint(hint, tmp_path):
     writer.put(0, 1)
     pixels = argb(24)
     writer.image(pixels, main=True)
-    check_like_pillow(tmp_path, writer, channels=3 + hint)
+    (got,) = decode_all(tmp_path, [writer.file()], pixels=True)
+    assert_like_pillow(f"hint {hint}", writer.file(), got, channels=3 + hint)
     wanted = np.array(pixels, dtype=np.uint32).view(np.uint8).reshape(-1, 4)[:, [2, 1, 0, 3]]
-    (got,) = decode_all(tmp_path, [writer.file()])
     assert got["sha256"] == hashlib.sha256(np.ascontiguousarray(wanted)).hexdigest()
 
 
@@ -383,8 +399,9 @@ def made_a_transform_twice(kind):
     return writer
 
 
-def test_a_transform_twice(tmp_path):
-    refused(tmp_path, *map(made_a_transform_twice, range(4)), why="a transform that occurs twice")
+@refused("a transform that occurs twice")
+def a_transform_twice():
+    return list(map(made_a_transform_twice, range(4)))
 
 
 def made_other_versions(version):
@@ -394,8 +411,9 @@ def made_other_versions(version):
     return writer
 
 
-def test_other_versions(tmp_path):
-    refused(tmp_path, *map(made_other_versions, range(1, 8)), why="version")
+@refused("version")
+def other_versions():
+    return list(map(made_other_versions, range(1, 8)))
 
 
 def made_caches_of_invalid_size(bits):
@@ -410,8 +428,9 @@ def made_caches_of_invalid_size(bits):
     return writer
 
 
-def test_caches_of_invalid_size(tmp_path):
-    refused(tmp_path, *map(made_caches_of_invalid_size, [0, 12, 13, 14, 15]), why="cache")
+@refused("cache")
+def caches_of_invalid_size():
+    return list(map(made_caches_of_invalid_size, [0, 12, 13, 14, 15]))
 
 
 def made_code(lengths, which):
@@ -423,10 +442,15 @@ def made_code(lengths, which):
     return writer
 
 
-def test_incomplete_and_oversubscribed_codes(tmp_path):
+@accepted
+def codes_of_one_long_symbol():
+    return [made_code([2], which) for which in range(5)]
+
+
+@refused("prefix code")
+def incomplete_and_oversubscribed_codes():
     wrong = [], [1, 2], [1, 1, 1], [1, 2, 2, 2], [3] * 7, [3] * 9, [15] * 2, [1, *[15] * 200]
-    accepted(tmp_path, *(made_code([2], which) for which in range(5)))
-    refused(tmp_path, *itertools.starmap(made_code, itertools.product(wrong, range(5))), why="prefix code")
+    return list(itertools.starmap(made_code, itertools.product(wrong, range(5))))
 
 
 def test_copies_from_outside_the_image(tmp_path):
@@ -441,10 +465,13 @@ def test_copies_from_outside_the_image(tmp_path):
         writer.symbol(codes[4], distance)
         writer.put(0, 200)
         writers.append(writer)
-    check_like_pillow(tmp_path, *writers)
+    files = [writer.file() for writer in writers]
+    for number, (data, got) in enumerate(zip(files, decode_all(tmp_path, files, pixels=True), strict=True)):
+        assert_like_pillow(number, data, got)
 
 
-def test_more_code_lengths_than_symbols(tmp_path):
+@refused("more code lengths")
+def more_code_lengths_than_symbols():
     """The number of code lengths exceeds the alphabet."""
     counted = Writer(4, 4)
     counted.put(0, 3)
@@ -456,21 +483,38 @@ def test_more_code_lengths_than_symbols(tmp_path):
     counted.put(7, 3)
     counted.put(0xFFFF, 16)
     counted.put(0, 4000)
-    refused(tmp_path, counted, why="more code lengths")
+    return [counted]
 
 
-def test_a_symbol_outside_its_alphabet(tmp_path):
+@refused("prefix code")
+def a_symbol_outside_its_alphabet():
     """The alphabet of distances has 40 symbols."""
     writer = Writer(2, 2)
     writer.put(0, 3)
     for symbol in (1, 2, 3, 4, 200):
         writer.simple(symbol)
-    refused(tmp_path, writer, why="prefix code")
+    return [writer]
 
 
-def test_one_of_two_symbols_outside_its_alphabet(tmp_path):
+@accepted
+def one_of_two_symbols_outside_its_alphabet():
     writer = Writer(2, 2)
     writer.put(0, 3)
     for symbols in ((1,), (2,), (3,), (4,), (3, 200)):
         writer.simple(*symbols)
-    accepted(tmp_path, writer)
+    return [writer]
+
+
+def test_streams_that_both_decoders_read(tmp_path):
+    cases = [(make.__name__, writer.file()) for make in ACCEPTED for writer in make()]
+    for (name, data), got in zip(cases, decode_all(tmp_path, [data for _, data in cases], pixels=True), strict=True):
+        assert pillow(data) is not None, name
+        assert_like_pillow(name, data, got)
+
+
+def test_streams_that_both_decoders_refuse(tmp_path):
+    cases = [(make.__name__, why, writer.file()) for make, why in REFUSED for writer in make()]
+    for (name, why, data), got in zip(cases, decode_all(tmp_path, [data for *_, data in cases]), strict=True):
+        assert pillow(data) is None, name
+        assert got.get("name") == "WebPError", (name, got)
+        assert why in got["error"], name

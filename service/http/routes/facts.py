@@ -19,12 +19,12 @@ from ...core.problems import PROBLEM_TYPES, ProblemError
 from ...core.schemas import Health, Limits, Presets, ProblemKind, Version
 from ...jobs.container import Service, ServiceContainer
 from ...storage.database import error_text
+from ...storage.job_files import ORPHANED
 from .common import MAX_WAIT_SECONDS, NO_STORE, problems
 
 router = APIRouter()
 
 API_VERSION = "1.0"
-CONTAINER = "SOG-XT"
 
 
 @router.get("/v1/limits", tags=["facts"], operation_id="limits", summary="Get the limits")
@@ -81,7 +81,7 @@ async def get_problem(code: Annotated[str, Path(description="Code of a problem t
 @router.get("/version", tags=["health"], operation_id="version", summary="Get the version")
 async def get_version() -> Version:
     """Versions of the library and of this API, and the default container format."""
-    return Version(kissgs=kissgs.__version__, api=API_VERSION, container=CONTAINER)
+    return Version(kissgs=kissgs.__version__, api=API_VERSION, container="SOG-XT")
 
 
 @router.head("/livez", include_in_schema=False)
@@ -115,8 +115,8 @@ async def _check(context: ServiceContainer) -> Health:
         "disk": await run_sync(_disk_problem, context),
     }
     checks = {part: text or "ok" for part, text in found.items()}
-    if orphaned := await run_sync(context.storage.orphaned_note):
-        checks["orphaned"] = orphaned
+    if count := await run_sync(context.storage.count_orphaned):
+        checks["orphaned"] = f"folders without a job in jobs/{ORPHANED} of the data folder: {count}"
     return Health(ready=not any(found.values()), checks=checks)
 
 
@@ -136,7 +136,7 @@ async def get_metrics(context: Service) -> Response:
 
 
 def _database_problem(context: ServiceContainer) -> str | None:
-    problem = context.store.health_problem()
+    problem = context.store.monitor.health_problem()
     if problem is None:
         try:
             context.store.heartbeat()

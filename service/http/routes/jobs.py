@@ -6,7 +6,7 @@ import logging
 from typing import Annotated, Any
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from ...core.models import ACTIVE, Job, State
@@ -18,9 +18,6 @@ from .common import MAX_WAIT_SECONDS, NO_STORE, RequestedJob, accepts, problems,
 from .results import CONTAINER_TYPES, container
 
 log = logging.getLogger("kissgs.service")
-
-FOLLOW_UP = ("Location", "Retry-After")
-"""Headers that tell a client where its job is, and when to look next."""
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
@@ -45,6 +42,21 @@ IdempotencyKey = Annotated[
         pattern="^[!-~]+$",
     ),
 ]
+
+
+async def _submit(
+    context: Service,
+    request: Request,
+    owner: Owner,
+    options: Options = None,
+    name: Name = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Job:
+    return await submit(context, request, owner, options=options, name=name, key=idempotency_key)
+
+
+SubmittedJob = Annotated[Job, Depends(_submit)]
+
 Wait = Annotated[float, Query(description="Maximum wait for the end of the job, seconds.", ge=0, le=MAX_WAIT_SECONDS)]
 
 _REFUSALS = (
@@ -110,21 +122,12 @@ _EVENT: dict[str, Any] = {
     openapi_extra=_BODY,
     responses={**_ACCEPTED, **problems(*_REFUSALS)},
 )
-async def submit_job(
-    request: Request,
-    response: Response,
-    context: Service,
-    owner: Owner,
-    options: Options = None,
-    name: Name = None,
-    idempotency_key: IdempotencyKey = None,
-) -> JobStatus:
+async def submit_job(context: Service, response: Response, job: SubmittedJob) -> JobStatus:
     """Upload a scene and create a job that compresses it.
 
     The header of a `.ply` and the limits are checked during the upload, headers of other formats after it. After the
     response, the job is stored on disk and survives a crash of the service.
     """
-    job, _ = await submit(context, request, owner, options=options, name=name, key=idempotency_key)
     return await _accepted(context, response, job)
 
 
@@ -143,21 +146,13 @@ async def submit_job(
         **problems(*_REFUSALS, "crashed", "cancelled", "not-finished", "not-found"),
     },
 )
-async def compress_now(
-    request: Request,
-    context: Service,
-    owner: Owner,
-    options: Options = None,
-    name: Name = None,
-    idempotency_key: IdempotencyKey = None,
-) -> Response:
+async def compress_now(context: Service, request: Request, job: SubmittedJob) -> Response:
     """Submit a scene and answer with its container, if the job succeeds within `sync_seconds` of `/v1/limits`.
 
     After that time the job continues, and the answer is 202 with its status as JSON. A client whose `Accept` header
     excludes JSON gets a 409 problem instead (`not-finished`), with `Location`, so that a program that saves every
     successful answer as a container never saves a status.
     """
-    job, _ = await submit(context, request, owner, options=options, name=name, key=idempotency_key)
     job = await wait_for_end(context, job, context.settings.sync_seconds, request)
     if job.state == State.SUCCEEDED:
         result = f"/v1/jobs/{job.id}/result"
@@ -176,7 +171,8 @@ async def compress_now(
             f"the job has not ended yet and continues; wait for it with GET /v1/jobs/{job.id}?wait="
             f"{MAX_WAIT_SECONDS:g}, then download /v1/jobs/{job.id}/result instead of submitting the scene again"
         )
-        raise ProblemError("not-finished", text, headers={name: response.headers[name] for name in FOLLOW_UP})
+        headers = {name: response.headers[name] for name in ("Location", "Retry-After")}
+        raise ProblemError("not-finished", text, headers=headers)
     response.body = status.model_dump_json(exclude_none=True).encode()
     response.headers["Content-Length"] = str(len(response.body))
     return response

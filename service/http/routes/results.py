@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -47,7 +47,7 @@ class StoredFile(FileResponse):
         try:
             found = path.stat()
         except FileNotFoundError as error:
-            raise removed() from error
+            raise ProblemError("gone", "the file was removed during the request; submit the scene again") from error
         super().__init__(path, media_type=media_type, headers=fixed, stat_result=found)
         self._size = found.st_size
 
@@ -72,23 +72,6 @@ class StoredFile(FileResponse):
         if not _is_range(asked.getlist("range")):
             scope = {**scope, "headers": [(name, value) for name, value in scope["headers"] if name != b"range"]}
         await super().__call__(scope, receive, corrected)
-
-
-def described(summary: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    """Return the entry of a job's summary at a path of names."""
-    entry: Any = summary
-    for name in names:
-        if not isinstance(entry, dict) or name not in entry:
-            raise ProblemError(
-                "not-found", f"the job has no file {name[:80]!r}; sizes.files of its status lists all files"
-            )
-        entry = entry[name]
-    return dict(entry)
-
-
-def removed() -> ProblemError:
-    """Return the problem of a file that has expired or was reclaimed since the job was read."""
-    return ProblemError("gone", "the file was removed during the request; submit the scene again")
 
 
 def _attachment(name: str) -> str:
@@ -185,17 +168,18 @@ async def get_file(
     name: Annotated[str, PathParameter(description="One of `sizes.files` of the job.")],
 ) -> Response:
     """One file of the container, for readers that need only some. It never changes and may be cached."""
-    _ready(job)
-    entry = described(job.result or {}, ("files", name))
+    files = _result(job)["files"]
+    if name not in files:
+        raise ProblemError("not-found", f"the job has no file {name[:80]!r}; sizes.files of its status lists all files")
     media_type = _MEDIA_TYPES.get(Path(name).suffix, BINARY)
     file = context.storage.result(job.id) / "files" / name
-    return await _stored(file, sha256=entry["sha256"], media_type=media_type, headers=_FOREVER)
+    return await _stored(file, sha256=files[name]["sha256"], media_type=media_type, headers=_FOREVER)
 
 
 @_route("/decoded", "Download the decoded scene", BINARY, "disk-full", "memory-limit", "crashed", "time-limit")
 async def get_decoded(context: Service, job: RequestedJob) -> Response:
     """The container decoded to a `.ply`, on the first request."""
-    _ready(job)
+    _result(job)
     file, entry = await context.decoder.scene(job)
     download = f"{job.name}.decoded.ply"
     return await _stored(file, sha256=entry["sha256"], media_type=BINARY, download=download, headers=_PRIVATE)
@@ -204,7 +188,7 @@ async def get_decoded(context: Service, job: RequestedJob) -> Response:
 @_route("/source", "Download the upload", BINARY)
 async def get_source(context: Service, job: RequestedJob) -> Response:
     """The uploaded scene, for comparisons, unless it was removed to free disk space."""
-    _ready(job)
+    _result(job)
     file = await run_sync(context.storage.upload, job.id)
     if not job.upload_kept:
         raise ProblemError("gone", "the upload was removed to free disk space; the result is still available")
@@ -215,29 +199,27 @@ async def get_source(context: Service, job: RequestedJob) -> Response:
 @_route("/report", "Download the report", "application/json")
 async def get_report(context: Service, job: RequestedJob) -> Response:
     """The report of the compression, as from the library."""
-    _ready(job)
-    entry = described(job.result or {}, ("report",))
+    sha256 = _result(job)["report"]["sha256"]
     file = context.storage.result(job.id) / "report.json"
-    return await _stored(file, sha256=entry["sha256"], media_type="application/json", headers=_PRIVATE)
+    return await _stored(file, sha256=sha256, media_type="application/json", headers=_PRIVATE)
 
 
 async def container(context: ServiceContainer, job: Job) -> StoredFile:
     """Return the response with the container of a succeeded job."""
-    _ready(job)
-    entry = described(job.result or {}, ("container",))
-    kind = container_file(job.options)
+    sha256, kind = _result(job)["container"]["sha256"], container_file(job.options)
     file, download = context.storage.result(job.id) / kind.name, f"{job.name}{kind.ending}"
-    return await _stored(file, sha256=entry["sha256"], media_type=kind.media_type, download=download, headers=_PRIVATE)
+    return await _stored(file, sha256=sha256, media_type=kind.media_type, download=download, headers=_PRIVATE)
 
 
 async def _stored(path: Path, **values: Any) -> StoredFile:  # noqa: ANN401
     return await run_sync(partial(StoredFile, path, **values))  # it reads the file's size
 
 
-def _ready(job: Job) -> None:
+def _result(job: Job) -> dict[str, Any]:
+    """Return the summary of a succeeded job's result."""
     match job.state:
         case State.SUCCEEDED:
-            return
+            return job.result or {}
         case State.QUEUED | State.RUNNING:
             text = f"the job is {job.state}; follow it at /v1/jobs/{job.id}/events or try again later"
             raise ProblemError("not-finished", text, retry_after=2)

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 from helpers.examples import examples
-from helpers.reference_cameras import PINHOLE, assert_camera, frames, poses, write_binary, write_json, write_photo
+from helpers.reference_cameras import assert_camera, frames, poses, write_json, write_photo
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -43,15 +43,6 @@ def test_nerfstudio(tmp_path):
     for view, pose in zip(load_views(tmp_path, hold_out=0).train, POSES, strict=True):
         assert_camera(view.camera, pose, K, 120, 80)
         assert view.photo is None
-
-
-def test_cameras_equal_those_of_a_colmap_model(tmp_path):
-    write_binary(tmp_path / "colmap", {1: PINHOLE}, POSES)
-    write_json(tmp_path / "transforms.json", document())
-    pairs = zip(load_views(tmp_path / "colmap").train, load_views(tmp_path / "transforms.json").train, strict=True)
-    for one, other in pairs:
-        np.testing.assert_allclose(one.camera.viewmat, other.camera.viewmat, atol=1e-12)
-        np.testing.assert_array_equal(one.camera.K, other.camera.K)
 
 
 def test_fox_agrees_with_its_colmap_model(shared_data):

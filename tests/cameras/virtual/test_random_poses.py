@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from helpers.hollow_scenes import box, surface
-from helpers.whole_scenes import five
 
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.virtual.samples import FIELDS_OF_VIEW, random_poses
@@ -23,22 +22,16 @@ def positions_of(views):
 
 
 def test_views_are_split_named_square_and_of_several_fields_of_view(tall_box):
-    views = random_poses(tall_box, side=48, count=17)
+    views = random_poses(tall_box, side=24, count=17)
     assert 17 <= len(views.all) <= 4 * 17
     assert sorted(view.name for view in views.all) == [f"virtual_{n:02}" for n in range(len(views.all))]
     assert [view.name for view in views.test] == ["virtual_00", "virtual_08", "virtual_16"]
-    assert {(view.camera.width, view.camera.height) for view in views.all} == {(48, 48)}
-    angles = np.array([2 * np.arctan(24 / view.camera.K[0, 0]) for view in views.all])
+    assert {(view.camera.width, view.camera.height) for view in views.all} == {(24, 24)}
+    angles = np.array([2 * np.arctan(12 / view.camera.K[0, 0]) for view in views.all])
     assert FIELDS_OF_VIEW[0] <= angles.min() < angles.max() <= FIELDS_OF_VIEW[1]
     assert np.ptp(angles) > 0.2
     single = random_poses(tall_box, side=24, count=1)
     assert (len(single.train), len(single.test)) == (1, 0)
-
-
-@pytest.mark.quick(0)
-def test_a_scene_of_several_objects_gets_more_views():
-    views = random_poses(five(), side=16, count=24)
-    assert 48 <= len(views.all) <= 4 * 24
 
 
 @pytest.mark.quick(0)
@@ -50,7 +43,7 @@ def test_the_same_seed_gives_the_same_views_for_any_number_of_threads(tall_box):
 
 
 def test_an_object_is_seen_from_all_around_and_from_outside(tall_box):
-    views = random_poses(tall_box, side=48, count=40)
+    views = random_poses(tall_box, side=24, count=40)
     positions = positions_of(views)
     outside = (np.abs(positions) > (0.5, 1.5, 0.3)).any(axis=1)
     assert outside.mean() > 0.9  # further regions may lie on the inner side
@@ -62,8 +55,8 @@ def test_an_object_is_seen_from_all_around_and_from_outside(tall_box):
 
 def test_a_room_is_seen_from_inside_in_all_directions():
     half = np.array([4.0, 1.4, 3.0])
-    room = box(half, 10_000, 0.12)
-    views = random_poses(room, side=48, count=40)
+    room = box(half, 5000, 0.15)
+    views = random_poses(room, side=24, count=40)
     within = (np.abs(positions_of(views)) < half).all(axis=1)
     assert within.mean() > 0.8  # further regions may lie on the outer side
     directions = np.array([view.camera.viewmat[2, :3] for view in views.all])

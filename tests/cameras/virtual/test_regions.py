@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.whole_scenes import SCENES, joined, moved, two
+from helpers.fewer_cameras import try_fewer
+from helpers.whole_scenes import SCENES, joined, moved
 
 from kissgs import Camera, Splats, clean, sample_scene
 from kissgs.cameras.virtual.regions import scene_views
 from kissgs.cameras.virtual.samples import random_poses
+
+
+@pytest.fixture(autouse=True)
+def fewer(monkeypatch: pytest.MonkeyPatch):
+    try_fewer(monkeypatch)
+
+
+def two(distance: float, scale: float = 1.0) -> Splats:
+    return joined(sample_scene(2000), moved(sample_scene(2000, seed=1), by=(distance, 0, 0), scale=scale))
 
 
 def count_near(cameras: list[Camera], position: tuple[float, float, float], radius: float) -> int:
@@ -16,7 +26,7 @@ def count_near(cameras: list[Camera], position: tuple[float, float, float], radi
 
 
 def cameras_of(splats: Splats, count: int = 24) -> list[Camera]:
-    views = scene_views(clean(splats)[0], width=96, height=96, count=count)
+    views = scene_views(clean(splats)[0], width=48, height=48, count=count)
     assert len(views.all) == count
     return [view.camera for view in views.all]
 
@@ -43,7 +53,7 @@ def test_each_of_five_objects_has_cameras():
 
 
 def test_random_poses_are_divided_among_both_objects():
-    views = random_poses(clean(two(1000))[0], side=64, count=40)
+    views = random_poses(clean(two(1000))[0], side=24, count=40)
     cameras = [view.camera for view in views.all]
     assert count_near(cameras, (0, 0, 0), 40) >= 12
     assert count_near(cameras, (1000, 0, 0), 40) >= 12
@@ -55,7 +65,7 @@ def test_scenes_of_few_gaussians_have_cameras(count: int):
 
 
 def test_the_result_is_the_same_for_any_number_of_threads():
-    scene = clean(joined(sample_scene(1500), moved(sample_scene(1500, seed=1), by=(300, 0, 0))))[0]
-    one, many = (scene_views(scene, width=64, height=64, count=8, threads=threads) for threads in (1, 3))
+    scene = clean(joined(sample_scene(700), moved(sample_scene(700, seed=1), by=(300, 0, 0))))[0]
+    one, many = (scene_views(scene, width=48, height=48, count=8, threads=threads) for threads in (1, 3))
     for a, b in zip(one.all, many.all, strict=True):
         assert np.array_equal(a.camera.viewmat, b.camera.viewmat)

@@ -26,7 +26,7 @@ def by_name(views):
 
 @pytest.fixture(scope="module")
 def table():
-    return sample_scene(20_000, sh_degree=0)
+    return sample_scene(8000, sh_degree=0)
 
 
 @pytest.mark.usefixtures("fewer")
@@ -105,7 +105,7 @@ def test_the_best_view_is_one_of_all_views_and_not_a_close_up():
 @pytest.mark.usefixtures("fewer")
 def test_a_room_is_seen_from_inside():
     half = np.array([4.0, 1.4, 3.0])
-    room = box(half, 10_000, 0.12)
+    room = box(half, 5000, 0.15)
     for view in by_name(virtual_views(room, width=64, height=48, count=16)):
         assert (np.abs(view.camera.position) < half - 0.05).all()
         _, alpha = render(room, view.camera)
