@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from kissgs import EncodeSettings, KissgsError, Settings, Views, load_views
-from kissgs.settings.encode import GOALS
+from kissgs.settings import GOALS
 
 Curve = Sequence[tuple[float, float]]
 """Points (quality, bytes) in any order."""

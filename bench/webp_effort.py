@@ -10,7 +10,7 @@ from pathlib import Path
 
 from bench.common import head, parser_of, row, run
 from kissgs.io.containers import open_source
-from kissgs.io.webp import decode_plane, encode_plane, probe_webp
+from kissgs.io.images import decode_plane, encode_plane, probe_webp
 
 EFFORTS = ((25, 0), (25, 1), (25, 4), (50, 1), (50, 2), (75, 2), (75, 4))
 """Quality and method; (50, 2) is that of the preset fast, (75, 4) that of balanced."""

@@ -36,11 +36,9 @@ if TYPE_CHECKING:
     from kissgs.finetuning.result import FinetuneReport
     from kissgs.io.ply import PlyInfo, read_ply_info
     from kissgs.io.scene_format import ReadOptions
-    from kissgs.pipeline.decompress import decompress
-    from kissgs.pipeline.inspect import SceneInfo, read_scene_info
     from kissgs.pipeline.pipeline import Compressed, compact, compress
     from kissgs.pipeline.report import Report
-    from kissgs.pipeline.scene_files import load, recognise, save
+    from kissgs.pipeline.scene_files import SceneInfo, decompress, load, read_scene_info, recognise, save
     from kissgs.rendering.camera import Camera
     from kissgs.rendering.rasterizer import render
     from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
@@ -75,7 +73,7 @@ _HOMES = {
     "RemoteError": "core.errors",
     "RunnerError": "core.errors",
     "Report": "pipeline.report",
-    "SceneInfo": "pipeline.inspect",
+    "SceneInfo": "pipeline.scene_files",
     "Settings": "settings",
     "Splats": "core.splats",
     "UnsupportedError": "core.errors",
@@ -86,13 +84,13 @@ _HOMES = {
     "compact": "pipeline.pipeline",
     "compress": "pipeline.pipeline",
     "compress_streamed": "streaming.compress",
-    "decompress": "pipeline.decompress",
+    "decompress": "pipeline.scene_files",
     "evaluate": "evaluation.evaluate",
     "load": "pipeline.scene_files",
     "load_views": "cameras.captures.load",
     "measure_sensitivity": "rendering.sensitivity",
     "read_ply_info": "io.ply",
-    "read_scene_info": "pipeline.inspect",
+    "read_scene_info": "pipeline.scene_files",
     "recognise": "pipeline.scene_files",
     "render": "rendering.rasterizer",
     "sample_scene": "synthetic",

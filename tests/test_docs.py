@@ -16,7 +16,7 @@ import typer.main
 
 from kissgs import Preset
 from kissgs.cli.app import app
-from kissgs.sogxt.names import FILES
+from kissgs.sogxt.container import FILES
 from service.core.presets import presets
 
 ROOT = Path(__file__).parents[1]

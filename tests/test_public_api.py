@@ -133,7 +133,7 @@ def test_reading_loads_neither_kernels_nor_the_encoder_nor_other_readers(tmp_pat
     program = f"""
 import sys
 from pathlib import Path
-from kissgs.pipeline.inspect import describe
+from kissgs.pipeline.scene_files import describe
 source = Path({str(tmp_path / "scene.zip")!r})
 assert describe(source).kind == "sogxt"
 print([name for name in {(*HEAVY, *ENCODER, *READERS)} if name in sys.modules])

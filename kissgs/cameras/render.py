@@ -1,23 +1,266 @@
-"""``RenderJob``: the work of ``kissgs render``, an image, an orbit around the scene, or a sheet of all views."""
+"""``RenderJob``: the work of ``kissgs render``, an image, a path around the scene, or a sheet of all views."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kissgs.cameras.captures.camera_json import is_camera_file, pick_view, view_of_file
-from kissgs.cameras.views import View, Views
-from kissgs.cameras.virtual.orbit import find_orbit
-from kissgs.cameras.virtual.select import best_view, virtual_views
-from kissgs.core.array_types import UInt8
+from kissgs.cameras.captures.transforms_json import is_camera_file, pick_view, view_of_file
+from kissgs.cameras.views import Vec3, View, Views
+from kissgs.cameras.virtual.candidates import FIELD_OF_VIEW, SceneBounds, horizontal_axes, opacity, weighted_quantile
+from kissgs.cameras.virtual.select import (
+    SCORE_MARGIN,
+    ScoredCandidates,
+    best_view,
+    overview_bonus,
+    score_candidates,
+    virtual_views,
+)
+from kissgs.core.array_types import Bool, Float64, Int, UInt8
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.progress import Progress, load_kernels, silent
+from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.rendering.camera import Camera
+from kissgs.rendering.camera import Camera, look_at
+from kissgs.rendering.constants import NEAR
 from kissgs.rendering.images import Label, contact_sheet, reframed, render_all
 from kissgs.rendering.rasterizer import BLACK, Colour, Device
+
+# ``Orbit``: a camera path around a scene, a full circle or an arc that is travelled to and fro.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Orbit:
+    """A horizontal circle around a look-at target, and the arc of it from which the scene looks good."""
+
+    target: Vec3
+    """Point that all cameras look at, world units."""
+    radius: float
+    """Distance of the cameras from the target, world units; 0 to look around from the target itself."""
+    elevation: float
+    """Elevation of the cameras as seen from the target, radians."""
+    up: Vec3
+    mid_azimuth: float = 0.0
+    """Azimuth of the middle of the arc; of a full circle, the azimuth with the best view; radians."""
+    sweep: float = 2 * np.pi
+    """Length of the arc, radians; 2 pi for a full circle."""
+
+    @property
+    def full(self) -> bool:
+        """Whether the path is a full circle."""
+        return self.sweep >= 2 * np.pi
+
+    @property
+    def description(self) -> str:
+        """Short description for messages."""
+        return "a full circle" if self.full else f"{np.degrees(self.sweep):.0f}° to and fro"
+
+    def camera(self, azimuth: float, width: int, height: int) -> Camera:
+        """Return the camera at ``azimuth``, radians, with an image of ``width`` x ``height`` pixels.
+
+        It looks at the target; at radius 0, from the target in the direction that it would have on a larger circle.
+        """
+        east, north = horizontal_axes(self.up)
+        horizontal = np.cos(azimuth) * east + np.sin(azimuth) * north
+        direction = np.cos(self.elevation) * horizontal + np.sin(self.elevation) * self.up
+        position = self.target + self.radius * direction
+        return look_at(position, position - direction, self.up, fov=FIELD_OF_VIEW, width=width, height=height)
+
+    def loop_cameras(self, frames: int, width: int, height: int) -> list[Camera]:
+        """Return the cameras of an animation that loops without a jump.
+
+        On an arc, the azimuth is a sine of time, slow at the ends. Frames that show the same view share one camera
+        object, so that a caller can render it once.
+        """
+        _check(frames, width, height)
+        if self.full:
+            azimuths = self.mid_azimuth + np.arange(frames) * (2 * np.pi / frames)
+            return [self.camera(float(azimuth), width, height) for azimuth in azimuths]
+        phases = [_swing_phase(frame, frames) for frame in range(frames)]
+        by_phase = {
+            phase: self.camera(
+                self.mid_azimuth + 0.5 * self.sweep * float(np.sin(np.pi * phase / frames)), width, height
+            )
+            for phase in sorted(set(phases))
+        }
+        return [by_phase[phase] for phase in phases]
+
+    def sheet_cameras(self, frames: int, width: int, height: int) -> list[Camera]:
+        """Return the cameras of a contact sheet: evenly spaced, once along the path."""
+        _check(frames, width, height)
+        if self.full or frames == 1:
+            return self.loop_cameras(frames, width, height)
+        azimuths = self.mid_azimuth + np.linspace(-0.5, 0.5, frames) * self.sweep
+        return [self.camera(float(azimuth), width, height) for azimuth in azimuths]
+
+
+def _swing_phase(frame: int, frames: int) -> int:
+    """Return the phase of a swing, -``frames``/2 to ``frames``/2, equal for frames at the same azimuth.
+
+    It goes from the middle to one end, back through the middle to the other end, and to the middle again. Integers, so
+    that phases of the way there and of the way back are exactly equal.
+    """
+    if 4 * frame <= frames:
+        return 2 * frame
+    if 4 * frame <= 3 * frames:
+        return frames - 2 * frame
+    return 2 * frame - 2 * frames
+
+
+def _check(frames: int, width: int, height: int) -> None:
+    if min(frames, width, height) < 1:
+        raise InvalidViewsError(
+            f"there must be at least 1 frame of at least 1x1 pixels, not {frames} of {width}x{height}"
+        )
+
+
+# ``find_orbit``: the orbit with the longest arc of good views.
+#
+# Horizontal circles of several radii and elevations are scored by thumbnails all along them, like virtual cameras. A
+# scene that was captured from one side dissolves towards the ends of the arc, where the path turns back.
+
+COARSE_STEPS = 24
+"""Number of thumbnails along each circle."""
+
+FINE_STEPS = 72
+"""Number of thumbnails along the circle that is selected."""
+
+FULL_CIRCLE_TOLERANCE = 0.15
+"""How much lower than on an arc the scores on a full circle may be: to pass a weak view is better than to turn back."""
+
+MIN_SWEEP = float(np.radians(30))
+"""Shortest arc, radians; on a shorter one the motion would hardly be noticed."""
+
+RADII = (1.1, 1.5, 2.0, 2.6)
+"""Radii of circles around the centre of a scene with a background, in radii of the scene."""
+
+ELEVATIONS = (5, 15, 28)
+"""Elevations of circles as seen from the centre, degrees."""
+
+OBJECT_MARGIN = 1.1
+"""Size of the frame around an object that stands alone, relative to the object."""
+
+LOOK_AROUND_PITCH = 6
+"""Downward pitch of cameras that look around from one position, degrees."""
+
+
+def find_orbit(
+    splats: Splats, *, width: int = 640, height: int = 480, threads: int = 0, progress: Progress = silent
+) -> Orbit:
+    """Return the orbit with the longest arc of good views; only the images' aspect ratio matters."""
+    with Workers(threads) as pool:
+        candidates = score_candidates(splats, (width, height), pool, progress)
+        bounds = candidates.bounds
+        min_score = candidates.scores.max() - SCORE_MARGIN
+        if candidates.kind == "object":
+            circles = list(_circles_around_object(splats, bounds, width / height))
+        else:
+            circles = list(_circles_in_scene(bounds, enclosed=candidates.kind == "enclosed"))
+        scores = _scores(circles, COARSE_STEPS, candidates)
+        ranks = [
+            _rank(score - min_score, circle.radius / bounds.radius)
+            for circle, score in zip(circles, scores, strict=True)
+        ]
+        best = circles[max(range(len(circles)), key=lambda n: ranks[n])]
+        fine_scores = _scores([best], FINE_STEPS, candidates)[0]
+    progress("cameras", 1.0)
+    return _with_arc(best, fine_scores, min_score)
+
+
+def _scores(circles: list[Orbit], steps: int, candidates: ScoredCandidates) -> Float64[np.ndarray, "circles steps"]:
+    """Return the view scores at even steps along each circle."""
+    width, height = candidates.cameras[0].width, candidates.cameras[0].height
+    cameras = [camera for circle in circles for camera in circle.loop_cameras(steps, width, height)]
+    return candidates.scores_of(cameras).reshape(len(circles), steps)
+
+
+def _circles_in_scene(bounds: SceneBounds, *, enclosed: bool) -> Iterator[Orbit]:
+    """Yield circles around the centre; if the scene encloses the cameras, also orbits of radius 0 that look around."""
+    for radius in RADII:
+        for elevation in ELEVATIONS:
+            yield Orbit(
+                target=bounds.centre,
+                radius=radius * bounds.radius,
+                elevation=float(np.radians(elevation)),
+                up=bounds.up,
+            )
+    if enclosed:
+        for rise in (0.0, 0.4):
+            position = bounds.centre + rise * bounds.radius * bounds.up
+            yield Orbit(target=position, radius=0.0, elevation=float(np.radians(LOOK_AROUND_PITCH)), up=bounds.up)
+
+
+def _circles_around_object(splats: Splats, bounds: SceneBounds, aspect: float) -> Iterator[Orbit]:
+    """Yield circles from which an upright cylinder around the object fits into every image of this width to height."""
+    weights = opacity(splats)
+    axes = np.stack([*horizontal_axes(bounds.up), bounds.up])
+    offsets = (splats.means.astype(np.float64) - bounds.centre) @ axes.T
+    low, high = ([weighted_quantile(values, weights, quantile) for values in offsets.T] for quantile in (0.01, 0.99))
+    middle, half_extents = 0.5 * np.add(high, low), 0.5 * np.subtract(high, low)
+    from_axis = np.linalg.norm((offsets - middle)[:, :2], axis=1)
+    min_size = 0.1 * bounds.radius
+    radius = max(weighted_quantile(from_axis, weights, 0.98), min_size)
+    half_height = max(half_extents[2], min_size)
+    target = bounds.centre + middle @ axes
+    slopes = np.tan(0.5 * FIELD_OF_VIEW) * np.array([min(1.0, aspect), min(1.0, 1 / aspect)])
+    for elevation in np.radians(ELEVATIONS):
+        half_extent_up = half_height * np.cos(elevation) + radius * np.sin(elevation)
+        half_depth = radius * np.cos(elevation) + half_height * np.sin(elevation)
+        distance = max(OBJECT_MARGIN * max(radius / slopes[0], half_extent_up / slopes[1]), 2 * NEAR) + half_depth
+        yield Orbit(target=target, radius=float(distance), elevation=float(elevation), up=bounds.up)
+
+
+def _rank(surplus: Float64[np.ndarray, " steps"], radii: float) -> tuple[bool, float]:
+    """Return the sort key of a circle: full circles first, then by the scores along the longest arc.
+
+    The sum of scores is divided by the square root of the length, so that an arc four times as long ranks like scores
+    twice as high: the ends of a long arc are seldom its best views.
+    """
+    good = _acceptable(surplus)
+    steps = _longest_run(good)
+    total = (surplus + overview_bonus(radii)).take(steps, mode="wrap").sum()
+    return bool(good.all()), float(total / max(len(steps), 1) ** 0.5)
+
+
+def _acceptable(surplus: Float64[np.ndarray, " steps"]) -> Bool[np.ndarray, " steps"]:
+    """Return which steps show good views; slightly worse ones are accepted if the whole circle is then."""
+    full_circle = (surplus >= -FULL_CIRCLE_TOLERANCE).all()
+    return np.asarray(surplus >= (-FULL_CIRCLE_TOLERANCE if full_circle else 0))
+
+
+def _longest_run(good: Bool[np.ndarray, " steps"]) -> Int[np.ndarray, " run"]:
+    """Return the steps of the longest run of good ones on a circle, in order.
+
+    A run that passes the last step continues with indices from ``len(good)`` on.
+    """
+    count = len(good)
+    if good.all():
+        return np.arange(count)
+    begin = int(np.flatnonzero(~good)[0])  # no run is cut in two if the circle is opened at a bad step
+    rolled = np.roll(good, -begin)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], rolled, [False]]).astype(np.int8)))
+    if not len(edges):
+        return np.empty(0, np.int64)
+    starts, ends = edges[::2], edges[1::2]
+    longest = int((ends - starts).argmax())
+    return np.arange(begin + starts[longest], begin + ends[longest])
+
+
+def _with_arc(circle: Orbit, scores: Float64[np.ndarray, " steps"], min_score: float) -> Orbit:
+    """Return the circle with the longest arc of good views, at least :data:`MIN_SWEEP` long."""
+    step = 2 * np.pi / len(scores)
+    steps = _longest_run(_acceptable(scores - min_score))
+    if len(steps) == len(scores):
+        return replace(circle, mid_azimuth=step * int(scores.argmax()))
+    if len(steps) == 0:
+        return replace(circle, mid_azimuth=step * int(scores.argmax()), sweep=MIN_SWEEP)
+    sweep = max(step * (len(steps) - 1), MIN_SWEEP)
+    return replace(circle, mid_azimuth=0.5 * step * float(steps[0] + steps[-1]), sweep=sweep)
+
+
+# ``RenderJob``: the work of ``kissgs render``, an image, an orbit around the scene, or a sheet of all views.
 
 IMAGE_SIZE, FRAME_SIZE, CELL_SIZE = (1280, 960), (640, 480), (320, 240)
 """Default (width, height), pixels: of a single image, of an animation's frames, of the images on a contact sheet."""

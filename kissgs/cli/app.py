@@ -13,21 +13,14 @@ from typing import Annotated, NoReturn
 import typer
 
 from kissgs._version import __version__
-from kissgs.cli.bench import bench
-from kissgs.cli.compact import compact
-from kissgs.cli.compress import compress
-from kissgs.cli.convert import convert
-from kissgs.cli.decompress import decompress
-from kissgs.cli.evaluate import evaluate
+from kissgs.cli.bench import bench, evaluate, sample, warmup
+from kissgs.cli.compress import compact, compress
+from kissgs.cli.convert import convert, decompress, info
 from kissgs.cli.files import discard_stdout, write_stdout
-from kissgs.cli.info import info
 from kissgs.cli.options import SCENE_OPTIONS, SEE_SCENE_OPTIONS, with_default_values
 from kissgs.cli.remote import app as remote
-from kissgs.cli.render import render
-from kissgs.cli.sample import sample
+from kissgs.cli.render import render, view
 from kissgs.cli.signals import unwinding
-from kissgs.cli.view import view
-from kissgs.cli.warmup import warmup
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 
 app = typer.Typer(

@@ -1,7 +1,4 @@
-"""``kissgs bench``: bytes, seconds and quality of a scene with each preset and in limited times.
-
-The studies behind the documentation's figures are in ``bench/`` of the source repository, and use :func:`measured`.
-"""
+"""``kissgs evaluate``, ``bench``, ``sample`` and ``warmup``: measurements of scenes and of this machine."""
 
 from __future__ import annotations
 
@@ -17,16 +14,29 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar, cast
 
 import typer
 
-from kissgs.cli.files import show
-from kissgs.cli.options import ForceOption, ViewsOption, chosen, open_views
+from kissgs.cli.files import print_json, progress_bar, say_notes, show
+from kissgs.cli.options import (
+    ForceOption,
+    ImagesOption,
+    RenderDeviceOption,
+    ScaleOption,
+    SceneOptions,
+    SplitOption,
+    ViewsOption,
+    choice,
+    chosen,
+    device_of,
+    open_views,
+    reads_scenes,
+)
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 
 if TYPE_CHECKING:
@@ -37,6 +47,165 @@ if TYPE_CHECKING:
     from kissgs.formats import ContainerName
     from kissgs.pipeline.report import Report
     from kissgs.settings import Settings
+
+
+# ``kissgs sample``: write a synthetic scene for tests and demos.
+
+
+def sample(
+    output: Annotated[Path, typer.Argument(help="Output NAME.ply; other formats as for convert.")],
+    gaussians: Annotated[int, typer.Option(min=0, help="Number of Gaussians.")] = 60_000,
+    degree: Annotated[int, typer.Option(min=0, max=3, help="Degree of the spherical harmonics.")] = 3,
+    force: ForceOption = False,
+) -> None:
+    """Write a synthetic sample scene: shiny, textured objects on a table."""
+    from kissgs.pipeline.scene_files import save
+    from kissgs.synthetic import sample_scene
+
+    save(sample_scene(gaussians, sh_degree=degree), output, overwrite=force)
+
+
+# ``kissgs warmup``: compile all kernels in advance, and measure the speed of the machine.
+
+SAMPLE_COUNT = 20_000
+"""Gaussians of the synthetic scene that is encoded to measure the speed."""
+
+
+def warmup() -> None:
+    """Compile and cache all kernels, and measure the speed of this machine, by which --time chooses what to do."""
+    from kissgs.compaction import merging  # noqa: F401
+    from kissgs.core import numba_kernels
+    from kissgs.finetuning import planes  # noqa: F401
+    from kissgs.planning import kernels, kmeans_kernels, rdo_kernels  # noqa: F401
+    from kissgs.rendering import ssim_kernels  # noqa: F401
+    from kissgs.rendering.cpu import backward, neighbours, sensitivity  # noqa: F401
+
+    if find_spec("torch"):  # without it nothing is trained
+        from kissgs.training import model  # noqa: F401
+
+    with progress_bar(False) as progress:
+        for number, kernel in enumerate(numba_kernels.kernels):
+            progress("kernels", number / len(numba_kernels.kernels))
+            kernel.load()
+        try:
+            _measure_speed()
+        except OutputError as error:
+            sys.stderr.write(f"kissgs: the speed of this machine is not saved, --time assumes the usual one: {error}\n")
+
+
+def _measure_speed() -> None:
+    """Encode a synthetic scene twice, the first time to load what is needed, and save the time of the second."""
+    from kissgs.pipeline.pipeline import compress
+    from kissgs.pipeline.search_time import save_speed
+    from kissgs.settings import Preset, Settings
+    from kissgs.synthetic import sample_scene
+
+    scene, settings = sample_scene(SAMPLE_COUNT), Settings(preset=Preset.BALANCED)
+    compress(scene, settings=settings)
+    started = time.perf_counter()
+    compress(scene, settings=settings)
+    save_speed(time.perf_counter() - started, settings.preset, SAMPLE_COUNT)
+
+
+# ``kissgs evaluate``: compare a scene with its original, and with photographs.
+
+
+@reads_scenes
+def evaluate(
+    reference: Annotated[
+        Path, typer.Argument(metavar="REFERENCE", help="Original scene, of any format that kissgs reads.")
+    ],
+    candidate: Annotated[
+        Path, typer.Argument(metavar="CANDIDATE", help="Scene to evaluate, of any format that kissgs reads.")
+    ],
+    views: ViewsOption = None,
+    scale: ScaleOption = None,
+    images: ImagesOption = None,
+    split: SplitOption = "test",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual cameras.")] = 0,
+    distance: Annotated[
+        float,
+        typer.Option(metavar="FACTOR", help="Move the virtual cameras to this many times their distance, such as 4."),
+    ] = 1.0,
+    flip: Annotated[bool, typer.Option("--flip", help="Also measure FLIP; needs the extra kissgs\\[flip].")] = False,
+    lpips: Annotated[
+        bool, typer.Option("--lpips", help="Also measure LPIPS; needs the extra kissgs\\[lpips].")
+    ] = False,
+    html: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write an HTML report with renderings of both scenes and error maps."),
+    ] = None,
+    device: RenderDeviceOption = "cpu",
+    force: ForceOption = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON report.")] = False,
+    *,
+    common: SceneOptions,
+) -> None:
+    """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""
+    from kissgs.cli.files import progress_bar
+    from kissgs.core.positions import with_origin
+    from kissgs.evaluation.evaluate import evaluate as measure
+    from kissgs.evaluation.html import ReportScene, html_report
+    from kissgs.evaluation.results import Split
+    from kissgs.io.files import atomic_file, refuse_existing
+    from kissgs.pipeline.scene_files import load, stored_bytes
+
+    quiet, threads = common.quiet or as_json, common.threads
+    used_split = cast(Split, choice("--split", split, Split))
+    render_device = device_of(device)
+    if html is not None:
+        refuse_existing(html, overwrite=force)
+    capture = open_views(views, scale=scale, images=images)
+    with progress_bar(quiet) as progress:
+        reading = asdict(common.reading())
+        sides = [
+            ReportScene(
+                name=path.name,
+                splats=load(path, threads=threads, progress=progress, **reading),
+                bytes=stored_bytes(path),
+            )
+            for path in (reference, candidate)
+        ]
+        sides[1] = replace(sides[1], splats=with_origin(sides[1].splats, sides[0].splats.origin))
+        scenes = sides[0].splats, sides[1].splats
+        result = measure(
+            *scenes,
+            capture,
+            split=used_split,
+            seed=seed,
+            distance=distance,
+            flip=flip,
+            lpips=lpips,
+            device=render_device,
+            threads=threads,
+            progress=progress,
+        )
+        if html is not None:
+            page = html_report(result, sides[0], sides[1], device=render_device, threads=threads, progress=progress)
+            with atomic_file(html, overwrite=force) as file:
+                file.write(page.encode(errors="replace"))  # file names may be invalid UTF-8
+    for side in sides:
+        say_notes(side.name, side.splats.notes, common.quiet)
+    if scenes[0].antialiased != scenes[1].antialiased and not common.quiet:
+        marked, other = sides if scenes[0].antialiased else sides[::-1]
+        sys.stderr.write(
+            f"kissgs: {marked.name} is marked as trained with antialiasing, and {other.name} is not; each is drawn so "
+            "(for both: --antialiased or --classic)\n"
+        )
+    sizes = {"reference": sides[0].bytes, "candidate": sides[1].bytes}
+    if as_json:
+        print_json({**result.as_dict(), "bytes": sizes})
+    elif not quiet:
+        from kissgs.cli.tables import evaluation_table
+
+        show(evaluation_table(result, sides[0], sides[1], asked=split))
+        if html is not None:
+            show(f"\nreport  {html}")
+
+
+# ``kissgs bench``: bytes, seconds and quality of a scene with each preset and in limited times.
+#
+# The studies behind the documentation's figures are in ``bench/`` of the source repository, and use :func:`measured`.
 
 Result = TypeVar("Result")
 
@@ -102,7 +271,7 @@ def bench(
 
     Each is compressed, decompressed and evaluated in a process of its own.
     """
-    from kissgs.cli.console import progress_bar
+    from kissgs.cli.files import progress_bar
     from kissgs.settings import Preset
 
     if not presets and not times:
@@ -154,9 +323,8 @@ def measured(
 def _measure(scene: Path, settings: Settings, container: ContainerName, views: Views | None) -> Measurement:
     from kissgs.core.resources import peak_memory
     from kissgs.evaluation.evaluate import evaluate
-    from kissgs.pipeline.decompress import decompress
     from kissgs.pipeline.pipeline import compress
-    from kissgs.pipeline.scene_files import load
+    from kissgs.pipeline.scene_files import decompress, load
 
     result = compress(scene, settings=settings, container=container, views=views)
     archive = result.to_zip()
@@ -236,7 +404,7 @@ def _table(rows: Sequence[Row]) -> Table:
     """Return the table for the terminal, at most 120 columns wide."""
     from rich.table import Column, Table
 
-    from kissgs.evaluation.metric_text import format_metric
+    from kissgs.evaluation.results import format_metric
 
     photos = rows[0].against == "photos"
     heads = [

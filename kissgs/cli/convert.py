@@ -1,4 +1,4 @@
-"""``kissgs convert``: write scenes of any format in a plain one."""
+"""``kissgs info``, ``kissgs decompress`` and ``kissgs convert``: describe, decode and rewrite scenes."""
 
 from __future__ import annotations
 
@@ -8,17 +8,99 @@ from typing import Annotated, Any
 
 import typer
 
-from kissgs.cli.console import progress_bar
-from kissgs.cli.files import for_each_input, say_notes, show, source, stdout
+from kissgs.cli.files import for_each_input, progress_bar, say_notes, show, source, stdout
 from kissgs.cli.options import (
+    FilesArgument,
     ForceOption,
     JsonOption,
     OriginOption,
     SceneOptions,
+    ScenesArgument,
     reads_scenes,
 )
-from kissgs.core.errors import InvalidSceneError, OutputError
+from kissgs.core.errors import InvalidContainerError, InvalidSceneError, OutputError
 from kissgs.formats import ENDINGS, OUTPUT_FORMATS, SCENE_ENDINGS, WRITTEN, alternatives, output_format
+
+# ``kissgs info``: describe the contents of scene files.
+
+
+@reads_scenes
+def info(
+    files: FilesArgument,
+    as_json: JsonOption = False,
+    *,
+    common: SceneOptions,
+) -> None:
+    """Describe scenes of any format and containers: Gaussians, SH degree, bytes per file, value ranges."""
+    from kissgs.cli.tables import info_table
+    from kissgs.pipeline.scene_files import describe
+
+    def work(file: str, target: Path) -> dict[str, Any]:
+        found = describe(Path(file), common.reading())
+        if not as_json:
+            show(info_table(found))
+        return found.as_dict()
+
+    for_each_input(files, Path("-"), "", as_json, work, writes=False)
+
+
+# ``kissgs decompress``: decode containers and scenes of other formats into ``.ply`` files.
+
+
+@reads_scenes
+def decompress(
+    containers: ScenesArgument,
+    output: Annotated[
+        str | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="PATH",
+            help="Output NAME.ply, a folder, or '-' for standard output. Default: next to the container.",
+        ),
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    *,
+    common: SceneOptions,
+) -> None:
+    """Decode containers and scenes of other formats into .ply files."""
+    from kissgs.pipeline.scene_files import decompress as run
+
+    quiet = common.quiet or as_json
+
+    def work(container: str, target: Path) -> dict[str, Any]:
+        piped = str(target) == "-"
+        with progress_bar(quiet) as progress:
+            splats = run(
+                source(container),
+                None if piped else target,
+                max_gaussians=common.max_gaussians,
+                level=common.level or 0,
+                raw_axes=common.raw_axes,
+                antialiased=common.antialiased,
+                overwrite=force,
+                threads=common.threads,
+                progress=progress,
+            )
+        say_notes(str(target), splats.notes, quiet)
+        if piped:
+            from kissgs.io.ply import write_ply
+
+            with stdout():
+                write_ply(sys.stdout.buffer, splats)
+            return {}
+        if not quiet:
+            from kissgs.cli.tables import gaussians
+
+            show(f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}")
+        size = target.stat().st_size
+        return {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": size, "notes": list(splats.notes)}
+
+    for_each_input(containers, output, ".ply", as_json, work, unreadable=InvalidContainerError)
+
+
+# ``kissgs convert``: write scenes of any format in a plain one.
 
 
 @reads_scenes
@@ -42,7 +124,7 @@ def convert(
     common: SceneOptions,
 ) -> None:
     """Convert scenes into other formats; the ending of OUT decides."""
-    from kissgs.core.origin import in_world
+    from kissgs.core.positions import in_world
     from kissgs.core.splats import clean
     from kissgs.io.files import atomic_file, refuse_existing
     from kissgs.pipeline.scene_files import read_scene, write_scene

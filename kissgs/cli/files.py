@@ -1,4 +1,4 @@
-"""Input and output files of the commands, and the handling of failures among several inputs."""
+"""Input and output of the command line: files, standard output, and the progress bar."""
 
 from __future__ import annotations
 
@@ -10,16 +10,77 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.text import Text
 
 from kissgs.core.errors import InvalidSceneError, KissgsError, OutputError, UnsupportedError
+from kissgs.core.progress import Progress as Receiver
+from kissgs.core.progress import silent
 from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, SCENE_ENDINGS, named_manifest, names_folder
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+
+# Terminal output: the console for tables, and the progress bar.
+
+
+def output() -> Console:
+    """Return a console on standard output, as wide as the terminal; 200 columns if that is a pipe or a file."""
+    console = Console(highlight=False, markup=False)
+    if not console.is_terminal:
+        console.width = 200
+    return console
+
+
+class _ElapsedColumn(ProgressColumn):
+    """Time since the command began. Rich's own column stops when a stage is complete: one task serves all stages."""
+
+    def render(self, task: Task) -> Text:
+        """Return hours, minutes and seconds."""
+        return Text(str(timedelta(seconds=int(task.elapsed or 0))), style="progress.elapsed")
+
+
+@contextlib.contextmanager
+def progress_bar(quiet: bool) -> Iterator[Receiver]:
+    """Yield a receiver of progress events that draws a bar on standard error, if that is a terminal."""
+    console = Console(stderr=True)
+    if quiet:
+        yield silent
+        return
+    columns = (
+        TextColumn("{task.description:>14}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        _ElapsedColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with (
+        Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
+        contextlib.ExitStack() as watch,
+    ):
+        task = bar.add_task("", total=1.0, note="")
+        watched = False
+
+        def receive(stage: str, fraction: float, note: str = "") -> None:
+            nonlocal watched
+            if stage == "kernels" and not watched:  # numba is about to be needed, and not before
+                from kissgs.core.numba_kernels import report_compilation
+
+                watched = True
+                watch.enter_context(report_compilation(console.print))
+            bar.update(task, description=stage, completed=fraction, note=note)
+
+        yield receive
+
+
+# Input and output files of the commands, and the handling of failures among several inputs.
 
 _SLASHES = tuple({"/", os.sep})
 
@@ -252,7 +313,6 @@ def say_notes(name: str, notes: Sequence[str], quiet: bool) -> None:
 
 def show(what: RenderableType) -> None:
     """Print a table or a line of text."""
-    from kissgs.cli.console import output
 
     with stdout():
         output().print(what)

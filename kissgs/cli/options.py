@@ -192,6 +192,9 @@ FinetuneOption = Annotated[
 EvaluateOption = Annotated[
     bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
 ]
+CHECKPOINT = ".checkpoint.npz"
+"""Ending of checkpoints beside their outputs."""
+
 CheckpointOption = Annotated[
     bool, typer.Option("--checkpoint", help="Save the state of training next to the scene, and resume from it.")
 ]

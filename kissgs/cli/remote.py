@@ -70,7 +70,7 @@ def compress(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job."""
-    from kissgs.cli.console import progress_bar
+    from kissgs.cli.files import progress_bar
     from kissgs.cli.tables import status_table
     from kissgs.client import Remote
     from kissgs.core.errors import UnsupportedError
@@ -138,7 +138,7 @@ def get(
     force: ForceOption = False,
 ) -> None:
     """Wait for a job to finish, and download its container."""
-    from kissgs.cli.console import progress_bar
+    from kissgs.cli.files import progress_bar
     from kissgs.cli.tables import status_table
     from kissgs.client import Remote
     from kissgs.core.errors import OutputError

@@ -9,19 +9,18 @@ from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
-from kissgs.core.origin import relative_to
+from kissgs.core.positions import relative_to
 from kissgs.core.splats import CLEANED_TEXTS
-from kissgs.evaluation.capture_fit import USUAL_PSNR
+from kissgs.evaluation.evaluate import USUAL_PSNR
 from kissgs.evaluation.html import ReportScene
-from kissgs.evaluation.metric_text import format_metric
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, format_metric
 from kissgs.formats import FORMATS
 
 if TYPE_CHECKING:
     from kissgs.compaction.result import CompactionReport
     from kissgs.finetuning.result import FinetuneReport
-    from kissgs.pipeline.inspect import Info
     from kissgs.pipeline.report import Report
+    from kissgs.pipeline.scene_files import Info
     from kissgs.streaming.compress import StreamedReport
 
 CHANGES = {

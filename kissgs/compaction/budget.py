@@ -14,9 +14,8 @@ import numpy as np
 
 from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.samples import random_poses
-from kissgs.compaction.popspa import Popspa, StepLog, step_log
+from kissgs.compaction.popspa import Popspa, StepLog, TrainingPath, step_log
 from kissgs.compaction.result import Compacted, CompactionReport, CountTrial
-from kissgs.compaction.training_path import TrainingPath
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.root_finding import find_root
@@ -24,8 +23,7 @@ from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import BACKGROUNDS, evaluation_views
 from kissgs.evaluation.evaluate import Rendering, compare_images
 from kissgs.evaluation.results import ESTIMATED_DROP, SEARCH_SEED, Evaluation, drop_of
-from kissgs.rendering.gsplat_backend import need_cuda
-from kissgs.rendering.rasterizer import Device
+from kissgs.rendering.rasterizer import Device, need_cuda
 from kissgs.settings import CompactSettings
 from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, evaluation_only, supervision_views
 

@@ -1,9 +1,11 @@
-"""``SceneTraining``: a scene that is pruned and trained in turn, by a schedule (KISS-GS, section 3.1)."""
+"""``SceneTraining``: a scene that is pruned by scores and trained in turn (KISS-GS, section 3.1)."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Literal
@@ -11,14 +13,16 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from kissgs._version import __version__
-from kissgs.cameras.captures.posed_image import open_file
+from kissgs.cameras.captures.photos import open_file
+from kissgs.cameras.views import View
 from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.compaction.result import CompactionStep
-from kissgs.compaction.scoring import prune_by_score
-from kissgs.core.array_types import Float32, Int
-from kissgs.core.progress import Deadline, Pace, Progress
+from kissgs.core.array_types import Float, Float32, Float64, Int
+from kissgs.core.progress import Deadline, Pace, Progress, silent
 from kissgs.core.splats import ATTRIBUTES, Splats
-from kissgs.rendering.rasterizer import Device
+from kissgs.rendering.camera import Camera
+from kissgs.rendering.rasterizer import Device, removal_scores
+from kissgs.rendering.sensitivity import Coverage
 from kissgs.settings import CompactSettings
 from kissgs.training.supervision import SupervisionViews
 
@@ -27,6 +31,88 @@ if TYPE_CHECKING:
     from kissgs.training.model import GaussianModel
     from kissgs.training.supervision import TrainingTargets
 
+
+# Pruning by the scores of GaussianPOP: the squared image error that the removal of one Gaussian would cause.
+
+
+def highest_indices(scores: Float[np.ndarray, " N"], count: int) -> Int[np.ndarray, " M"]:
+    """Return the indices of the ``count`` highest scores, ascending; of equal scores the first are selected."""
+    selected = np.argsort(-scores, kind="stable")[:count]
+    return np.sort(selected)
+
+
+def prune_by_score(
+    splats: Splats,
+    views: Sequence[View],
+    background: Float32[np.ndarray, "3"],
+    count: int,
+    *,
+    min_keep_per_scoring: float = 0.0,
+    min_score: float = 0.0,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Int[np.ndarray, " M"]:
+    """Return the indices of the ``count`` Gaussians to keep: those whose removal would change the images most.
+
+    GaussianPOP, section 3, with mean squared errors, so that every image has the same weight whatever its size. A score
+    is the error of a single removal: of two Gaussians, one behind the other, each may be superfluous only while the
+    other is there. So deep pruning is done in rounds that remove the same share each, and the remaining Gaussians are
+    scored anew after each. No round leaves less than ``min_keep_per_scoring`` of them (0: a single round), and no score
+    is below ``min_score`` of what an unobstructed camera nearby would find.
+    """
+    kept = np.arange(len(splats))
+    close_up = Coverage(splats).close_up
+    share = min_keep_per_scoring
+    rounds = max(1, math.ceil(math.log(count / max(len(splats), count)) / math.log(share) - 1e-9)) if share > 0 else 1
+    shrink = (count / max(len(splats), 1)) ** (1 / rounds)
+    for round_ in range(rounds):
+        if len(kept) <= count:
+            break
+
+        def report(stage: str, fraction: float, note: str = "", done: int = round_) -> None:
+            progress(stage, (done + fraction) / rounds, note)
+
+        scene = splats.select(kept)
+        scores = _mean_scores(scene, views, background, threads, report)
+        scores = np.maximum(scores, min_score * _nearby_scores(scores, close_up[kept]))
+        left = count if round_ == rounds - 1 else max(count, round(len(splats) * shrink ** (round_ + 1)))
+        kept = kept[highest_indices(scores, left)]
+    progress("score", 1.0)
+    return kept
+
+
+def _mean_scores(
+    scene: Splats, views: Sequence[View], background: Float32[np.ndarray, "3"], threads: int, progress: Progress
+) -> Float64[np.ndarray, " N"]:
+    """Return the sum over views of the mean squared error that each removal causes, each view on its background."""
+    groups = defaultdict[tuple[int, tuple[float, ...]], list[Camera]](list)
+    for view in views:
+        view_background = background if view.background is None else view.background
+        groups[view.camera.width * view.camera.height, tuple(view_background.tolist())].append(view.camera)
+    scores, done = np.zeros(len(scene)), 0
+    for (pixels, colour), cameras in groups.items():
+
+        def report(stage: str, fraction: float, note: str = "", done: int = done, count: int = len(cameras)) -> None:
+            progress(stage, (done + fraction * count) / len(views), note)
+
+        scores += removal_scores(scene, cameras, background=colour, threads=threads, progress=report) / (3 * pixels)
+        done += len(cameras)
+    return scores
+
+
+def _nearby_scores(scores: Float[np.ndarray, " N"], close_up: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Estimate the score that an unobstructed camera near each Gaussian would find.
+
+    It is taken as proportional to ``close_up``, see :attr:`kissgs.rendering.sensitivity.Coverage.close_up`; the factor
+    is the median over the Gaussians that were seen, or 1 if none was.
+    """
+    seen = (scores > 0) & (close_up > 0)
+    if not seen.any():
+        return close_up
+    return np.asarray(np.median(scores[seen] / close_up[seen]) * close_up)
+
+
+# ``SceneTraining``: a scene that is pruned and trained in turn, by a schedule (KISS-GS, section 3.1).
 
 # Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.1).
 

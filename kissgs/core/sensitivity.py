@@ -155,8 +155,8 @@ class Sensitivity:
 
         Args:
             splats: the scene.
-            close_up: ``(N,)`` see :attr:`kissgs.rendering.coverage.Coverage.close_up`.
-            coverage: ``(N,)`` from 0 to 1, see :class:`kissgs.rendering.coverage.Coverage`.
+            close_up: ``(N,)`` see :attr:`kissgs.rendering.sensitivity.Coverage.close_up`.
+            coverage: ``(N,)`` from 0 to 1, see :class:`kissgs.rendering.sensitivity.Coverage`.
             view_uncertainty: 0 to 1; at 0 the prior is not used.
         """
         coverage = coverage.astype(np.float32)

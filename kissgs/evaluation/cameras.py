@@ -9,8 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from kissgs.cameras.random_cameras import Vec3, camera_at, log_uniform, random_direction
-from kissgs.cameras.views import View, Views
+from kissgs.cameras.views import Vec3, View, Views, camera_at, log_uniform, random_direction
 from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.progress import Progress, silent

@@ -18,8 +18,7 @@ from kissgs.core.array_types import Float32, Float64, UInt8
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.evaluate import background_of, render_clamped
-from kissgs.evaluation.metric_text import format_metric
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison, format_metric
 from kissgs.rendering.images import to_bytes
 from kissgs.rendering.rasterizer import Device
 

@@ -1,4 +1,4 @@
-"""Results of an evaluation: metrics per view and their means, and the loss as goals define it."""
+"""Metrics as text, apart from the evaluation, so that a command prints its report without loading it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,19 @@ import numpy as np
 
 from kissgs.cameras.views import View
 from kissgs.core.array_types import Float32
-from kissgs.core.origin import WORLD, Origin
-from kissgs.evaluation.metric_text import format_metric
+from kissgs.core.positions import WORLD, Origin
+
+
+def format_metric(value: float, digits: int, *, signed: bool = False) -> str:
+    """Return a value as text with this number of digits: ∞ for equal images, NaN for a failed rendering."""
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    if math.isnan(value):
+        return "NaN"
+    return f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # -0.0 + 0.0 is 0.0
+
+
+# Results of an evaluation: metrics per view and their means, and the loss as goals define it.
 
 # Results of an evaluation: metrics per view and their means, as text and as JSON.
 

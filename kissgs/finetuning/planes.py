@@ -1,25 +1,162 @@
-"""Levels of a field in training, and the tables whose values are trained."""
+"""Planes of levels in fine-tuning, and the compiled loops of its gradients and bits."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from kissgs.core.array_types import Bool, Float, Float32, Float64, Int
+from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, Int64
+from kissgs.core.numba_kernels import compiled
+from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.finetuning import kernels
-from kissgs.planning.container_model import ByteTables
 from kissgs.planning.encoding_plan import EncodingPlan
-from kissgs.planning.quantize import MEANS_TOP, Quantized
-from kissgs.planning.rdo_quantize import CAPTURED
+from kissgs.planning.quantize import MEANS_TOP, SIZE, ByteTables, Quantized, short_values, table_field
+from kissgs.planning.rd_fields import CAPTURED
 from kissgs.planning.sh_codebook import COEFFICIENTS
-from kissgs.planning.value_table import SIZE, short_values, table_field
 from kissgs.rendering.rasterizer import Device
+
+# Numba kernels of fine-tuning: one pass over the levels in place of a dozen operations with arrays in float64.
+
+T = TypeVar("T")
+
+PART = 1 << 16
+"""Number of rows that a thread processes at a time; sums of parts are added in order."""
+
+
+def each_part(work: Callable[[int, int], T], rows: int, threads: int) -> list[T]:
+    """Call ``work`` with the first row of each part and the end of its rows; return the results in order."""
+    with Workers(threads) as pool:
+        return pool.map(lambda first: work(first, min(first + PART, rows)), range(0, rows, PART))
+
+
+@compiled(
+    "void(float64[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1], float64[:, ::1], int64, int64, float64[:, ::1])"
+)
+def level_values(
+    base: Float64[np.ndarray, "R C"],
+    latents: Float32[np.ndarray, "R C"],
+    start: Int64[np.ndarray, "R _"],
+    lists: Int64[np.ndarray, " P"],
+    table: Float64[np.ndarray, "L _"],
+    first: int,
+    last: int,
+    values: Float64[np.ndarray, "R C"],  # written
+) -> None:
+    """Write the values of the levels of a plane, rows ``first`` to before ``last``."""
+    for n in range(first, last):
+        for c in range(base.shape[1]):
+            at = start[n, c if start.shape[1] > 1 else 0] + np.int64(np.rint(base[n, c] + latents[n, c]))
+            values[n, c] = table[lists[at], c if table.shape[1] > 1 else 0]
+
+
+@njit(nogil=True, error_model="numpy", inline="always")
+def _unit(place: float, start: int, lists: np.ndarray, table: np.ndarray, column: int) -> float:
+    """Return the change of a value per unit of its latent, see :meth:`kissgs.finetuning.planes.Plane.units`."""
+    near = np.rint(place)
+    at = start + np.int64(near)
+    here = table[lists[at], column]
+    below, above = here - table[lists[at - 1], column], table[lists[at + 1], column] - here
+    down, up = below if below > 0 else above, above if above > 0 else below  # outside of either end
+    return down if place < near else up if place > near else (down + up) / 2
+
+
+@compiled(
+    "void(float64[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1], int64, int64,"
+    " float32[:, ::1])"
+)
+def level_gradients(
+    base: Float64[np.ndarray, "R C"],
+    latents: Float32[np.ndarray, "R C"],
+    start: Int64[np.ndarray, "R _"],
+    lists: Int64[np.ndarray, " P"],
+    table: Float64[np.ndarray, "L _"],
+    gradient: Float64[np.ndarray, "R C"],  # by the values
+    first: int,
+    last: int,
+    v_latents: Float32[np.ndarray, "R C"],  # written
+) -> None:
+    """Write the gradients by the latents of rows ``first`` to before ``last``."""
+    for n in range(first, last):
+        for c in range(base.shape[1]):
+            own, column = start[n, c if start.shape[1] > 1 else 0], c if table.shape[1] > 1 else 0
+            v_latents[n, c] = gradient[n, c] * _unit(base[n, c] + latents[n, c], own, lists, table, column)
+
+
+@compiled(
+    "void(float64[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1], float64,"
+    " int64, int64, float32[:, ::1])"
+)
+def attract(
+    base: Float64[np.ndarray, "R C"],
+    latents: Float32[np.ndarray, "R C"],
+    start: Int64[np.ndarray, "R _"],
+    lists: Int64[np.ndarray, " P"],
+    table: Float64[np.ndarray, "L _"],
+    weights: Float64[np.ndarray, "R 1"],  # curvature of the loss by the values
+    factor: float,
+    first: int,
+    last: int,
+    gradient: Float32[np.ndarray, "R C"],  # changed
+) -> None:
+    """Add the gradient of the quadratic attraction of latents to their levels, rows ``first`` to before ``last``."""
+    for n in range(first, last):
+        for c in range(base.shape[1]):
+            own, column = start[n, c if start.shape[1] > 1 else 0], c if table.shape[1] > 1 else 0
+            unit = _unit(base[n, c] + latents[n, c], own, lists, table, column)
+            level = np.float32(np.rint(base[n, c] + latents[n, c]) - base[n, c])
+            gradient[n, c] += np.float32(factor * weights[n, 0] * unit * unit) * (latents[n, c] - level)
+
+
+@compiled(
+    "float64(float64[:, ::1], float32[:, ::1], int64[:, ::1], float32[::1], int64, int64, int64, float32[:, ::1])"
+)
+def level_bits(
+    base: Float64[np.ndarray, "R C"],  # symbol of each level of the plan
+    latents: Float32[np.ndarray, "R C"],
+    rows: Int64[np.ndarray, "R C"],  # index of each level's code in ``table``
+    table: Float32[np.ndarray, " _"],  # bits of the symbols of all codes; between two symbols they are interpolated
+    symbols: int,  # number of symbols of a code; ``symbols + 1`` entries of ``table`` belong to it
+    first: int,
+    last: int,  # exclusive
+    slopes: Float32[np.ndarray, "R C"],  # written: gradient by the latents
+) -> float:
+    """Return the bits of the levels of rows ``first`` to ``last`` (exclusive)."""
+    total = 0.0
+    for n in range(first, last):
+        for c in range(base.shape[1]):
+            position = base[n, c] + latents[n, c]
+            below = min(max(np.floor(position), 0.0), symbols - 1.0)
+            index = rows[n, c] + np.int64(below)
+            slopes[n, c] = table[index + 1] - table[index]
+            total += table[index] + np.float32(position - below) * slopes[n, c]
+    return total
+
+
+@compiled("void(float32[:, ::1], int64[::1], int64[::1], int64[::1], int64, int64, float32[:, ::1])")
+def sum_by_label(
+    rows: Float32[np.ndarray, "M C"],
+    order: Int64[np.ndarray, " M"],  # rows sorted by label
+    used: Int64[np.ndarray, " U"],  # labels that occur
+    starts: Int64[np.ndarray, " U+1"],  # start of each of these in ``order``, and the end
+    first: int,
+    last: int,  # exclusive
+    totals: Float32[np.ndarray, "E C"],  # sums; rows are added
+) -> None:
+    """Add up the rows of each label, of the labels ``used[first:last]``."""
+    for u in range(first, last):
+        for i in range(starts[u], starts[u + 1]):
+            for c in range(rows.shape[1]):
+                totals[used[u], c] += rows[order[i], c]
+
+
+# Levels of a field in training, and the tables whose values are trained.
 
 FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")
 """Trained fields of an encoding plan."""
@@ -199,9 +336,9 @@ class Plane:
         levels, curvature, slopes = self._arrays(latents, self._values(table)), weights.numpy(), gradient.numpy()
 
         def part(first: int, last: int) -> None:
-            kernels.attract(*levels, curvature, factor, first, last, slopes)
+            attract(*levels, curvature, factor, first, last, slopes)
 
-        kernels.each_part(part, len(latents), torch.get_num_threads())
+        each_part(part, len(latents), torch.get_num_threads())
 
     def _arrays(
         self, latents: Float32[Tensor, "R C"], table: Float64[Tensor, "L _"]
@@ -242,9 +379,9 @@ class _Values(torch.autograd.Function):
         levels, values = plane._arrays(latents, table), np.empty(tuple(latents.shape))
 
         def part(first: int, last: int) -> None:
-            kernels.level_values(*levels, first, last, values)
+            level_values(*levels, first, last, values)
 
-        kernels.each_part(part, len(values), torch.get_num_threads())
+        each_part(part, len(values), torch.get_num_threads())
         return torch.from_numpy(values)
 
     @staticmethod
@@ -265,9 +402,9 @@ class _Values(torch.autograd.Function):
         v_latents = np.empty(tuple(gradient.shape), np.float32)
 
         def part(first: int, last: int) -> None:
-            kernels.level_gradients(*arrays, v_values, first, last, v_latents)
+            level_gradients(*arrays, v_values, first, last, v_latents)
 
-        kernels.each_part(part, len(v_latents), torch.get_num_threads())
+        each_part(part, len(v_latents), torch.get_num_threads())
         return torch.from_numpy(v_latents), total, None
 
 

@@ -20,12 +20,11 @@ from kissgs.core.progress import Deadline, Pace, Progress, as_stage, silent
 from kissgs.core.splats import ATTRIBUTES, MAX_GAUSSIANS, Splats, clean
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
-from kissgs.finetuning.losses import RateLoss, TotalVariationLoss
 from kissgs.finetuning.planes import FIELDS, TABLES
-from kissgs.finetuning.quantized_scene import QuantizedScene, table_name
+from kissgs.finetuning.quantized_scene import QuantizedScene, RateLoss, TotalVariationLoss, table_name
 from kissgs.finetuning.result import FinetuneReport
-from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
+from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
 from kissgs.planning.rate_distortion import implied_lambda
 from kissgs.planning.rd_criterion import Costs
 from kissgs.rendering.rasterizer import Device

@@ -16,13 +16,21 @@ import numpy as np
 
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.core.origin import WORLD, from_world, origin_for
+from kissgs.core.positions import WORLD, from_world, origin_for
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.conventions import log_scales, mirror, move, opacity_logits, steps
 from kissgs.io.files import listed, marked, open_scene_file, refuse_more_than
-from kissgs.io.gltf_document import EXTENSION, GLB_MAGIC, SPZ_EXTENSIONS, TO_PLY, Document, node_matrix
-from kissgs.io.gltf_writer import write_glb, write_spz_glb
+from kissgs.io.gltf_document import (
+    EXTENSION,
+    GLB_MAGIC,
+    SPZ_EXTENSIONS,
+    TO_PLY,
+    Document,
+    node_matrix,
+    write_glb,
+    write_spz_glb,
+)
 from kissgs.io.scene_format import Codec, Facts, Match, titled
 from kissgs.io.spz import largest_spz, read_spz, read_spz_info
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from kissgs.core.array_types import UInt8
 from kissgs.core.resources import Workers
-from kissgs.io.webp import encode_plane
+from kissgs.io.images import encode_plane
 from kissgs.settings import EncodeSettings
 
 HIGHEST_EFFORT, HIGH_EFFORT = (100, 6), (100, 5)

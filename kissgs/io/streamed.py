@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.origin import Origin, read_origin, recorded
+from kissgs.core.positions import Origin, read_origin, recorded
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, MAX_GAUSSIANS, SH_REST_COUNTS, Splats, empty_splats

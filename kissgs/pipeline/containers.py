@@ -5,14 +5,14 @@ from __future__ import annotations
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned
 from kissgs.formats import ContainerName
-from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
+from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
 from kissgs.settings import EncodeSettings
 from kissgs.sog import encode as sog
 from kissgs.sog.decode import decode as decode_sog
 from kissgs.sog.encode import SOG
+from kissgs.sogxt import container as names
 from kissgs.sogxt import encode as sogxt
-from kissgs.sogxt import names
 from kissgs.sogxt.decode import decode as decode_sogxt
 
 MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 
 from kissgs.core.root_finding import StopRule, find_root
 from kissgs.pipeline.goal import Attempt, Goal
-from kissgs.settings import EncodeSettings
-from kissgs.settings.encode import GOALS
+from kissgs.settings import GOALS, EncodeSettings
 
 LOG2_LAMBDA_RANGE = (-70.0, -6.0)
 """log2 of the smallest and the largest lambda that is tried: the finest and the coarsest container."""

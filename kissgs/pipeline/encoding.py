@@ -23,11 +23,9 @@ from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
 from kissgs.pipeline.containers import DECODERS, MODELS, write_files
 from kissgs.pipeline.goal import Container
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
-from kissgs.planning.order_refinement import refine_order
-from kissgs.planning.planner import plan_encoding
+from kissgs.planning.planner import plan_encoding, refine_order
 from kissgs.planning.rate_distortion import ColorRefit
-from kissgs.rendering.gsplat_backend import need_cuda
-from kissgs.rendering.rasterizer import Device
+from kissgs.rendering.rasterizer import Device, need_cuda
 from kissgs.settings import EncodeSettings, FinetuneSettings, Settings
 
 if TYPE_CHECKING:
@@ -95,7 +93,7 @@ def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     """Measure the sensitivity of the work's scene, or of one with fewer Gaussians, if the settings need it."""
     if not settings.rate_distortion or len(splats) == 0:
         return Measured(splats)
-    from kissgs.cameras.virtual.regions import default_view_count, sensitivity_cameras
+    from kissgs.cameras.virtual.samples import default_view_count, sensitivity_cameras
 
     whole = splats is work.splats
     sensitivity = work.sensitivity if whole else None

@@ -23,8 +23,7 @@ from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
 from kissgs.pipeline.training_choice import choose, decided
 from kissgs.rendering.rasterizer import Device
-from kissgs.settings import EncodeSettings, Settings
-from kissgs.settings.encode import GOALS
+from kissgs.settings import GOALS, EncodeSettings, Settings
 from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
 from kissgs.training.checkpoint import delete_checkpoints, finetune_checkpoint_path
 
@@ -303,7 +302,7 @@ def _fitting(
     """Return the views in the coordinates of the scene and a note; raise InvalidViewsError if they do not show it."""
     if views is None:
         return None, ""
-    from kissgs.evaluation.capture_fit import fitting_views
+    from kissgs.evaluation.evaluate import fitting_views
 
     return fitting_views(splats, views, force=force, threads=threads, progress=progress)
 

@@ -1,18 +1,20 @@
-"""Scenes in files: recognise and read every format, write those that are no containers."""
+"""Scenes in files: recognise, describe, read and decode every format, write those that are no containers."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
 
 from kissgs.core.errors import InvalidContainerError, OutputError, UnsupportedError
-from kissgs.core.origin import WORLD, centred, in_world, origin_for, relative_to, world_positions
+from kissgs.core.positions import WORLD, centred, in_world, origin_for, relative_to, world_positions
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import Cleaned, Splats, clean
+from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, clean
 from kissgs.formats import ENDINGS, FORMATS, LEVELS_NAME, LOD_NAME, SCENE_ENDINGS, output_format
 from kissgs.io.containers import (
     MAX_METADATA_BYTES,
@@ -24,10 +26,11 @@ from kissgs.io.containers import (
     sniff_format,
     zip_names,
 )
-from kissgs.io.files import BinaryWriter, atomic_file, listed, parse_json, reason_of, refuse_existing
-from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Match, ReadOptions
-from kissgs.sogxt.container import is_packed
-from kissgs.sogxt.names import YAML_NAME
+from kissgs.io.files import BinaryWriter, atomic_file, listed, parse_json, reason_of, refuse_existing, refuse_more_than
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Facts, Match, ReadOptions
+from kissgs.sogxt.container import YAML_NAME, is_packed
+
+# Scenes in files: recognise and read every format, write those that are no containers.
 
 # Recognition of scene formats: by content where a format has a mark, else by the ending of the name.
 
@@ -354,3 +357,154 @@ def stored_bytes(path: Path) -> int:
         return sum(entry.stat().st_size for entry in root.rglob("*") if entry.is_file())
     except OSError as error:
         raise InvalidContainerError(f"cannot read {path}: {reason_of(error)}") from error
+
+
+# ``decompress``: it needs no encoder, so that a small container is decoded soon after the program starts.
+
+
+def decompress(
+    source: AnyPath | bytes | Mapping[str, bytes],
+    destination: AnyPath | None = None,
+    *,
+    max_gaussians: int | None = None,
+    level: int = 0,
+    raw_axes: bool = False,
+    antialiased: bool | None = None,
+    overwrite: bool = False,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Splats:
+    """Decode a SOG-XT container, or a scene of another compressed format.
+
+    Args:
+        source: path of a zip or a folder, the bytes of a zip, or the files in memory; or any other file that
+            :func:`kissgs.load` reads, except a ``.ply``.
+        destination: ``.ply`` to write; by default nothing is written.
+        max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
+        level: level of detail of a streamed scene; 0 is the finest.
+        raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
+        antialiased: see :func:`kissgs.load`.
+        overwrite: replace ``destination`` if it exists.
+        threads: number of threads; 0 means one per processor.
+        progress: receives events.
+
+    Returns:
+        The scene exactly as stored: quaternions are as quantised, so their length is only approximately 1. Only
+        formats other than containers can hold values that cannot be drawn, such as NaN: such a scene is cleaned as by
+        :func:`kissgs.load`, and ``notes`` says so. Positions are those of the world where float32 can hold them, else
+        relative to its ``origin``.
+
+    Raises:
+        InvalidContainerError: the container is damaged.
+        InvalidSceneError: a file of another format is damaged.
+        UnsupportedError: the file has a feature that kissgs does not read.
+        OutputError: ``destination`` cannot be written.
+    """
+    if destination is not None:
+        check_ply(Path(destination), overwrite=overwrite)
+    scene = source if isinstance(source, bytes | Mapping) else Path(source)
+    splats = read_scene(
+        scene,
+        ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased),
+        threads=threads,
+        progress=progress,
+        only_containers=True,
+    )
+    if not FORMATS[recognise(scene)].is_container:
+        usable, cleaned = clean(splats)
+        if cleaned.notes:
+            splats = replace(usable, notes=(*splats.notes, *cleaned.notes))
+    splats = in_world(splats)
+    if destination is not None:
+        save_ply(splats, destination, overwrite=overwrite, progress=progress)
+    return splats
+
+
+# Describe the contents of a scene file, for ``kissgs info``.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Info(Facts):
+    """Contents of a scene file or a container.
+
+    Beyond what the metadata states, those that are decoded for it have their ranges over all finite values, and the
+    Gaussians that cleaning would remove or correct. The count of a streamed scene is that of one level.
+    """
+
+    path: str
+    kind: str
+    bytes: int
+    """Size of the file or the folder."""
+
+    @property
+    def bits_per_gaussian(self) -> float:
+        """Bits of the whole file per Gaussian; of a streamed scene, those of the level's files."""
+        total = sum(self.parts.values()) if FORMATS[self.kind].manifest else self.bytes
+        return 8 * total / max(self.count, 1)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all fields and derived figures for JSON, without the texts for the terminal."""
+        found = {"path": self.path, **asdict(self), "bits_per_gaussian": self.bits_per_gaussian}
+        return {name: value for name, value in found.items() if name not in ("title", "lines")}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneInfo:
+    """Properties of a scene that its headers and metadata state.
+
+    Attributes:
+        format: format of the scene.
+        count: Gaussians.
+        sh_degree: 0 to 3.
+    """
+
+    format: str
+    count: int
+    sh_degree: int
+
+
+def read_scene_info(path: Path, *, name: str | None = None) -> SceneInfo:
+    """Read the headers and metadata of a scene, without decoding it; errors in the rest are not found.
+
+    Args:
+        path: the file or folder.
+        name: name of the file, if ``path`` has another one; the ending tells ``.splat``.
+
+    Raises:
+        KissgsError: the file is not a scene.
+    """
+    kind = recognise(path, name=name)
+    facts = FORMATS[kind].codec.info(scene_root(path), 0)
+    return SceneInfo(format=kind, count=facts.count, sh_degree=facts.sh_degree)
+
+
+def describe(path: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS) -> Info:
+    """Describe a scene file.
+
+    No image of a container is decoded, except SOG-XT's mask if the metadata does not state the number of Gaussians.
+    """
+    kind = recognise(path)
+    refuse_level(kind, reading.level)
+    facts = FORMATS[kind].codec.info(scene_root(path), reading.level)
+    if FORMATS[kind].is_container:
+        refuse_more_than(reading.max_gaussians, facts.count, str(path))  # no default: no image is decoded
+    else:
+        splats = read_scene(path, reading)
+        facts = replace(
+            facts,
+            count=len(splats),
+            sh_degree=splats.sh_degree,
+            ranges={name: _extremes(getattr(splats, name)) for name in ATTRIBUTES if getattr(splats, name).size},
+            changed=clean(splats)[1].as_dict(),
+            notes=tuple(reading_notes(splats)),
+        )
+    found = {each.name: getattr(facts, each.name) for each in fields(facts)}
+    return Info(path=str(path), kind=kind, bytes=stored_bytes(path), **found)
+
+
+def _extremes(values: np.ndarray) -> tuple[float, float]:
+    low, high = float(values.min()), float(values.max())
+    if not np.isfinite(low + high):
+        values = values[np.isfinite(values)]
+        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    return low, high

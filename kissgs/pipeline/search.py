@@ -40,7 +40,7 @@ from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
-    from kissgs.compaction.training_path import PathPoint, TrainingPath
+    from kissgs.compaction.popspa import PathPoint, TrainingPath
     from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
     from kissgs.finetuning.tune import Tuner

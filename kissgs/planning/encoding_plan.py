@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import Int, UInt8
-from kissgs.core.origin import Origin
+from kissgs.core.positions import Origin
 from kissgs.planning.layout import Grid
 from kissgs.planning.quantize import Quantized
 from kissgs.planning.rd_criterion import Costs

@@ -1,11 +1,14 @@
-"""Compiled inner loops of the encoder."""
+"""Compiled inner loops of the encoder: sorting, rotations' forms, and local search of the order."""
 
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from kissgs.core.array_types import Float32, Int32, Int64, UInt8
+from kissgs.core.array_types import Float32, Float64, Int32, Int64, UInt8, UInt64
 from kissgs.core.numba_kernels import compiled
+
+# Compiled inner loops of the encoder.
 
 
 @compiled("void(uint16[:, ::1], uint64[::1])")
@@ -232,3 +235,305 @@ def nearest_forms(
                 best = negated
                 chosen = k + 24
         forms[n] = chosen
+
+
+# Compiled inner loops of :mod:`kissgs.planning.rotation_forms`.
+
+
+@compiled("void(float32[:, ::1], float64[:, ::1])")
+def normalize(quats: np.ndarray, unit: np.ndarray) -> None:
+    """Write the quaternions ``(N, 4)``, divided by their lengths, to ``unit``."""
+    for n in range(quats.shape[0]):
+        w, x, y, z = np.float64(quats[n, 0]), np.float64(quats[n, 1]), np.float64(quats[n, 2]), np.float64(quats[n, 3])
+        length = np.sqrt(w * w + x * x + y * y + z * z)
+        unit[n, 0], unit[n, 1], unit[n, 2], unit[n, 3] = w / length, x / length, y / length, z / length
+
+
+@compiled("void(float64[:, ::1], float64[:, ::1], uint8[::1])")
+def largest_w(quats: np.ndarray, rotations: np.ndarray, forms: np.ndarray) -> None:
+    """Write the form of largest w of each quaternion ``(N, 4)`` to ``forms``; among equals, the first of the table.
+
+    w is compared in units of 1e-9: without rounding, equal forms would differ. ``rotations`` is ``(24, 4)``.
+    """
+    for n in range(quats.shape[0]):
+        w, x, y, z = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
+        best = least = np.rint(w * 1e9)  # the first form is the identity
+        chosen = lowest = 0
+        for k in range(1, 24):
+            found = w * rotations[k, 0] - x * rotations[k, 1] - y * rotations[k, 2] - z * rotations[k, 3]
+            found = np.rint(found * 1e9)
+            if found > best:
+                best, chosen = found, k
+            if found < least:
+                least, lowest = found, k
+        forms[n] = chosen if best >= -least else lowest + 24
+
+
+@compiled(
+    "void(float64[:, ::1], float32[:, ::1], uint8[::1], float64[:, ::1], int64[:, ::1], float64[:, ::1],"
+    " float32[:, ::1])"
+)
+def apply_forms(
+    quats: Float64[np.ndarray, "N 4"],
+    scales: Float32[np.ndarray, "N 3"],
+    forms: UInt8[np.ndarray, " N"],  # row of the table, plus 24 if the quaternion is negated
+    rotations: Float64[np.ndarray, "24 4"],
+    permutations: Int64[np.ndarray, "24 3"],  # scale order of each form
+    new_quats: Float64[np.ndarray, "N 4"],  # written
+    new_scales: Float32[np.ndarray, "N 3"],  # written
+) -> None:
+    """Write rotations and log-scales in the forms: the Hamilton product with a row of the table, and its order."""
+    for n in range(quats.shape[0]):
+        row, sign = forms[n] % 24, 1.0 if forms[n] < 24 else -1.0
+        w1, x1, y1, z1 = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
+        w2, x2, y2, z2 = rotations[row, 0], rotations[row, 1], rotations[row, 2], rotations[row, 3]
+        new_quats[n, 0] = sign * (w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2)
+        new_quats[n, 1] = sign * (w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2)
+        new_quats[n, 2] = sign * (w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2)
+        new_quats[n, 3] = sign * (w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2)
+        for i in range(3):
+            new_scales[n, i] = scales[n, permutations[row, i]]
+
+
+@njit(nogil=True, error_model="numpy")
+def _covariance(quats: np.ndarray, scales: np.ndarray, largest: float, n: int, out: np.ndarray) -> None:
+    """Write the covariance of one Gaussian, divided by the square of exp(``largest``), to ``out``, ``(2, 3, 3)``."""
+    w, x, y, z = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
+    axes = out[1]
+    axes[0, 0], axes[0, 1], axes[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    axes[1, 0], axes[1, 1], axes[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    axes[2, 0], axes[2, 1], axes[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    for k in range(3):
+        deviation = np.exp(np.float64(scales[n, k]) - largest)
+        for i in range(3):
+            axes[i, k] *= deviation
+    for i in range(3):
+        for j in range(3):
+            out[0, i, j] = axes[i, 0] * axes[j, 0] + axes[i, 1] * axes[j, 1] + axes[i, 2] * axes[j, 2]
+
+
+@compiled("float64(float64[:, ::1], float32[:, ::1], float64[:, ::1], float32[:, ::1])")
+def covariance_error(quats: np.ndarray, scales: np.ndarray, new_quats: np.ndarray, new_scales: np.ndarray) -> float:
+    """Return the largest relative difference of the covariances before and after, Frobenius norm; 0 of no rows."""
+    before, after = np.empty((2, 3, 3)), np.empty((2, 3, 3))
+    worst = 0.0
+    for n in range(quats.shape[0]):
+        largest = np.float64(max(scales[n, 0], scales[n, 1], scales[n, 2]))  # avoids squares of e^±60
+        _covariance(quats, scales, largest, n, before)
+        _covariance(new_quats, new_scales, largest, n, after)
+        size = difference = 0.0
+        for i in range(3):
+            for j in range(3):
+                size += before[0, i, j] * before[0, i, j]
+                difference += (after[0, i, j] - before[0, i, j]) ** 2
+        worst = max(worst, difference / size)
+    return np.sqrt(worst)
+
+
+# Compiled sorting of keys, for :mod:`kissgs.planning.layout`.
+
+
+@compiled("void(uint64[::1], int32[::1], uint64[::1], int32[::1], int64)")
+def sort_keys(
+    keys: UInt64[np.ndarray, " N"],
+    order: Int32[np.ndarray, " N"],
+    other_keys: UInt64[np.ndarray, " N"],
+    other_order: Int32[np.ndarray, " N"],
+    passes: int,
+) -> None:
+    """Sort ``keys`` stably by their lowest 12 · ``passes`` bits, and write the permutation to ``order``, by radix sort.
+
+    ``passes`` is even, so that the result ends in ``keys`` and ``order``; the others are scratch.
+    """
+    count = keys.shape[0]
+    counts = np.zeros((passes, 4096), np.int64)
+    for n in range(count):
+        order[n] = n
+        key = keys[n]
+        for digit in range(passes):
+            counts[digit, (key >> np.uint64(12 * digit)) & np.uint64(4095)] += 1
+    for digit in range(passes):
+        total = 0
+        for value in range(4096):
+            total, counts[digit, value] = total + counts[digit, value], total
+        here, there = (keys, other_keys) if digit % 2 == 0 else (other_keys, keys)
+        old, new = (order, other_order) if digit % 2 == 0 else (other_order, order)
+        shift = np.uint64(12 * digit)
+        for n in range(count):
+            value = (here[n] >> shift) & np.uint64(4095)
+            place = counts[digit, value]
+            counts[digit, value] = place + 1
+            there[place] = here[n]
+            new[place] = old[n]
+
+
+# Compiled inner loops of :mod:`kissgs.planning.planner`: near pixels, and local search (2-opt, Or-opt).
+
+
+@njit(nogil=True, error_model="numpy")
+def _bits_between(pixels: np.ndarray, bits: np.ndarray, a: int, b: int) -> int:
+    """Return the bits of pixel ``a`` beside pixel ``b``."""
+    total = 0
+    for channel in range(pixels.shape[1]):
+        total += bits[channel, np.uint8(pixels[a, channel] - pixels[b, channel])]
+    return total
+
+
+@compiled("void(uint8[:, ::1], int32[:, ::1], int32[:, ::1], int64, int32[:, ::1])")
+def near_pixels(
+    pixels: UInt8[np.ndarray, "N C"],
+    bits: Int32[np.ndarray, "C 256"],
+    curves: Int32[np.ndarray, "K N"],
+    reach: int,
+    near: Int32[np.ndarray, "N k"],
+) -> None:
+    """Find the pixels that take the fewest bits beside each pixel, among those that are near it on some curves.
+
+    ``bits`` are those of each difference modulo 256, ``curves`` permutations, and ``reach`` places on a curve in both
+    directions. ``near`` has the fewest bits first, and is filled up with the pixel itself.
+    """
+    count, most = near.shape
+    best = np.empty((count, most), np.int64)
+    for n in range(count):
+        for place in range(most):
+            near[n, place], best[n, place] = n, 1 << 40
+    for curve in range(curves.shape[0]):
+        for i in range(count):
+            n = curves[curve, i]
+            for j in range(max(i - reach, 0), min(i + reach + 1, count)):
+                if j == i:
+                    continue
+                other = curves[curve, j]
+                cost = _bits_between(pixels, bits, n, other)
+                if cost >= best[n, most - 1]:
+                    continue
+                known = False
+                for place in range(most):
+                    known |= near[n, place] == other
+                if known:
+                    continue
+                place = most - 1
+                while place > 0 and best[n, place - 1] > cost:
+                    near[n, place], best[n, place] = near[n, place - 1], best[n, place - 1]
+                    place -= 1
+                near[n, place], best[n, place] = other, cost
+
+
+@njit(nogil=True, error_model="numpy")
+def _reverse(order: np.ndarray, places: np.ndarray, first: int, last: int) -> None:
+    """Reverse the order from ``first`` to ``last``, both included."""
+    while first < last:
+        a, b = order[first], order[last]
+        order[first], order[last] = b, a
+        places[b], places[a] = first, last
+        first, last = first + 1, last - 1
+
+
+@njit(nogil=True, error_model="numpy")
+def _reversal(
+    order: np.ndarray, places: np.ndarray, pixels: np.ndarray, bits: np.ndarray, near: np.ndarray, a: int, side: int
+) -> bool:
+    """Join ``a`` to a near pixel by the best reversal (2-opt), on its later ``side``, 1, or its earlier one, -1."""
+    count, i = len(order), places[a]
+    if not 0 <= i + side < count:
+        return False
+    beside = order[i + side]
+    now = _bits_between(pixels, bits, a, beside)
+    best, found = 0, -1
+    for place in range(near.shape[1]):
+        b = near[a, place]
+        j, joined = places[b], _bits_between(pixels, bits, a, b)
+        if joined >= now:
+            break
+        if not 0 <= j + side < count:
+            continue
+        other = order[j + side]
+        gain = now + _bits_between(pixels, bits, b, other) - joined - _bits_between(pixels, bits, beside, other)
+        if gain > best:
+            best, found = gain, j
+    if found < 0:
+        return False
+    later = 1 if side > 0 else 0
+    _reverse(order, places, min(i, found) + later, max(i, found) + later - 1)
+    return True
+
+
+@njit(nogil=True, error_model="numpy")
+def _move(
+    order: np.ndarray, places: np.ndarray, pixels: np.ndarray, bits: np.ndarray, near: np.ndarray, a: int, length: int
+) -> bool:
+    """Move the ``length`` pixels that begin with ``a`` beside a pixel near their first or last one (Or-opt)."""
+    count, i = len(order), places[a]
+    if i < 1 or i + length >= count:
+        return False
+    before, last, after = order[i - 1], order[i + length - 1], order[i + length]
+    saved = (
+        _bits_between(pixels, bits, before, a)
+        + _bits_between(pixels, bits, last, after)
+        - _bits_between(pixels, bits, before, after)
+    )
+    best, found, found_side, joined_first = 0, -1, 0, False
+    for first in (True, False):
+        joined, loose = (a, last) if first else (last, a)
+        for place in range(near.shape[1]):
+            b = near[joined, place]
+            cost, j = _bits_between(pixels, bits, joined, b), places[b]
+            if cost >= saved:
+                break
+            if i <= j < i + length:
+                continue
+            for side in (1, -1):
+                k = j + side
+                if not 0 <= k < count or i <= k < i + length:
+                    continue
+                other = order[k]
+                gain = saved - cost - _bits_between(pixels, bits, loose, other) + _bits_between(pixels, bits, b, other)
+                if gain > best:
+                    best, found, found_side, joined_first = gain, j, side, first
+    if found < 0:
+        return False
+    if joined_first != (found_side > 0):  # after b its joined end comes first, before b last
+        _reverse(order, places, i, i + length - 1)
+    if found > i:
+        end = found if found_side > 0 else found - 1
+        _rotate(order, places, i, i + length, end + 1)
+    else:
+        _rotate(order, places, found + 1 if found_side > 0 else found, i, i + length)
+    return True
+
+
+@njit(nogil=True, error_model="numpy")
+def _rotate(order: np.ndarray, places: np.ndarray, first: int, middle: int, end: int) -> None:
+    """Swap the part from ``first`` to before ``middle`` with the part from there to before ``end``."""
+    moved = np.concatenate((order[middle:end], order[first:middle]))
+    for k in range(len(moved)):
+        order[first + k] = moved[k]
+        places[moved[k]] = first + k
+
+
+@compiled("void(uint8[:, ::1], int32[:, ::1], int32[:, ::1], int64, int32[::1])")
+def improve(
+    pixels: UInt8[np.ndarray, "N C"],
+    bits: Int32[np.ndarray, "C 256"],
+    near: Int32[np.ndarray, "N k"],
+    passes: int,
+    order: Int32[np.ndarray, " N"],
+) -> None:
+    """Reorder pixels such that each takes fewer bits beside the one before it; the first and the last one stay.
+
+    ``bits`` are equal for a difference and its negative.
+    """
+    places = np.empty(len(order), np.int32)
+    for place in range(len(order)):
+        places[order[place]] = place
+    for _ in range(passes):
+        changes = 0
+        for a in range(len(order)):
+            for side in (1, -1):
+                changes += _reversal(order, places, pixels, bits, near, a, side)
+            for length in (1, 2, 3):
+                if _move(order, places, pixels, bits, near, a, length):
+                    changes += 1
+                    break
+        if changes == 0:
+            break

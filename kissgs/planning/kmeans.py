@@ -11,8 +11,7 @@ import numpy as np
 from kissgs.core.array_types import Float32, Float64, Int, Int32, UInt16
 from kissgs.core.resources import Workers
 from kissgs.planning.clustering import BLOCK, Clustering, Vectors, sorted_by_label
-from kissgs.planning.quantize import clip_outliers
-from kissgs.planning.rows import for_each_block
+from kissgs.planning.quantize import clip_outliers, for_each_block
 
 if TYPE_CHECKING:
     from kissgs.planning.clustering import ShMetric

@@ -12,8 +12,7 @@ from kissgs.core.array_types import Bool, Float32, Int, Int32, Integer, UInt16
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.resources import Workers
 from kissgs.core.splats import MAX_GRID_SIDE
-from kissgs.planning.quantize import quantize_means
-from kissgs.planning.rows import for_each_block, selected, sorted_order
+from kissgs.planning.quantize import for_each_block, quantize_means, selected, sorted_order
 from kissgs.settings import EncodeSettings
 
 # PLAS: arrange vectors on a square grid so that neighbours are similar.

@@ -1,17 +1,134 @@
-"""Levels and the values that they stand for; uniform quantisers, and the ranges that decoders need to invert them."""
+"""Quantisation: the values that a container can hold, levels, tables of values, and blocks of rows."""
 
 from __future__ import annotations
 
+import heapq
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, Integer, UInt8, UInt16
+from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, Int32, Integer, Shaped, UInt8, UInt16, UInt64
+from kissgs.core.positions import signed_log
+from kissgs.core.progress import Progress
 from kissgs.core.resources import Workers
-from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import Splats
-from kissgs.planning.rows import Rows, for_each_block, row_range, selected
+from kissgs.settings import EncodeSettings
+
+# ``ContainerModel``: the values that a container can hold; ``Planning``: inputs that all steps of planning share.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ByteTables:
+    """Eight-bit levels that stand for the values of tables, as SOG has them.
+
+    Scales, base colours and SH coefficients have one free table of 256 values each, for all their channels. Rotations
+    are three of the quaternion's components, 255 steps from -1/sqrt(2) to 1/sqrt(2), and which one is left out.
+    Positions have 65,536 levels over a range of their own per axis.
+    """
+
+    opacity_logits: Float64[np.ndarray, " 256"]  # opacity logit of each level, ascending
+    first_drawn: int  # smallest level of opacity that renderers draw
+    last_drawn: int  # largest level of opacity to use
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ContainerModel:
+    """Description of the values that a container can hold."""
+
+    tables: ByteTables | None = None  # None for even levels over a range per channel, and whole quaternions
+    padding_last: bool = False  # whether cells without a Gaussian must follow all others
+    entry_bits: float = 112  # typical size of an entry of the SH codebook, bits, at 45 dimensions
+
+
+EVEN_LEVELS = ContainerModel()
+"""Evenly spaced levels, and a mask that says which cells hold a Gaussian: the default."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Planning:
+    """Inputs that all steps of one planning share."""
+
+    settings: EncodeSettings
+    container: ContainerModel
+    pool: Workers
+    progress: Progress
+
+    def report(self, stage: str) -> Callable[[float], None]:
+        """Report that a stage begins, and return what reports the fraction of it that is done."""
+        self.progress(stage, 0.0)
+        return lambda fraction: self.progress(stage, fraction)
+
+
+# Rows of attributes that are made block by block, so that no whole copy of a scene is needed.
+
+R = TypeVar("R")
+
+BLOCK = 1 << 14
+"""Number of rows of a block: its float64 values stay in the processor's cache."""
+
+
+@runtime_checkable
+class Rows(Protocol):
+    """Array, or what gives the rows of one when asked: ``values[first:last]`` is ``(last - first, C)``."""
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        """Return some rows."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Computed:
+    """Rows that a function computes."""
+
+    count: int
+    of: Callable[[slice], np.ndarray]
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        return self.of(rows)
+
+
+def selected(array: Shaped[np.ndarray, "N C"], index: Int[np.ndarray, " M"]) -> Computed:
+    """Return the rows of ``array`` at ``index``, in that order."""
+    return Computed(len(index), lambda rows: array.take(index[rows], axis=0))
+
+
+def for_each_block(
+    count: int, work: Callable[[slice], R], pool: Workers | None = None, *, block: int = BLOCK
+) -> list[R]:
+    """Call ``work`` for the slices that cover ``count`` rows; return its results in their order."""
+    slices = [slice(first, min(first + block, count)) for first in range(0, count, block)]
+    return [work(rows) for rows in slices] if pool is None else pool.map(work, slices)
+
+
+def row_range(values: Rows, pool: Workers | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest value of each column, of at least one row."""
+
+    def ends(rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        columns = values[rows].T  # NumPy is slow at the ends of short rows
+        return np.array([column.min() for column in columns]), np.array([column.max() for column in columns])
+
+    found = for_each_block(len(values), ends, pool)
+    return np.min([low for low, _ in found], axis=0), np.max([high for _, high in found], axis=0)
+
+
+def sorted_order(keys: UInt64[np.ndarray, " N"], bits: int = 64) -> Int32[np.ndarray, " N"]:
+    """Sort ``keys``, below 2^``bits``, in place; return the permutation that does, stably."""
+    from kissgs.planning import kernels as order_kernels
+
+    order, scratch = np.empty(len(keys), np.int32), np.empty(len(keys), np.int32)
+    order_kernels.sort_keys(keys, order, np.empty_like(keys), scratch, 2 * -(-bits // 24))
+    return order
+
+
+# Levels and the values that they stand for; uniform quantisers, and the ranges that decoders need to invert them.
 
 MEANS_TOP = 65_535
 """Top level of positions. It must occur, because some readers of meta.json divide by it, not by the observed one."""
@@ -229,3 +346,125 @@ def _levels(
     np.rint(levels, out=levels)
     levels *= spacing
     return np.clip(levels, 0, top, out=levels)
+
+
+# Tables of at most 256 values that all channels of an attribute share, and the nearest levels.
+
+SIZE = 256
+"""Largest number of values of a table."""
+
+WIDEST = 120
+"""Joined points span at most this fraction of the whole range, which bounds the error where weights are small."""
+
+DIGITS = 6
+"""Significant digits of the values of a table, which its container stores as text."""
+
+MAX_POINTS = 1 << 14
+"""Largest number of lattice points before joining; the lattice is coarser for values that occupy more."""
+
+
+def fit_table(
+    values: Float[np.ndarray, " V"], weights: Float64[np.ndarray, " V"], step: float, *, with_zero: bool = False
+) -> Float32[np.ndarray, " levels"]:
+    """Return ascending values of a table for at least one value: the occupied points of a lattice of this ``step``.
+
+    So outliers cost no step of the others. If more than 256 points are occupied, the neighbours whose union adds the
+    least weighted squared error are joined.
+    """
+    wide = np.asarray(values, np.float64)
+    span = float(np.ptp(wide))
+    step = max(step, span * 2.0**-40, 1e-30)
+    while True:
+        points, index = np.unique(np.rint(wide / step), return_inverse=True)
+        if len(points) <= MAX_POINTS:
+            break
+        step *= 2
+    centers = points * step
+    if len(points) > SIZE - with_zero:
+        mass = np.bincount(index, np.maximum(weights, weights.mean() * 1e-3 + 1e-300), minlength=len(points))
+        centers = _join(centers, mass, SIZE - with_zero, (centers[-1] - centers[0]) / WIDEST)
+    if with_zero and not (centers == 0).any():
+        centers = np.append(centers, 0.0)
+    return np.unique(centers.astype(np.float32) + np.float32(0))
+
+
+def _join(
+    centers: Float64[np.ndarray, " points"], mass: Float64[np.ndarray, " points"], size: int, widest: float
+) -> Float64[np.ndarray, " levels"]:
+    """Join neighbours, the cheapest first, until ``size`` groups remain; return the weighted mean of each."""
+    count = len(centers)
+    mean, total = centers.copy(), mass.copy()
+    first, last = centers.copy(), centers.copy()
+    before, after = np.arange(count) - 1, np.arange(count) + 1
+    version = np.zeros(count, np.int64)
+    queue: list[tuple[float, int, int, int]] = []
+
+    def offer(a: int, b: int) -> None:
+        if last[b] - first[a] <= widest:
+            cost = total[a] * total[b] / (total[a] + total[b]) * (mean[b] - mean[a]) ** 2
+            heapq.heappush(queue, (float(cost), a, int(version[a]), int(version[b])))
+
+    for a in range(count - 1):
+        offer(a, a + 1)
+    alive = count
+    while alive > size and queue:
+        _, a, made_a, made_b = heapq.heappop(queue)
+        b = int(after[a])
+        if version[a] != made_a or b >= count or version[b] != made_b:
+            continue
+        mean[a] = (mean[a] * total[a] + mean[b] * total[b]) / (total[a] + total[b])
+        total[a] += total[b]
+        last[a], after[a] = last[b], after[b]
+        version[a] += 1
+        version[b] = -1
+        alive -= 1
+        if after[a] < count:
+            before[after[a]] = a
+            offer(a, int(after[a]))
+        if before[a] >= 0:
+            offer(int(before[a]), a)
+    return mean[version >= 0]
+
+
+def nearest_levels(table: Float[np.ndarray, " levels"], values: Float[np.ndarray, "N C"]) -> UInt8[np.ndarray, "N C"]:
+    """Return the index of the nearest value of the ascending ``table``."""
+    wide = table.astype(np.float64)
+    return np.asarray(np.searchsorted((wide[1:] + wide[:-1]) / 2, values, side="right").astype(np.uint8))
+
+
+def table_field(table: Float32[np.ndarray, " levels"], levels: UInt8[np.ndarray, "N C"]) -> Quantized:
+    """Return levels that stand for the values of a table, which are rounded to the digits that are stored."""
+    return Quantized(levels, short_values(table).astype(np.float64)[:, None])
+
+
+def short_values(table: Float32[np.ndarray, " levels"]) -> Float32[np.ndarray, " levels"]:
+    """Return the values with the digits that are stored."""
+    return np.array([float(f"{value:.{DIGITS}g}") for value in table.tolist()], np.float32)
+
+
+def refit_table(
+    table: Float32[np.ndarray, " levels"],
+    levels: Integer[np.ndarray, "N C"],
+    values: Float64[np.ndarray, "N C"],
+    weights: Float64[np.ndarray, " N"],
+    largest: tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]],
+) -> Float32[np.ndarray, " levels"]:
+    """Move each value of a table to the weighted mean of what it stands for, within the largest changes down and up."""
+    size, rows = len(table), np.broadcast_to(weights[:, None], levels.shape).ravel()
+    index, flat = levels.ravel(), values.ravel()
+    mass = np.bincount(index, rows, minlength=size)
+    mean = np.bincount(index, rows * flat, minlength=size) / np.where(mass > 0, mass, 1)
+    floor, ceiling = np.full(size, -np.inf), np.full(size, np.inf)
+    np.maximum.at(floor, index, (values - largest[0][:, None]).ravel())
+    np.minimum.at(ceiling, index, (values + largest[1][:, None]).ravel())
+    moved = np.where((mass > 0) & (floor <= ceiling), np.clip(mean, floor, np.maximum(floor, ceiling)), table)
+    moved = moved.astype(np.float32)
+    return moved if (np.diff(moved) > 0).all() else table
+
+
+def without_unused(
+    table: Float32[np.ndarray, " levels"], levels: Integer[np.ndarray, "N C"]
+) -> tuple[Float32[np.ndarray, " used"], UInt8[np.ndarray, "N C"]]:
+    """Return the table without the values that no level uses, and the levels in it."""
+    used, index = np.unique(levels, return_inverse=True)
+    return table[used], index.reshape(levels.shape).astype(np.uint8)

@@ -7,20 +7,17 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Int, Int32, UInt16
+from kissgs.core.positions import signed_log
 from kissgs.core.resources import Workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import SH_C0, Splats
 from kissgs.planning.clustering import ShMetric
-from kissgs.planning.container_model import Planning
 from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import layout_grid
-from kissgs.planning.quantize import Quantized, means_bits
+from kissgs.planning.quantize import Planning, Quantized, for_each_block, means_bits, row_range, selected
 from kissgs.planning.rd_criterion import SEEN, Costs, RdCriterion
-from kissgs.planning.rd_fields import RdFields, decoded_entries, decoded_scene, largest_errors
-from kissgs.planning.rdo_quantize import largest_changes
+from kissgs.planning.rd_fields import RdFields, decoded_entries, decoded_scene, largest_changes, largest_errors
 from kissgs.planning.rotation_forms import choose_forms
-from kissgs.planning.rows import for_each_block, row_range, selected
 from kissgs.planning.sh_codebook import (
     SH_SHRINK,
     Codebook,

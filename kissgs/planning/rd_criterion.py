@@ -12,7 +12,7 @@ from kissgs.core.array_types import Bool, Float32, Float64, Int, Integer, UInt8,
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import Splats
-from kissgs.planning.rows import Rows, for_each_block, sorted_order
+from kissgs.planning.quantize import Rows, for_each_block, sorted_order
 
 FLOOR = 1e-3
 """Smallest sensitivity, in units of the median, so that Gaussians that no camera saw keep a bounded error."""

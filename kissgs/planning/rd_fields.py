@@ -1,24 +1,349 @@
-"""Levels of every attribute at one lambda, in the values that the container can hold."""
+"""Levels of each attribute with the least distortion and rate, given even steps or tables of values."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from math import ceil
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.core.array_types import Float, Float32, Float64, Int, Integer, UInt8
+from kissgs.core.positions import signed_exp, signed_log
 from kissgs.core.resources import Workers
-from kissgs.core.signed_log import signed_exp, signed_log
 from kissgs.core.splats import Splats
-from kissgs.planning import table_fields
-from kissgs.planning.container_model import Planning
-from kissgs.planning.quantize import MEANS_TOP, Quantized, clip_outliers, log_extent, means_bits, quantize_means
+from kissgs.planning import rotation_forms as smallest_three
+from kissgs.planning.quantize import (
+    MEANS_TOP,
+    SIZE,
+    ByteTables,
+    Computed,
+    Planning,
+    Quantized,
+    Rows,
+    clip_outliers,
+    even_table,
+    fit_table,
+    for_each_block,
+    log_extent,
+    means_bits,
+    nearest_levels,
+    quantize_means,
+    refit_table,
+    row_range,
+    selected,
+    table_field,
+    without_unused,
+)
 from kissgs.planning.rd_criterion import RdCriterion
-from kissgs.planning.rdo_quantize import quantize_by_class, rdo_quantize
-from kissgs.planning.rotation_forms import StoredShapes
-from kissgs.planning.rows import Rows, for_each_block, selected
+from kissgs.planning.rotation_forms import KEPT, PERMUTATIONS, StoredShapes
 from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook
+
+# RDO quantisation: levels of the smallest squared image error plus lambda · bits.
+#
+# Every sensitivity class has its own step, and within a class, frequent levels are preferred where the error is small.
+
+UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
+VIRTUAL = {"opacities": 0.4, "scales": 0.13, "growth": 0.12, "quaternions": 0.04, "f_dc": 0.2}
+CAPTURED = {"opacities": 2.0, "scales": 0.6, "growth": 0.3, "quaternions": 0.25, "f_dc": 0.5}
+"""Largest step of each attribute and largest change by rounding, at any lambda.
+
+``UNSEEN``, the steps of ``fast``, is for Gaussians that no camera saw; ``VIRTUAL`` for those that virtual cameras saw,
+because other cameras may come closer; ``CAPTURED`` for those that a capture's cameras saw. The Hessian does not hold
+for larger errors. A Gaussian smaller than a pixel has no derivative by its size, but would become a visible blob from
+nearby, so scales may grow less than they may shrink (``growth``).
+"""
+
+SLACK_POWER = 1 / 3
+"""Exponent with which these bounds grow with ``slack``, measured with cameras that the encoder did not use."""
+
+
+def largest_changes(
+    coverage: Float[np.ndarray, " M"], captured: Float[np.ndarray, " M"], slack: float
+) -> dict[str, Computed]:
+    """Return the largest change by rounding of each attribute of each Gaussian, rows of float64.
+
+    Optimal steps grow as the root of lambda. These bounds grow more slowly: they protect views in which a change is
+    more visible than in the measured ones, where pruning or coarser colours would be the smaller loss.
+    """
+
+    def change(name: str, rows: slice) -> Float64[np.ndarray, " n"]:
+        seen, by_capture = coverage[rows].astype(np.float64), captured[rows].astype(np.float64)
+        unseen, virtual, capture = np.log([UNSEEN[name], VIRTUAL[name], CAPTURED[name]])
+        logs = unseen * (1 - seen) + virtual * (seen - by_capture) + capture * by_capture
+        return np.minimum(np.exp(logs) * slack**SLACK_POWER, CAPTURED[name])
+
+    return {name: Computed(len(coverage), partial(change, name)) for name in CAPTURED}
+
+
+UNUSED_COUNT = 0.05
+"""Count that an unused level has in the estimate of its bits."""
+
+ROUNDS = 3
+"""Number of iterations of counting levels and choosing by the counts."""
+
+CHUNK = 1 << 14
+"""Gaussians per task."""
+
+SHAPE_FIELDS = ("opacities", "scales", "quaternions")
+"""Fields whose levels are chosen jointly."""
+
+
+def quantize_by_class(
+    values: Float[np.ndarray, "M C"] | Rows,
+    optimal: Sequence[float],
+    classes: Integer[np.ndarray, " M"],
+    coarsest: Float64[np.ndarray, " M"] | Rows,
+    pool: Workers | None = None,
+) -> Quantized:
+    """Round to the nearest of the levels that each sensitivity class uses: multiples of one step for all channels.
+
+    ``optimal`` is the best step of each class; no step is above ``coarsest`` of the Gaussian.
+    """
+    smallest, largest = row_range(values, pool)
+    low32 = smallest.astype(np.float32) + np.float32(0)
+    low = low32.astype(np.float64)
+    extent = largest.astype(np.float64) - low
+    widest = float(extent.max(initial=0))
+    count, best = len(values), np.array(optimal)
+
+    def steps(rows: slice) -> Float64[np.ndarray, " n"]:
+        return np.minimum(best[classes[rows]], coarsest[rows])
+
+    least = min(for_each_block(count, lambda rows: float(steps(rows).min()), pool))
+    finest = max(least, widest / 255, 1e-30)
+    top = int(min(max(ceil(widest / finest - 1e-3), 1), 255))
+    levels, stride = np.empty((count, len(low)), np.uint8), np.empty(count, np.uint8)
+
+    def round_to_levels(rows: slice) -> None:
+        spacing = np.clip(np.rint(steps(rows) / finest), 1, 255)
+        multiples = spacing[:, None]
+        found = np.rint((values[rows] - low) / finest / multiples) * multiples
+        found = np.where(found > top, np.floor(top / multiples) * multiples, found)
+        levels[rows], stride[rows] = np.clip(found, 0, top), spacing
+
+    for_each_block(count, round_to_levels, pool)
+    high = np.where(extent > 0, low + top * finest, low).astype(np.float32)
+    return Quantized(levels, even_table(low32, high, top), stride)
+
+
+def rdo_quantize(
+    values: Float64[np.ndarray, "M 8"] | Rows,
+    parts: dict[str, Quantized],
+    hessians: Float32[np.ndarray, "M 10"] | Rows,
+    forms: UInt8[np.ndarray, " M"],
+    criterion: RdCriterion,
+    largest: Mapping[str, Float64[np.ndarray, " M"] | Rows],
+    pool: Workers,
+    tables: ByteTables | None = None,
+) -> dict[str, Quantized]:
+    """Choose the levels of opacities, scales and quaternions jointly by squared error plus lambda · bits.
+
+    With ``tables``, the values of the scales' table move to the mean of what they stand for.
+    """
+    from kissgs.planning import rdo_kernels
+
+    costs, classes = criterion.costs, criterion.classes
+    levels = np.concatenate([parts[name].levels for name in SHAPE_FIELDS], axis=1)
+    omitted = parts["omitted"].levels[:, 0] if "omitted" in parts else None
+    floor = np.array([float(cost.min(initial=np.inf)) for cost in (costs.opacity, costs.scale, costs.rotation)])
+
+    for _ in range(ROUNDS):
+        rate_table = criterion.rd_lambda * level_bits(levels, classes, pool)
+        values_of_levels, ends = _values_of_levels([parts[name] for name in SHAPE_FIELDS])
+        if tables is not None:
+            ends[0] = tables.first_drawn, tables.last_drawn
+
+        def choose(
+            rows: slice,
+            rate_table: Float64[np.ndarray, "classes C 256"] = rate_table,
+            values_of_levels: Float64[np.ndarray, "C 256"] = values_of_levels,
+            ends: Int[np.ndarray, "C 2"] = ends,
+        ) -> None:
+            chosen = levels[rows].astype(np.int64)
+            missing = np.full(len(chosen), -1) if omitted is None else omitted[rows].astype(np.int64)
+            rdo_kernels.choose_levels(
+                values[rows],
+                np.tile(np.arange(4), (len(chosen), 1)) if omitted is None else KEPT[missing],
+                missing,
+                hessians[rows],
+                forms[rows],
+                PERMUTATIONS,
+                classes[rows].astype(np.int64),
+                values_of_levels,
+                ends,
+                rate_table,
+                _bounds(largest, rows, levels.shape[1]),
+                floor,
+                chosen,
+            )
+            levels[rows] = chosen
+
+        for_each_block(len(levels), choose, pool, block=CHUNK)
+        if tables is not None:
+            bounds = largest["scales"][:], largest["growth"][:]
+            table = parts["scales"].table[:, 0].astype(np.float32)
+            moved = refit_table(table, levels[:, 1:4], values[:][:, 1:4], costs.scale, bounds)
+            parts = {**parts, "scales": replace(parts["scales"], table=moved.astype(np.float64)[:, None])}
+    chosen = np.split(levels, [1, 4], axis=1)
+    found = {name: replace(parts[name], levels=own) for name, own in zip(SHAPE_FIELDS, chosen, strict=True)}
+    return {**parts, **found}
+
+
+def _values_of_levels(fields: list[Quantized]) -> tuple[Float64[np.ndarray, "C 256"], Int[np.ndarray, "C 2"]]:
+    """Return the values of the levels of every channel, and the first and last level to use: one if it is constant."""
+    values, ends = [], []
+    for field in fields:
+        for column in range(field.levels.shape[1]):
+            table = field.table[:, column % field.table.shape[1]]
+            values.append(np.pad(table, (0, SIZE - len(table)), mode="edge"))
+            ends.append((0, field.top if table[-1] > table[0] else 0))
+    return np.stack(values), np.array(ends)
+
+
+def _bounds(
+    largest: Mapping[str, Float64[np.ndarray, " M"] | Rows], rows: slice, columns: int
+) -> Float64[np.ndarray, "n 2 columns"]:
+    """Return the largest distance of a level below and above each value."""
+    bounds = np.empty((len(range(rows.stop)[rows]), 2, columns))
+    bounds[:, :, 0] = largest["opacities"][rows][:, None]
+    bounds[:, 0, 1:4] = largest["scales"][rows][:, None]
+    bounds[:, 1, 1:4] = largest["growth"][rows][:, None]
+    bounds[:, :, 4:] = largest["quaternions"][rows][:, None, None]
+    return bounds
+
+
+def level_bits(
+    levels: Integer[np.ndarray, "M C"],
+    classes: Integer[np.ndarray, " M"],
+    pool: Workers | None = None,
+) -> Float64[np.ndarray, "classes C 256"]:
+    """Estimate the bits of every level of every channel in every class from the counts of ``levels``."""
+    number = int(classes.max()) + 1
+
+    def counted(rows: slice) -> Int[np.ndarray, "classes C 256"]:
+        base = classes[rows].astype(np.int64) * 256
+        return np.stack(
+            [np.bincount(base + column, minlength=number * 256).reshape(number, 256) for column in levels[rows].T],
+            axis=1,
+        )
+
+    likely = np.sum(for_each_block(len(levels), counted, pool), axis=0) + UNUSED_COUNT
+    return np.asarray(np.log2(likely.sum(axis=2, keepdims=True)) - np.log2(likely))
+
+
+# Levels of every attribute for containers with :class:`~kissgs.planning.quantize.ByteTables`.
+
+
+def stored_values(values: Float64[np.ndarray, "M 8"], tables: ByteTables) -> Float64[np.ndarray, "M 8"]:
+    """Return opacity logits, log-scales and quaternions in the form in which they are quantised.
+
+    Logits are clipped to those of the levels that may be used; beyond, opacities differ by less than 1/255.
+    """
+    lowest, highest = tables.opacity_logits[[tables.first_drawn, tables.last_drawn]]
+    opacities = np.clip(values[:, :1], lowest, highest)
+    return np.concatenate([opacities, values[:, 1:4], shape_quats(values[:, 4:])], axis=1)
+
+
+def rounded_shapes(
+    values: Float64[np.ndarray, "M 8"],
+    weights: Float64[np.ndarray, " M"],
+    steps: tuple[Float64[np.ndarray, " M"], Float64[np.ndarray, " M"], Float64[np.ndarray, " M"]],
+    tables: ByteTables,
+) -> dict[str, Quantized]:
+    """Round opacity, log-scales and quaternion of :func:`stored_values` to steps of each Gaussian's own.
+
+    ``weights`` are squared image errors per squared unit of the log-scales.
+    """
+    quats = values[:, 4:]
+    opacities = nearest_levels(tables.opacity_logits, _on_lattice(values[:, :1], steps[0]))
+    finest = float(steps[1].min())
+    scales = _on_lattice(values[:, 1:4], np.clip(np.rint(steps[1] / finest), 1, 255) * finest)
+    scale_table = fit_table(scales.ravel(), np.repeat(weights, 3), finest)
+    omitted = smallest_three.omitted_components(quats)
+    small = smallest_three.stored_components(quats, omitted)
+    return {
+        "opacities": Quantized(
+            np.clip(opacities, tables.first_drawn, tables.last_drawn), tables.opacity_logits[:, None]
+        ),
+        "scales": Quantized(nearest_levels(scale_table, scales), scale_table.astype(np.float64)[:, None]),
+        "quaternions": Quantized(
+            smallest_three.lattice_levels(small, smallest_three.strides(steps[2])), smallest_three.TABLE[:, None]
+        ),
+        "omitted": Quantized(omitted[:, None], np.arange(4.0)[:, None]),
+    }
+
+
+def finished_shapes(
+    fields: dict[str, Quantized], logits: Float64[np.ndarray, " M"], tables: ByteTables
+) -> dict[str, Quantized]:
+    """Return the fields with the digits that are stored; Gaussians of these ``logits`` that nobody draws stay so."""
+    opacities = fields["opacities"].levels.copy()
+    hidden = logits <= tables.opacity_logits[1]
+    opacities[hidden, 0] = np.rint(255 / (1 + np.exp(-logits[hidden])))
+    scales = fields["scales"]
+    used = without_unused(scales.table[:, 0].astype(np.float32), scales.levels)
+    return {**fields, "opacities": replace(fields["opacities"], levels=opacities), "scales": table_field(*used)}
+
+
+def criterion_steps(
+    name: str, criterion: RdCriterion, coarsest: Float64[np.ndarray, " M"]
+) -> Float64[np.ndarray, " M"]:
+    """Return the step of each Gaussian's attribute: the best one of its class, at most ``coarsest``."""
+    return np.minimum(np.array(criterion.steps_of(name))[criterion.classes], coarsest)
+
+
+def color_field(
+    base: Float64[np.ndarray, "M 3"], steps: Float64[np.ndarray, " M"], weights: Float64[np.ndarray, " M"]
+) -> Quantized:
+    """Return the levels of base colours, each Gaussian's rounded to a step of its own."""
+    finest = float(steps.min())
+    rounded = _on_lattice(base, np.clip(np.rint(steps / finest), 1, 255) * finest)
+    table = fit_table(rounded.ravel(), np.repeat(weights, 3), finest)
+    return table_field(*without_unused(table, nearest_levels(table, rounded)))
+
+
+def means_field(means: Float32[np.ndarray, "M 3"], steps: float | Float64[np.ndarray, " M"]) -> Quantized:
+    """Return 16-bit levels of the positions' signed logarithms, with a range per axis.
+
+    Levels are multiples of a power of two, up to 256, of about the step of each Gaussian, so that low bytes compress.
+    """
+    logs = signed_log(means)
+    low, high = (_as_text(end.astype(np.float32)) for end in (logs.min(axis=0), logs.max(axis=0)))
+    table = even_table(low, high, MEANS_TOP)
+    extent = high.astype(np.float32).astype(np.float64) - low.astype(np.float32)
+    unit = np.where(extent > 0, extent, np.inf) / MEANS_TOP
+    exponents = np.log2(np.maximum(np.reshape(steps, (-1, 1)) / unit, 1))
+    every = np.exp2(np.clip(np.floor(exponents + 0.5), 0, 8))
+    levels = np.clip(np.rint((logs - low.astype(np.float32)) / unit / every) * every, 0, MEANS_TOP)
+    stride = np.broadcast_to(every, levels.shape).astype(np.int64)
+    return Quantized(levels.astype(np.uint16), table, stride)
+
+
+def _as_text(ends: Float32[np.ndarray, " C"]) -> Float64[np.ndarray, " C"]:
+    """Return the shortest decimal numbers that stand for these, which the container stores as text."""
+    return np.array([float(str(value + np.float32(0))) for value in ends])
+
+
+def decoded_quats(fields: dict[str, Quantized]) -> Float64[np.ndarray, "M 4"]:
+    """Return the quaternions of a plan's fields, stored whole or as three components."""
+    if "omitted" not in fields:
+        return fields["quaternions"].values()
+    return smallest_three.whole(fields["quaternions"].values(), fields["omitted"].levels[:, 0])
+
+
+def shape_quats(quats: Float64[np.ndarray, "M 4"]) -> Float64[np.ndarray, "M 4"]:
+    """Return the quaternions with the sign in which they are quantised."""
+    return smallest_three.with_sign(quats, smallest_three.omitted_components(quats))
+
+
+def _on_lattice(values: Float64[np.ndarray, "M C"], steps: Float[np.ndarray, " M"]) -> Float64[np.ndarray, "M C"]:
+    every = np.reshape(steps, (-1, 1))
+    return np.rint(values / every) * every
+
+
+# Levels of every attribute at one lambda, in the values that the container can hold.
 
 OUTLIERS = 1e-4
 """Share of base colours, at either end of a channel, that may be clipped so that the step of the others stays small."""
@@ -49,19 +374,19 @@ class RdFields:
             }
         else:
             logits = values.opacities[:][:, 0].astype(np.float64)
-            wanted = table_fields.stored_values(values[:], tables)
+            wanted = stored_values(values[:], tables)
             opacity, scale, rotation = (
-                table_fields.criterion_steps(name, criterion, largest[field][:])
+                criterion_steps(name, criterion, largest[field][:])
                 for name, field in (("opacity", "opacities"), ("scale", "scales"), ("rotation", "quaternions"))
             )
-            fields = table_fields.rounded_shapes(wanted, criterion.costs.scale, (opacity, scale, rotation), tables)
+            fields = rounded_shapes(wanted, criterion.costs.scale, (opacity, scale, rotation), tables)
         if self.planning.settings.rdo_quantization:
             fields = rdo_quantize(
                 wanted, fields, hessians, values.forms, criterion, largest, self.planning.pool, tables
             )
             if tables is None:
                 fields = {name: field.from_zero() for name, field in fields.items()}
-        return fields if tables is None else table_fields.finished_shapes(fields, logits, tables)
+        return fields if tables is None else finished_shapes(fields, logits, tables)
 
     def means(self, splats: Splats, order: Int[np.ndarray, " M"], coarser: Int[np.ndarray, " M"]) -> Quantized:
         """Quantise the positions of the Gaussians ``order``, with the bits that lambda asks for in each class.
@@ -75,7 +400,7 @@ class RdFields:
         steps = criterion.steps_of("position")
         if self.planning.container.tables is not None:
             each = np.array(steps)[criterion.classes]
-            return table_fields.means_field(means[:], np.minimum(each, unit * 2.0**most / np.sqrt(2)))
+            return means_field(means[:], np.minimum(each, unit * 2.0**most / np.sqrt(2)))
         coarse = np.array([min(max(np.floor(np.log2(step / unit) + 0.5), 0), 8) for step in steps]).astype(np.int8)
         return quantize_means(means, bits=16 - np.minimum(coarse[criterion.classes], most), pool=pool)
 
@@ -83,8 +408,8 @@ class RdFields:
         """Quantise base colours; return them and the number of clipped outliers."""
         criterion, coarsest = self.criterion, self.largest["f_dc"]
         if self.planning.container.tables is not None:
-            steps = table_fields.criterion_steps("color", criterion, coarsest[:])
-            return table_fields.color_field(base.astype(np.float64), steps, criterion.costs.color), 0
+            steps = criterion_steps("color", criterion, coarsest[:])
+            return color_field(base.astype(np.float64), steps, criterion.costs.color), 0
         optimal = criterion.steps_of("color")
         clipped = clip_outliers(base, step=min(optimal), share=OUTLIERS)
         levels = quantize_by_class(clipped, optimal, criterion.classes, coarsest, self.planning.pool)
@@ -108,7 +433,7 @@ def decoded_scene(
     fields: dict[str, Quantized], sh0: Float32[np.ndarray, "M 3"], shN: Float32[np.ndarray, "M K 3"]
 ) -> Splats:
     """Return the decoded scene."""
-    quats = table_fields.decoded_quats(fields)
+    quats = decoded_quats(fields)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     return Splats(
         means=signed_exp(fields["means"].values()).astype(np.float32),
@@ -133,12 +458,12 @@ def largest_errors(
         wanted, some = values[rows], {name: field.take(rows) for name, field in fields.items()}
         quats = wanted[:, 4:]
         if "omitted" in fields:  # the sign of the missing component is not stored
-            quats = table_fields.shape_quats(quats)
+            quats = shape_quats(quats)
         pairs = {
             "means": (some["means"].values(), signed_log(means[rows])),
             "opacities": (some["opacities"].values(), wanted[:, :1]),
             "scales": (some["scales"].values(), wanted[:, 1:4]),
-            "quaternions": (table_fields.decoded_quats(some), quats),
+            "quaternions": (decoded_quats(some), quats),
             "f_dc": (some["f_dc"].values(), colors[rows]),
         }
         return {name: np.abs(found - wanted).max(axis=0) for name, (found, wanted) in pairs.items()}

@@ -1,4 +1,4 @@
-"""Compiled inner loop of :mod:`kissgs.planning.rdo_quantize`."""
+"""Compiled inner loop of :mod:`kissgs.planning.rd_fields`."""
 
 from __future__ import annotations
 

@@ -14,10 +14,8 @@ from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, SH_REST_COUNTS, Splats
 from kissgs.planning import kmeans
 from kissgs.planning.clustering import ShMetric
-from kissgs.planning.container_model import Planning
 from kissgs.planning.layout import axes_order, plas, principal_axes
-from kissgs.planning.quantize import Quantized, half_steps, quantize
-from kissgs.planning.value_table import fit_table, nearest_levels, table_field
+from kissgs.planning.quantize import Planning, Quantized, fit_table, half_steps, nearest_levels, quantize, table_field
 from kissgs.settings import EncodeSettings
 
 COEFFICIENTS = SH_REST_COUNTS[-1]

@@ -57,7 +57,7 @@ def rasterize(
     if any(tensor.dtype != torch.float32 or tensor.device != device for tensor in tensors):
         raise UnsupportedError("the rasteriser takes float32 parameters on one device only; convert or move the others")
     if device.type == "cuda":
-        from kissgs.rendering.gsplat_backend import rasterize_on_cuda
+        from kissgs.rendering.rasterizer import rasterize_on_cuda
 
         return rasterize_on_cuda(parameters, viewmats, Ks, width, height, backgrounds, dilation, antialiased)
     if device.type != "cpu":

@@ -17,7 +17,7 @@ from kissgs.runners.contract import (
     WorkItem,
     error_of,
 )
-from kissgs.runners.local import LocalRunner
+from kissgs.runners.process import LocalRunner
 from kissgs.runners.ray_runner import RayRunner
 
 __all__ = [

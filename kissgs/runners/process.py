@@ -1,16 +1,15 @@
-"""``ItemProcess``: start of an item's process, its progress events, its limits and its outcome.
-
-Only a process of its own can be ended at any moment, be limited in its memory, and crash alone. Ray's worker processes,
-below which it runs on a cluster, run many tasks and have no hard limit of memory.
-"""
+"""``ItemProcess``: an item's process, with its limits and outcome; ``LocalRunner``: processes on this machine."""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import math
 import os
 import re
+import secrets
+import shutil
 import signal
 import socket
 import subprocess
@@ -19,9 +18,11 @@ import tempfile
 import threading
 import time
 from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import IO, Any
 
+from kissgs.core.progress import Progress, silent
 from kissgs.runners.contract import (
     CRASHED,
     INTERNAL,
@@ -30,9 +31,82 @@ from kissgs.runners.contract import (
     NOT_STARTED,
     TIME_LIMIT,
     Outcome,
+    Resources,
+    RunHandle,
     WorkItem,
+    log,
+    report,
 )
-from kissgs.runners.temporary_folder import temporary_folder
+
+# ``temporary_folder``: a folder of one item on the disk of the machine that runs it.
+#
+#     TEMP/kissgs-item-TOKEN.lock    locked by the process that made it, as long as it lives
+#     TEMP/kissgs-item-TOKEN/        the current folder of the item's process, made once the lock is held
+#
+# TEMP is the system's folder for temporary files (``TMPDIR``). Whoever starts the item's process removes both when that
+# has ended. If it is killed itself, they stay, and the next item that starts on the machine removes them: a lock that
+# can be taken has no owner.
+
+PREFIX, LOCK = "kissgs-item-", ".lock"
+
+
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Make an empty folder, and remove it with all that is in it; remove former ones whose owners were killed."""
+    place = Path(tempfile.gettempdir())
+    _remove_remains(place)
+    with _new_lock(place) as lock:
+        folder = Path(lock.name).with_suffix("")
+        try:
+            folder.mkdir(mode=0o700)
+            yield folder
+        finally:
+            _remove(folder)
+
+
+def _new_lock(place: Path) -> IO[bytes]:
+    """Return a new file that is locked. Before it is, another process may take it for remains and remove it."""
+    while True:
+        lock = tempfile.NamedTemporaryFile(prefix=PREFIX, suffix=LOCK, dir=place, delete=False)  # noqa: SIM115
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        except OSError:
+            lock.close()
+            Path(lock.name).unlink(missing_ok=True)
+            raise
+        if Path(lock.name).exists():
+            return lock
+        lock.close()
+
+
+def _remove_remains(place: Path) -> None:
+    """Remove folders of this user that nobody has locked."""
+    with contextlib.suppress(OSError):
+        for path in place.glob(f"{PREFIX}*{LOCK}"):
+            with contextlib.suppress(OSError):
+                _remove_if_unlocked(path)
+
+
+def _remove_if_unlocked(path: Path) -> None:
+    if path.is_symlink() or path.stat().st_uid != os.geteuid():
+        return
+    with path.open("rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _remove(path.with_suffix(""))
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder, and then its lock: what cannot be removed now, the next item can try to remove."""
+    shutil.rmtree(folder, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        if not folder.exists():
+            folder.with_suffix(LOCK).unlink(missing_ok=True)
+
+
+# ``ItemProcess``: start of an item's process, its progress events, its limits and its outcome.
+#
+# Only a process of its own can be ended at any moment, be limited in its memory, and crash alone. Ray's worker
+# processes, below which it runs on a cluster, run many tasks and have no hard limit of memory.
 
 OUT_OF_MEMORY = re.compile(
     "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory|failed to map|can't start new thread"
@@ -224,3 +298,74 @@ def child_environment(secret: tuple[str, ...] = ("KISSGS_", "AWS_")) -> dict[str
     inherited = {name: value for name, value in os.environ.items() if not name.upper().startswith(secret)}
     libraries = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}  # its buffers count as memory
     return {**inherited, **libraries, "PYTHONUNBUFFERED": "1"}
+
+
+# ``LocalRunner``: work items as processes on this machine, which start at once: the caller limits their number.
+
+
+class LocalRunner:
+    """Runner on this machine, see :class:`kissgs.runners.Runner`."""
+
+    def __init__(self) -> None:
+        self._items: dict[str, tuple[ItemProcess, Future[Outcome]]] = {}
+        self._closed = False
+        self._lock = threading.Lock()
+
+    @property
+    def nodes(self) -> tuple[Resources, ...]:
+        """See :class:`kissgs.runners.Runner`."""
+        return ()
+
+    def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
+        """See :class:`kissgs.runners.Runner`."""
+        item_id, process, outcome = secrets.token_hex(8), ItemProcess(item), Future[Outcome]()
+        with self._lock:
+            if self._closed:
+                raise RuntimeError("the runner is closed")
+            self._items[item_id] = process, outcome
+
+        def run() -> None:
+            outcome.set_result(_run(process, progress))
+            with self._lock:
+                del self._items[item_id]
+
+        threading.Thread(target=run, daemon=True).start()
+        return RunHandle(item_id, outcome)
+
+    def cancel(self, item_id: str) -> None:
+        """See :class:`kissgs.runners.Runner`."""
+        with self._lock:
+            if item_id in self._items:
+                self._items[item_id][0].kill()
+
+    def refusal(self, resources: Resources) -> str | None:
+        """See :class:`kissgs.runners.Runner`."""
+        return None
+
+    def health_problem(self) -> str | None:
+        """See :class:`kissgs.runners.Runner`."""
+        return "the runner is closed" if self._closed else None
+
+    def close(self) -> None:
+        """See :class:`kissgs.runners.Runner`."""
+        with self._lock:
+            self._closed = True
+            items = list(self._items.values())
+        for process, _ in items:
+            process.kill()
+        wait([outcome for _, outcome in items])
+
+
+def _run(process: ItemProcess, progress: Progress) -> Outcome:
+    """Report the events of a process and return its outcome."""
+    outcome = Outcome("cancelled")
+    try:
+        for event in process.events():
+            if isinstance(event, Outcome):
+                outcome = event
+            else:
+                report(progress, *event)
+    except Exception as error:  # noqa: BLE001  a bug, of which whoever waits must hear
+        log.exception("an item could not be followed", exc_info=error)
+        return Outcome("error", code=INTERNAL, message="the work could not be followed; please report it")
+    return outcome

@@ -10,15 +10,14 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, UInt8
 from kissgs.core.errors import InvalidContainerError
+from kissgs.core.positions import signed_exp
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
-from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import MAX_GAUSSIANS, Splats, empty_splats
 from kissgs.io.containers import Source, open_source
 from kissgs.io.conventions import insert_largest, look_up, steps
 from kissgs.io.files import refuse_more_than
-from kissgs.io.png import decode_png, is_png, probe_png
-from kissgs.io.webp import decode_plane, probe_webp
+from kissgs.io.images import decode_plane, decode_png, is_png, probe_png, probe_webp
 from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, MAX_SH_ENTRIES, Rest, SogLayout, read_layout
 
 _FREE_PIXELS = 1 << 20

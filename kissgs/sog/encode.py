@@ -10,16 +10,15 @@ import numpy as np
 from kissgs._version import __version__
 from kissgs.core.array_types import UInt8
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.origin import recorded
+from kissgs.core.positions import recorded
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.containers import META_NAME
 from kissgs.io.conventions import OPACITY_OF_BYTE
 from kissgs.io.planes import compress_images
-from kissgs.planning.container_model import ByteTables, ContainerModel
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
-from kissgs.planning.quantize import Quantized
+from kissgs.planning.quantize import ByteTables, ContainerModel, Quantized
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.settings import EncodeSettings
 from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG

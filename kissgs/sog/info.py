@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from kissgs.core.origin import recorded
+from kissgs.core.positions import recorded, signed_exp
 from kissgs.core.progress import Progress
-from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import Splats
 from kissgs.io.containers import META_NAME, open_source, stored_size
 from kissgs.io.scene_format import Codec, Facts, ReadOptions, SceneSource, titled

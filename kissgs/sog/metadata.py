@@ -10,7 +10,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.origin import WORLD, Origin, read_origin
+from kissgs.core.positions import WORLD, Origin, read_origin
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.containers import (
     MAX_METADATA_BYTES,

@@ -1,4 +1,4 @@
-"""Writing of a container: a folder or a zip, atomically and with the same bytes every time."""
+"""Files of a SOG-XT container: their names, and writing them to a zip or a folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,33 @@ from kissgs.core.errors import OutputError
 from kissgs.formats import ENDINGS
 from kissgs.io.containers import open_source
 from kissgs.io.files import atomic_file, check_writable, move_into_place, path_state, reason_of, refuse_existing, umask
-from kissgs.sogxt.names import FILES
+
+# Names of a container's files, and of the metadata's checksum.
+
+YAML_NAME, JSON_NAME, SCENE_NAME = "container_meta.yaml", "meta.json", "scene.json"
+
+FORMAT = "sog-xt"
+"""Name of the format in ``meta.json``."""
+
+CHECKSUM = "kissgs_crc32"
+"""Key of the metadata's checksum, outside ``kissgs``, so that it shows a loss of that block."""
+
+PLANES = (
+    "active_mask.webp",
+    "means_bytes_0.webp",
+    "means_bytes_1.webp",
+    "opacities.webp",
+    "scales.webp",
+    "quaternions.webp",
+    "f_dc.webp",
+    "f_rest_labels.webp",
+    "f_rest_centroids.webp",
+)
+
+FILES = (YAML_NAME, JSON_NAME, SCENE_NAME, *PLANES)
+
+
+# Writing of a container: a folder or a zip, atomically and with the same bytes every time.
 
 
 def zip_bytes(files: Mapping[str, bytes]) -> bytes:

@@ -15,14 +15,13 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, UInt8, UInt16
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
+from kissgs.core.positions import signed_exp
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
-from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import MAX_GAUSSIANS, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.containers import Source, open_source
-from kissgs.io.webp import decode_plane
-from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout
-from kissgs.sogxt.metadata_reader import read_layout
+from kissgs.io.images import decode_plane
+from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout, read_layout
 
 CHUNK = 1 << 14
 """Gaussians per task."""

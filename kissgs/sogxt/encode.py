@@ -13,16 +13,16 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import blas_workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, NOTHING_CLEANED, Cleaned, Splats
+from kissgs.io.images import pixels_crc32
 from kissgs.io.planes import compress_images
-from kissgs.io.webp import pixels_crc32
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.planner import plan_encoding
 from kissgs.planning.quantize import Quantized, observed_range
 from kissgs.planning.rate_distortion import ColorRefit
 from kissgs.planning.sh_codebook import Codebook
-from kissgs.settings import EncodeSettings
-from kissgs.settings.encode import GOALS
-from kissgs.sogxt import metadata, names
+from kissgs.settings import GOALS, EncodeSettings
+from kissgs.sogxt import container as names
+from kissgs.sogxt import metadata
 
 
 def encode(

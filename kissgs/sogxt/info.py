@@ -7,15 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.errors import InvalidContainerError
-from kissgs.core.origin import recorded
+from kissgs.core.positions import recorded, signed_exp
 from kissgs.core.progress import Progress
-from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import Splats
 from kissgs.io.containers import Source, open_source
 from kissgs.io.scene_format import Codec, Facts, ReadOptions, SceneSource, titled
-from kissgs.sogxt.metadata import CHANNELS, Layout
-from kissgs.sogxt.metadata_reader import read_layout, read_provenance
-from kissgs.sogxt.names import FILES, PLANES
+from kissgs.sogxt.container import FILES, PLANES
+from kissgs.sogxt.metadata import CHANNELS, Layout, read_layout, read_provenance
 
 NAMES = {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
 MAX_PLANE_BYTES = 1 << 30
@@ -67,7 +65,7 @@ def ranges_of(layouts: list[Layout]) -> dict[str, tuple[float, float]]:
 
 
 def _count_mask(files: Source, layout: Layout) -> int:
-    from kissgs.io.webp import decode_plane
+    from kissgs.io.images import decode_plane
 
     side, name = layout.grid_side, "active_mask.webp"
     mask = decode_plane(files.read(name, MAX_PLANE_BYTES), name, width=side, height=side, channels=1)

@@ -1,24 +1,31 @@
-"""The metadata files ``container_meta.yaml``, ``meta.json`` and ``scene.json``.
-
-:class:`Layout` is written in two formats: the paper's Python decoder reads the YAML, browsers read the two JSON files.
-"""
+"""Metadata of a SOG-XT container: what is written, and what is read and checked before any image is opened."""
 
 from __future__ import annotations
 
 import json
+import math
+import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 from pydantic_core import PydanticCustomError
 
-from kissgs.core.origin import WORLD, Origin, recorded
+from kissgs.core.errors import InvalidContainerError, UnsupportedError
+from kissgs.core.positions import WORLD, Origin, read_origin, recorded
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE, SH_REST_COUNTS
-from kissgs.io.containers import is_antialiased
-from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME
+from kissgs.formats import LEVELS_NAME, LOD_NAME
+from kissgs.io.containers import MAX_METADATA_BYTES, MAX_SIGNED_LOG, Source, is_antialiased, stated_text
+from kissgs.io.files import parse_json
+from kissgs.sogxt.container import CHECKSUM, FORMAT, JSON_NAME, YAML_NAME
+
+# The metadata files ``container_meta.yaml``, ``meta.json`` and ``scene.json``.
+#
+# :class:`Layout` is written in two formats: the paper's Python decoder reads the YAML, browsers read the two JSON
+# files.
 
 TILE_ROWS, TILE_COLUMNS = 3, 5
 
@@ -77,7 +84,7 @@ class Layout(BaseModel):
     model: str | None = None
     """Variant of the renderer that the scene was made for, as in SOG: "antialiased", or None."""
     crc32: dict[str, Annotated[int, Field(ge=0, lt=1 << 32)]] = Field(default_factory=dict)
-    """CRC-32 of each image's pixels (:func:`kissgs.io.webp.pixels_crc32`); in ``meta.json`` only."""
+    """CRC-32 of each image's pixels (:func:`kissgs.io.images.pixels_crc32`); in ``meta.json`` only."""
 
     @property
     def antialiased(self) -> bool:
@@ -202,3 +209,302 @@ def scene_json(files: Mapping[str, bytes]) -> bytes:
     planes = {role: entry(f"{name}.webp") for role, name in SCENE_PLANES.items()}
     document = {"version": 1, "metadata": entry(JSON_NAME), "planes": planes}
     return json.dumps(document, separators=(",", ":")).encode("ascii")
+
+
+# Reading of a container's metadata: ``meta.json`` if it exists, else the YAML. Unknown keys are ignored.
+
+MAX_YAML_EVENTS = 20_000
+"""Largest number of values, and beginnings and ends of lists and mappings, of the YAML; kissgs writes about 500."""
+
+MAX_YAML_DEPTH = 50
+"""Largest nesting; kissgs writes 6 levels."""
+
+MAX_YAML_ALIASES = 20
+"""Largest number of aliases: dumpers write one if two fields share a list; thousands would take long to go through."""
+
+MAX_NUMBER_LENGTH = 100
+"""Largest number of characters of a number of the YAML; kissgs writes up to 25. Longer ones are text."""
+
+_CONSTANTS: dict[str, float | bool | None] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    ".inf": math.inf,
+    "-.inf": -math.inf,
+    ".nan": math.nan,
+}
+
+_NUMBER = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
+
+_WORD = re.compile(r"""[^ \t\r\n,:"'\[\]{}]+""")
+
+MISSING = object()
+"""Placeholder for a missing checksum: other encoders and early versions of kissgs write none."""
+
+
+def read_layout(source: Source) -> Layout:
+    """Read and check the metadata of a container."""
+    names = source.names()
+    if JSON_NAME in names:
+        layout = _layout_of(_from_json(source.read(JSON_NAME, MAX_METADATA_BYTES)), JSON_NAME)
+        if YAML_NAME in names:
+            _compare(source.read(YAML_NAME, MAX_METADATA_BYTES), layout)
+        return layout
+    if YAML_NAME in names:
+        return _layout_of(_from_yaml(source.read(YAML_NAME, MAX_METADATA_BYTES)), YAML_NAME)
+    raise InvalidContainerError(
+        f"this is no container: it has neither {YAML_NAME} nor {JSON_NAME}, and no {LOD_NAME} or {LEVELS_NAME} of "
+        "a streamed scene; name the folder or the zip that has one"
+    )
+
+
+def read_provenance(source: Source) -> Provenance | None:
+    """Return what kissgs recorded about the encoding, of which ``meta.json`` has a part; None for other encoders."""
+    if YAML_NAME not in source.names():
+        return read_layout(source).provenance
+    return _layout_of(_from_yaml(source.read(YAML_NAME, MAX_METADATA_BYTES)), YAML_NAME).provenance
+
+
+def _layout_of(raw: dict[str, Any], name: str) -> Layout:
+    """Check the fields of :class:`Layout` from the file ``name``."""
+    checksum = raw.pop(CHECKSUM)
+    try:
+        # Some YAML dumpers write numbers as text, so that is accepted; in JSON it is refused, as in browsers.
+        layout = Layout.model_validate(raw, strict=name == JSON_NAME)
+    except ValidationError as error:
+        raise InvalidContainerError(f"{name}: {_first_problem(error)}") from error
+    _check_ranges(layout, name)
+    if checksum is not MISSING and checksum != layout.checksum:
+        raise InvalidContainerError(f"{name} is damaged: its numbers do not give its {CHECKSUM}; copy it again")
+    return layout
+
+
+def _compare(data: bytes, layout: Layout) -> None:
+    """Refuse a YAML file that states another scene than ``meta.json``, as ``web_decoder/scene.js`` does.
+
+    Numbers are compared by the word before them, and the word after "model", so that browsers need no YAML reader.
+    """
+    stated: dict[str, list[float]] = {"model": [False]}
+    field = before = key = ""
+    for word in _WORD.findall(data.decode("utf-8-sig", "replace")):
+        if len(word) <= MAX_NUMBER_LENGTH and _NUMBER.fullmatch(word):
+            stated.setdefault(key, []).append(float(word))
+        elif word != "-":
+            field = word if before == "input_fields" else field
+            key = f"{field} {word}" if word in ("min_values", "max_values") else word
+            stated[key] = []
+            if before == "model":
+                stated[before] = [word.lower() == "antialiased"]
+            before = word
+    stated["origin"] = stated.get("origin") or [*WORLD]
+    needed: dict[str, list[float]] = {"grid_side": [layout.grid_side], "f_rest_centroids_side": [layout.codebook_side]}
+    needed |= {"origin": [*layout.origin], "model": [layout.antialiased]}
+    optional = {"count": [layout.count], "sh_degree": [layout.sh_degree], CHECKSUM: [layout.checksum]}
+    same = all(stated.get(key) == value for key, value in needed.items())
+    same = same and all(stated.get(key, value) == value for key, value in optional.items())
+    with np.errstate(over="ignore"):
+        for field in CHANNELS:
+            for end, values in zip(("min_values", "max_values"), layout.limits(field), strict=True):
+                found = np.array(stated.get(f"{field} {end}", ()), dtype=np.float32)
+                same = same and np.array_equal(found, values)
+    if not same:
+        raise InvalidContainerError(
+            f"{YAML_NAME} and {JSON_NAME} do not state the same: one is damaged or of another scene; "
+            "copy the container again, or remove the wrong one"
+        )
+
+
+def _check_ranges(layout: Layout, name: str) -> None:
+    for field, channels in CHANNELS.items():
+        if field not in layout.ranges:
+            raise InvalidContainerError(f"{name} gives no range for {field}")
+        for values in layout.ranges[field]:
+            if len(values) != channels:
+                raise InvalidContainerError(f"{name}: the range of {field} has {len(values)} numbers, not {channels}")
+    if np.abs(layout.limits("means")).max() > MAX_SIGNED_LOG:
+        raise InvalidContainerError(
+            f"{name}: the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold"
+        )
+
+
+def _from_yaml(data: bytes) -> dict[str, Any]:
+    """Return the fields of :class:`Layout` from the YAML, as tolerant as the reference decoder."""
+    try:
+        document = _load_yaml(data)
+        sides = document["meta"]
+        ops = document["ops"]
+        ranges = dict(found for op in ops for found in _ranges_of(op) if found[0] in CHANNELS)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InvalidContainerError(f"{YAML_NAME} is not readable YAML") from error
+    except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
+        raise InvalidContainerError(
+            f"{YAML_NAME} lacks 'meta' or 'ops', or they are not of the expected form"
+        ) from error
+    _require_webp(sides.get("image_codec") if isinstance(sides, dict) else None)
+    recorded = document.get("kissgs")
+    return {
+        "count": recorded.get("count") if isinstance(recorded, dict) else None,
+        "grid_side": sides.get("grid_side"),
+        "codebook_side": sides.get("f_rest_centroids_side"),
+        "ranges": ranges,
+        "provenance": recorded,
+        "origin": read_origin(document, YAML_NAME),
+        "model": stated_text(document.get("model")),
+        CHECKSUM: document.get(CHECKSUM, MISSING),
+    }
+
+
+def _load_yaml(data: bytes) -> Any:  # noqa: ANN401
+    """Return a document of lists, mappings with keys of text, and the plain values of YAML 1.2: see :func:`_value`.
+
+    PyYAML's loaders know more (numbers of base 60, merge keys, keys of any type), which takes minutes to expand.
+    """
+    waiting: list[tuple[Any, list[Any]]] = [(None, [])]
+    anchors: dict[str | None, Any] = {}
+    aliases = 0
+    for number, event in enumerate(yaml.parse(data, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))):
+        aliases += isinstance(event, yaml.AliasEvent)
+        if number > MAX_YAML_EVENTS or len(waiting) > MAX_YAML_DEPTH or aliases > MAX_YAML_ALIASES:
+            raise yaml.YAMLError("too many values or aliases, or nested too deep")
+        if getattr(event, "tag", None) is not None:
+            raise yaml.YAMLError("tags are not read")
+        if isinstance(event, yaml.CollectionStartEvent):
+            waiting.append((event, []))
+            continue
+        parent, items = waiting[-1]
+        value: Any
+        if isinstance(event, yaml.CollectionEndEvent):
+            value = _mapping(items) if isinstance(parent, yaml.MappingStartEvent) else items
+            event, items = waiting.pop()[0], waiting[-1][1]
+        elif isinstance(event, yaml.AliasEvent):
+            if event.anchor not in anchors:
+                raise yaml.YAMLError("an alias of nothing")
+            value = anchors[event.anchor]
+        elif isinstance(event, yaml.ScalarEvent):
+            is_key = isinstance(parent, yaml.MappingStartEvent) and len(items) % 2 == 0
+            value = event.value if is_key or not event.implicit[0] else _value(event.value)
+        else:
+            continue
+        anchors[event.anchor] = value
+        items.append(value)
+    documents = waiting[0][1]
+    if len(documents) > 1:
+        raise yaml.YAMLError("more than one document")
+    return documents[0] if documents else None
+
+
+def _mapping(items: list[Any]) -> dict[str, Any]:
+    keys = items[::2]
+    if not all(isinstance(key, str) and key != "<<" for key in keys):
+        raise yaml.YAMLError("a key is no text, or merges mappings")
+    return dict(zip(keys, items[1::2], strict=True))
+
+
+def _value(text: str) -> bool | float | str | None:
+    """Return the null, true, false or number that an unquoted text stands for, else the text."""
+    if text in _CONSTANTS:
+        return _CONSTANTS[text]
+    if len(text) > MAX_NUMBER_LENGTH or not _NUMBER.fullmatch(text):
+        return text
+    return int(text) if text.lstrip("+-").isdigit() else float(text)
+
+
+def _ranges_of(op: Mapping[str, Any]) -> Iterator[tuple[str, tuple[list[Any], list[Any]]]]:
+    """Yield field and range of each range of one op (the last one counts); nothing for ops on several fields."""
+    fields = op["input_fields"]
+    if len(fields) != 1:
+        return
+    for transform in op.get("transforms", ()):
+        quantize = transform.get("simple_quantize")
+        if quantize and "min_values" in quantize:
+            yield fields[0], (_flat(quantize["min_values"]), _flat(quantize["max_values"]))
+
+
+def _from_json(data: bytes) -> dict[str, Any]:
+    """Return the fields of :class:`Layout` from ``meta.json``; accept what ``web_decoder/scene.js`` accepts."""
+    document = parse_json(data, JSON_NAME, parse_int=float)  # every number becomes a float64, as in browsers
+    try:
+        _check_dialect(document)
+        keys = {"opacities": "opacities", "means": "means", "scales": "scales", "quats": "quaternions", "sh0": "f_dc"}
+        ranges = {
+            field: (_spread(document[key]["mins"], CHANNELS[field]), _spread(document[key]["maxs"], CHANNELS[field]))
+            for key, field in keys.items()
+        }
+        rest = document["shN"]
+        ranges["f_rest_centroids"] = _spread(rest["centroidsMins"], 45), _spread(rest["centroidsMaxs"], 45)
+        count = _whole(document["count"])
+        if count is None:
+            raise KeyError("count")
+        raw = {
+            "count": count,
+            "grid_side": _whole(document["gridSide"]),
+            "codebook_side": _whole(rest["centroidSide"]),
+            "ranges": ranges,
+            "origin": read_origin(document, JSON_NAME),
+            "model": stated_text(document.get("model")),
+            CHECKSUM: document.get(CHECKSUM, MISSING),
+        }
+        if "kissgs" in document:
+            recorded = document["kissgs"]
+            degree, checksums = _whole(recorded["sh_degree"]), recorded.get("crc32", {})
+            shared = {"count": count, "source_count": count}
+            raw["provenance"] = {"version": recorded["version"], "sh_degree": degree, **shared}
+            raw["crc32"] = {name: _whole(value) for name, value in checksums.items()}
+        return raw
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise InvalidContainerError(f"{JSON_NAME} lacks something that a SOG-XT container has: {error}") from error
+
+
+def _whole(value: Any) -> Any:  # noqa: ANN401
+    """Return a whole number as int; anything else unchanged, which type validation refuses."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _check_dialect(document: Mapping[str, Any]) -> None:
+    """Refuse formats that would decode to wrong values without an error."""
+    quats, rest, files = document["quats"], document["shN"], document["mask"]["files"]
+    for name, found, known in (
+        ("format", document.get("format", FORMAT), FORMAT),
+        ("version", document.get("version", 3), 3),
+        ("quats.encoding", quats.get("encoding", "direct"), "direct"),
+        ("shN.layout", rest.get("layout", "uv-codebook"), "uv-codebook"),
+        ("shN.coeffs", rest.get("coeffs", 15), 15),
+        ("shN.tileRows", rest.get("tileRows", TILE_ROWS), TILE_ROWS),
+        ("shN.tileCols", rest.get("tileCols", TILE_COLUMNS), TILE_COLUMNS),
+    ):
+        if found != known:
+            raise UnsupportedError(f"{JSON_NAME}: {name} is {repr(_whole(found))[:80]}; only {known!r} is read")
+    if not isinstance(files, list):
+        raise TypeError("mask.files is not a list")
+    _require_webp(files[0].rsplit(".", 1)[-1])
+
+
+def _require_webp(codec: object) -> None:
+    if codec != "webp":
+        raise UnsupportedError(f"the container's images are {codec!r} files; only 'webp' is read")
+
+
+def _flat(values: Any) -> list[Any]:  # noqa: ANN401
+    """Return a number as a list of one, or a flattened list; stop early, since YAML aliases may expand to millions."""
+    flat: list[Any] = []
+    waiting = [values]
+    for _ in range(1000):
+        if not waiting:
+            return flat
+        value = waiting.pop()
+        if isinstance(value, list):
+            waiting.extend(reversed(value))
+        else:
+            flat.append(value)
+    raise ValueError("a range has more than 1000 values")
+
+
+def _spread(values: Any, channels: int) -> list[Any]:  # noqa: ANN401
+    """Return one number per channel: repeat a number, or the first of a list of another length, as browsers do."""
+    numbers = values if isinstance(values, list) else [values]
+    return numbers if len(numbers) == channels else numbers[:1] * channels
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    return f"{'.'.join(map(str, problem['loc']))}: {problem['msg'].lower()}"

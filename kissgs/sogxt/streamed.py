@@ -8,11 +8,10 @@ from kissgs.core.errors import InvalidContainerError
 from kissgs.formats import LEVELS_NAME
 from kissgs.io.containers import Source, ZipSource, stored_size
 from kissgs.io.streamed import Container, StreamedFormat
-from kissgs.sogxt import names
+from kissgs.sogxt import container as names
 from kissgs.sogxt.decode import decode_files
 from kissgs.sogxt.info import ranges_of
-from kissgs.sogxt.metadata import Layout
-from kissgs.sogxt.metadata_reader import read_layout
+from kissgs.sogxt.metadata import Layout, read_layout
 
 MAX_FILE_BYTES = 1 << 28
 """Largest size of a zip, bytes; one of 400,000 Gaussians takes about 5 MB."""

@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from kissgs.cameras.virtual.regions import MAX_VIEWS, default_view_count, sensitivity_cameras
+from kissgs.cameras.virtual.samples import MAX_VIEWS, default_view_count, sensitivity_cameras
 from kissgs.core.array_types import Float32
-from kissgs.core.coarse_positions import STREAMED_REMEDY, Cuts, cuts_without_coarse, visible_sizes
-from kissgs.core.origin import WORLD
+from kissgs.core.positions import STREAMED_REMEDY, WORLD, Cuts, cuts_without_coarse, visible_sizes
 from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, clean, concatenate, sampled_rows
@@ -27,28 +26,30 @@ from kissgs.planning.planner import plan_encoding, visible_gaussians
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt.container import write_container
-from kissgs.sogxt.names import FORMAT
+from kissgs.sogxt.container import FORMAT, write_container
 from kissgs.streaming.layout import (
     CAMERAS,
     ENVIRONMENT,
     OUT,
     ContainerFile,
     Layout,
+    Leaf,
     chunk_file,
     environment_file,
     leaves_file,
     level_file,
+    manifest,
     read_leaves,
     rows_file,
     write_json,
 )
-from kissgs.streaming.levels import Environment, chunk_levels, level_count
-from kissgs.streaming.manifest import Leaf, manifest
-from kissgs.streaming.partition import (
+from kissgs.streaming.levels import (
+    Environment,
     append_rows,
     chunk_depth,
+    chunk_levels,
     from_rows,
+    level_count,
     read_rows,
     row_bytes,
     sync,

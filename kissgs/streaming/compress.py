@@ -14,7 +14,7 @@ from typing import Any
 
 from kissgs._version import __version__
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
-from kissgs.core.origin import middle_of, with_origin, world_positions
+from kissgs.core.positions import middle_of, with_origin, world_positions
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import BLOCK, Splats
 from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest

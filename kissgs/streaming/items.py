@@ -25,7 +25,7 @@ from kissgs.sog.encode import FILES
 from kissgs.streaming import build
 from kissgs.streaming.build import CHUNK
 from kissgs.streaming.layout import OUT, PARTITION, Layout, continuation, leaves_file, read_layout, rows_file
-from kissgs.streaming.partition import row_bytes
+from kissgs.streaming.levels import row_bytes
 
 # The work folder of a streamed scene: whose work it holds, its room on the disk, and the last step of the work.
 

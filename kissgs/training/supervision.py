@@ -10,15 +10,13 @@ from typing import Literal
 import numpy as np
 
 from kissgs.cameras.views import View, Views
-from kissgs.cameras.virtual.regions import scene_views
-from kissgs.cameras.virtual.samples import close_ups, random_poses, scattered_cameras
+from kissgs.cameras.virtual.samples import close_ups, random_poses, scattered_cameras, scene_views
 from kissgs.core.array_types import Float32, Shaped
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.gsplat_backend import ImageRenderer, image_renderer
-from kissgs.rendering.rasterizer import Device, render
-from kissgs.settings.training import TrainingViewSettings
+from kissgs.rendering.rasterizer import Device, ImageRenderer, image_renderer, render
+from kissgs.settings import TrainingViewSettings
 
 SCORING_STRIDE = 4
 """One in this many virtual training cameras scores Gaussians."""

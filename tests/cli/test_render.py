@@ -21,11 +21,11 @@ from PIL import Image
 from rich.console import Console
 
 import kissgs
-from kissgs.cameras.captures.camera_json import read_cameras
+from kissgs.cameras.captures.transforms_json import read_cameras
 from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.select import best_view
 from kissgs.cli import app as commands
-from kissgs.cli import console
+from kissgs.cli import files as console
 from kissgs.core.splats import clean
 from kissgs.rendering.images import reframed
 from kissgs.rendering.metrics import psnr
@@ -238,7 +238,7 @@ def test_warmup_compiles_all_kernels(torch: str, tmp_path: Path) -> None:
     """A kernel compiles at its first call, so that one that is not loaded here is compiled later."""
     home = Path(kissgs.__file__).parents[1]
     sources = [path.read_text(encoding="utf-8") for path in home.glob("kissgs/**/*.py")]
-    trained = (home / "kissgs/training/optimizer.py").read_text(encoding="utf-8")
+    trained = (home / "kissgs/training/model.py").read_text(encoding="utf-8")
     wanted = sum(source.count("\n@compiled(") for source in sources if not torch or source != trained)
     lines = torch + "from kissgs.cli.app import warmup; from kissgs.core.numba_kernels import kernels; warmup(); "
     lines += "print(len(kernels), all(kernel.signatures for kernel in kernels))"

@@ -10,7 +10,7 @@ import pytest
 from helpers.command_line import KISSGS, failure, run
 
 import kissgs
-from kissgs.preview import page_scene as page_files
+from kissgs import preview as page_files
 from kissgs.streaming import build
 
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 import kissgs
 from kissgs import CompactSettings
-from kissgs.compaction import covariance_kernels
+from kissgs.compaction import merging as covariance_kernels
 from kissgs.compaction import merging as merge_kernels
 from kissgs.compaction.budget import Compactor, compact_scene
 from kissgs.compaction.merging import BLUR, CONTRAST, merge_gaussians
-from kissgs.compaction.scoring import highest_indices
+from kissgs.compaction.scene_training import highest_indices
 from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN
 from kissgs.rendering.camera import look_at

@@ -12,14 +12,14 @@ from PIL import Image
 import kissgs
 from kissgs import CompactSettings, OutputError, UnsupportedError
 from kissgs.cameras.views import View, Views, black
-from kissgs.cameras.virtual.regions import scene_views
+from kissgs.cameras.virtual.samples import scene_views
 from kissgs.compaction.budget import compact_scene
 from kissgs.compaction.popspa import Popspa
-from kissgs.compaction.scoring import highest_indices, prune_by_score
+from kissgs.compaction.scene_training import highest_indices, prune_by_score
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import look_at
-from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.rasterizer import render
+from kissgs.rendering.sensitivity import Coverage
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.supervision import SupervisionViews, supervision_views, training_targets
 

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 import kissgs
 from kissgs.cameras.views import black
-from kissgs.compaction.scoring import highest_indices, prune_by_score
+from kissgs.compaction.scene_training import highest_indices, prune_by_score
 from kissgs.core.splats import ATTRIBUTES, SH_C0
-from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.rasterizer import removal_scores
+from kissgs.rendering.sensitivity import Coverage
 
 VIEWS = around()
 CAMERAS = [view.camera for view in VIEWS]

@@ -10,10 +10,8 @@ from helpers.training_scenes import around, cloud, same
 import kissgs
 from kissgs import CompactSettings
 from kissgs.cameras.views import black
-from kissgs.compaction.popspa import Popspa
-from kissgs.compaction.scene_training import MOST_STEP_PER_SIZE
-from kissgs.compaction.scoring import prune_by_score
-from kissgs.compaction.training_path import TrainingPath
+from kissgs.compaction.popspa import Popspa, TrainingPath
+from kissgs.compaction.scene_training import MOST_STEP_PER_SIZE, prune_by_score
 from kissgs.core.progress import Deadline, silent
 from kissgs.training.supervision import SupervisionViews
 

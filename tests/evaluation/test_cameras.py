@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kissgs
-from kissgs.cameras.random_cameras import MIN_DISTANCE
+from kissgs.cameras.views import MIN_DISTANCE
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import (

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import kissgs
 from kissgs.cameras.views import View, Views, black
 from kissgs.core.errors import InvalidViewsError
-from kissgs.evaluation.capture_fit import fitting_views, in_scene_frame
+from kissgs.evaluation.evaluate import fitting_views, in_scene_frame
 from kissgs.rendering.rasterizer import render
 
 SCENE = replace(CAPTURED, shN=np.empty((len(CAPTURED), 0, 3), np.float32))

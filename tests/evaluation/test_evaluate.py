@@ -20,8 +20,7 @@ from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation import evaluate as evaluation_module
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images, evaluate
-from kissgs.evaluation.metric_text import format_metric
-from kissgs.evaluation.results import ImageMetrics
+from kissgs.evaluation.results import ImageMetrics, format_metric
 from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.metrics import ms_ssim, ssim

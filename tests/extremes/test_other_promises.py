@@ -18,8 +18,7 @@ from kissgs.rendering.camera import look_at
 from kissgs.rendering.cpu.frame import draw
 from kissgs.rendering.sensitivity import WeightedCameras, _bound, measure_sensitivity
 from kissgs.sogxt.encode import encode
-from kissgs.training.model import BOUNDS, GaussianModel
-from kissgs.training.optimizer import PrunableAdam
+from kissgs.training.model import BOUNDS, GaussianModel, PrunableAdam
 
 
 def compressed(splats, preset="fast"):

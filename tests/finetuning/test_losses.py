@@ -12,8 +12,14 @@ from helpers.tuning_scenes import chosen, shuffled
 from PIL import Image
 
 from kissgs.core.progress import Pace
-from kissgs.finetuning.losses import ENTROPY_FIELDS, PAPER_TV_WEIGHTS, CodebookRate, RateLoss, TotalVariationLoss
-from kissgs.finetuning.quantized_scene import QuantizedScene
+from kissgs.finetuning.quantized_scene import (
+    ENTROPY_FIELDS,
+    PAPER_TV_WEIGHTS,
+    CodebookRate,
+    QuantizedScene,
+    RateLoss,
+    TotalVariationLoss,
+)
 from kissgs.sog.encode import SOG
 
 

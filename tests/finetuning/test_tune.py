@@ -20,10 +20,9 @@ from kissgs.evaluation.evaluate import evaluate
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.tune import Tuner, _Result
 from kissgs.pipeline.containers import DECODERS, MODELS, write_files
-from kissgs.pipeline.inspect import describe
+from kissgs.pipeline.scene_files import describe
 from kissgs.rendering.sensitivity import measure_sensitivity
-from kissgs.sogxt.container import zip_bytes
-from kissgs.sogxt.names import YAML_NAME
+from kissgs.sogxt.container import YAML_NAME, zip_bytes
 from kissgs.training.checkpoint import Checkpoint
 
 SHORT = {"enabled": True, "steps": 12, "lr": 0.2, "codebook_lr": 0.3, "synthetic_lr_scale": 1.0}

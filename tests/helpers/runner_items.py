@@ -58,7 +58,7 @@ def load_kernels(arguments, progress):
     import resource
 
     from kissgs.core.numba_kernels import kernels
-    from kissgs.rendering.cpu import coverage
+    from kissgs.rendering.cpu import sensitivity as coverage
 
     assert coverage
     used = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()

@@ -7,8 +7,8 @@ import numpy as np
 from helpers.training_scenes import around, cloud
 from kissgs import Settings
 from kissgs.cameras.views import black
-from kissgs.planning.container_model import EVEN_LEVELS
 from kissgs.planning.planner import plan_encoding
+from kissgs.planning.quantize import EVEN_LEVELS
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 
 FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")

@@ -12,8 +12,8 @@ import numpy as np
 
 import kissgs
 from helpers.web_tools import pillow, run_node
+from kissgs.sogxt.container import CHECKSUM
 from kissgs.sogxt.decode import decode as decode_in_python
-from kissgs.sogxt.names import CHECKSUM
 
 IMAGES = (
     *("active_mask.webp", "means_bytes_1.webp", "f_dc.webp", "opacities.webp", "scales.webp", "quaternions.webp"),

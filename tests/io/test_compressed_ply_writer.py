@@ -8,9 +8,8 @@ from helpers.format_scenes import assert_alike, made_scene
 from helpers.reference_compressed_ply import SH_C0, compressed_bytes
 
 from kissgs.core.splats import ATTRIBUTES, clean
-from kissgs.io.compressed_ply import write_compressed
 from kissgs.io.conventions import morton_order
-from kissgs.io.ply import read_ply
+from kissgs.io.ply import read_ply, write_compressed
 
 
 def written(splats):

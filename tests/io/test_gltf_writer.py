@@ -11,9 +11,9 @@ from helpers.reference_gltf import NAME, SPZ, attributes, parse_glb
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import ATTRIBUTES, clean
-from kissgs.io import gltf_writer
+from kissgs.io import gltf_document as gltf_writer
 from kissgs.io.gltf import describe, read_gltf
-from kissgs.io.gltf_writer import write_glb, write_spz_glb
+from kissgs.io.gltf_document import write_glb, write_spz_glb
 from kissgs.io.spz import write_spz
 
 

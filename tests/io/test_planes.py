@@ -12,8 +12,8 @@ from PIL import Image
 
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.resources import blas_workers
+from kissgs.io.images import decode_plane, encode_plane, probe_webp
 from kissgs.io.planes import compress_images, effort_of
-from kissgs.io.webp import decode_plane, encode_plane, probe_webp
 from kissgs.settings import EncodeSettings
 
 

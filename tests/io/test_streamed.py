@@ -12,7 +12,7 @@ from helpers.streamed_scenes import KINDS, SOGXT
 from kissgs.core.errors import InvalidContainerError, KissgsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.io.scene_format import ReadOptions
-from kissgs.pipeline.inspect import describe
+from kissgs.pipeline.scene_files import describe
 
 LEVELS = [[made_scene(65, 2), made_scene(40, 1)], [made_scene(20, 1)], [made_scene(3, 0)]]
 ENVIRONMENT = made_scene(7, 1)

@@ -21,8 +21,7 @@ from helpers.web_tools import run_node
 import kissgs
 from kissgs import Settings
 from kissgs.io.scene_format import ReadOptions
-from kissgs.pipeline.inspect import describe
-from kissgs.pipeline.scene_files import open_scene
+from kissgs.pipeline.scene_files import describe, open_scene
 from kissgs.streaming.compress import compress_streamed
 
 CLASSIC = made_scene(30, 1, extremes=False)

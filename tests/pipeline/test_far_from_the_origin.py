@@ -14,10 +14,10 @@ from helpers.command_line import run
 
 import kissgs
 from kissgs.cameras.views import Similarity, View, Views, black
-from kissgs.core.coarse_positions import coarse_share
-from kissgs.evaluation.capture_fit import in_scene_frame
+from kissgs.core.positions import coarse_share
+from kissgs.evaluation.evaluate import in_scene_frame
 from kissgs.rendering.camera import look_at
-from kissgs.sogxt.names import JSON_NAME, YAML_NAME
+from kissgs.sogxt.container import JSON_NAME, YAML_NAME
 
 SIZE = 0.03
 """Standard deviation of every Gaussian."""

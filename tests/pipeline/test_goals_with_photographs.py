@@ -10,7 +10,7 @@ from helpers.training_scenes import around, cloud
 
 import kissgs
 from kissgs import Settings
-from kissgs.compaction.training_path import TrainingPath
+from kissgs.compaction.popspa import TrainingPath
 from kissgs.pipeline.search_time import SearchTime
 from kissgs.rendering.sensitivity import WeightedCameras
 

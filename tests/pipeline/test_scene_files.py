@@ -13,8 +13,7 @@ from helpers.command_line import run
 import kissgs
 from kissgs import InvalidContainerError, KissgsError, Settings, decompress, sample_scene
 from kissgs.io.scene_format import ReadOptions
-from kissgs.pipeline.inspect import describe
-from kissgs.pipeline.scene_files import is_container, open_scene
+from kissgs.pipeline.scene_files import describe, is_container, open_scene
 
 
 def zips() -> dict[str, bytes]:

@@ -18,8 +18,7 @@ import kissgs
 from kissgs import InvalidContainerError, InvalidSceneError, KissgsError, Settings, UnsupportedError
 from kissgs.core.splats import clean
 from kissgs.io.scene_format import ReadOptions
-from kissgs.pipeline.inspect import describe
-from kissgs.pipeline.scene_files import open_scene, read_scene, recognise, stored_bytes
+from kissgs.pipeline.scene_files import describe, open_scene, read_scene, recognise, stored_bytes
 
 SCENE = made_scene(30, 1, extremes=False)
 ROOT, BUFFER = document(attributes(SCENE))

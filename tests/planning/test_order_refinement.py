@@ -7,9 +7,10 @@ from helpers.random_sensitivity import random_sensitivity
 import kissgs
 from kissgs import Settings
 from kissgs.core.resources import Workers
-from kissgs.planning import order_refinement, tour_kernels
+from kissgs.planning import kernels as tour_kernels
+from kissgs.planning import planner as order_refinement
 from kissgs.planning.layout import hilbert_order
-from kissgs.planning.order_refinement import refined_order
+from kissgs.planning.planner import refined_order
 from kissgs.sogxt.encode import encode
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as stnp
 
-from kissgs.core.signed_log import signed_exp, signed_log
+from kissgs.core.positions import signed_exp, signed_log
 from kissgs.planning.quantize import (
     MEANS_TOP,
     Quantized,

@@ -10,7 +10,7 @@ import kissgs
 from kissgs.core.resources import Workers
 from kissgs.planning.quantize import quantize
 from kissgs.planning.rd_criterion import Costs, RdCriterion, step
-from kissgs.planning.rdo_quantize import (
+from kissgs.planning.rd_fields import (
     CAPTURED,
     UNSEEN,
     VIRTUAL,

@@ -6,12 +6,20 @@ from helpers.codec_scenes import random_scene
 
 from kissgs.core.progress import silent
 from kissgs.core.resources import Workers
-from kissgs.planning.container_model import EVEN_LEVELS, Planning
-from kissgs.planning.quantize import means_bits, quantize, quantize_means
+from kissgs.planning.quantize import (
+    BLOCK,
+    EVEN_LEVELS,
+    Planning,
+    for_each_block,
+    means_bits,
+    quantize,
+    quantize_means,
+    selected,
+    sorted_order,
+)
 from kissgs.planning.rd_criterion import Costs
-from kissgs.planning.rdo_quantize import level_bits
+from kissgs.planning.rd_fields import level_bits
 from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS, choose_forms
-from kissgs.planning.rows import BLOCK, for_each_block, selected, sorted_order
 from kissgs.settings import Settings
 from kissgs.sog.encode import SOG
 

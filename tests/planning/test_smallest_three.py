@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.codec_scenes import unit
 
-from kissgs.planning import smallest_three as three
+from kissgs.planning import rotation_forms as three
 from kissgs.planning.rotation_forms import apply_forms, canonical_forms
 
 

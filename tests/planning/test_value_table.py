@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.planning import value_table
-from kissgs.planning.value_table import fit_table, nearest_levels, refit_table, table_field, without_unused
+from kissgs.planning import quantize as value_table
+from kissgs.planning.quantize import fit_table, nearest_levels, refit_table, table_field, without_unused
 
 
 def error(table, values, weights):

@@ -3,7 +3,7 @@
 import pytest
 from helpers.small_page import FILES, UNSERVED
 
-from kissgs.preview import page_scene as page_files
+from kissgs import preview as page_files
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 import kissgs
 from kissgs.core.errors import InvalidContainerError, InvalidSceneError
-from kissgs.preview.page_scene import page_container, page_scene
+from kissgs.preview import page_container, page_scene
 
 FAST = kissgs.Settings(preset="fast")
 

@@ -9,10 +9,9 @@ import time
 import pytest
 from helpers.small_page import FILES, UNSERVED
 
+from kissgs import preview as server_module
 from kissgs.core.errors import UnsupportedError
-from kissgs.preview import server as server_module
-from kissgs.preview.page_scene import PageScene, hash_source
-from kissgs.preview.server import PageServer
+from kissgs.preview import PageScene, PageServer, hash_source
 
 NAME = "two words % & ü?.zip"
 

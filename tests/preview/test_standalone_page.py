@@ -9,8 +9,7 @@ from html.parser import HTMLParser
 import pytest
 from helpers.small_page import FILES
 
-from kissgs.preview.page_scene import PageScene, hash_source
-from kissgs.preview.standalone_page import standalone_page
+from kissgs.preview import PageScene, hash_source, standalone_page
 
 NAME = 'a "b" <i>&</i> \' \N{SNOWMAN}.zip'
 DATA = bytes(range(256)) * 3

@@ -14,10 +14,9 @@ from helpers.streamed_scenes import small_sizes
 from helpers.viewers import scattered
 
 import kissgs
+from kissgs import preview as server_module
 from kissgs.core.splats import concatenate
-from kissgs.preview import server as server_module
-from kissgs.preview.page_scene import streamed_folder
-from kissgs.preview.server import PageServer
+from kissgs.preview import PageServer, streamed_folder
 from kissgs.streaming import levels as environment
 
 NAME = "city 100%41 \N{SNOWMAN}"

@@ -12,10 +12,9 @@ from helpers.streamed_scenes import SOG, small_sizes
 from helpers.viewers import scattered
 
 import kissgs
+from kissgs import preview as module
 from kissgs.core.errors import InvalidContainerError
-from kissgs.preview import page_scene as module
-from kissgs.preview.page_scene import fitting_level, is_streamed_folder, streamed_folder
-from kissgs.preview.server import PageServer
+from kissgs.preview import PageServer, fitting_level, is_streamed_folder, streamed_folder
 from kissgs.streaming.compress import compress_streamed
 
 from .test_server import ask

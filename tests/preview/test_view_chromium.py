@@ -7,9 +7,7 @@ import pytest
 from helpers.preview_browser import colours, preview, psnr, software_browser  # noqa: F401  fixtures
 
 import kissgs
-from kissgs.preview.page_scene import PageScene, page_scene
-from kissgs.preview.server import PageServer
-from kissgs.preview.standalone_page import standalone_page
+from kissgs.preview import PageScene, PageServer, page_scene, standalone_page
 
 NAME = "a 'b' <i>&amp; 100%41 \N{SNOWMAN}"
 

@@ -12,7 +12,7 @@ from kissgs import Splats, sample_scene
 from kissgs.core.resources import Workers
 from kissgs.core.splats import concatenate
 from kissgs.rendering.camera import Camera, look_at
-from kissgs.rendering.coverage import Coverage, local_scale
+from kissgs.rendering.sensitivity import Coverage, local_scale
 
 UP = np.array([0.0, -1.0, 0.0])
 

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs import sample_scene
-from kissgs.rendering.coverage import local_scale
 from kissgs.rendering.cpu.neighbours import leaves_of
+from kissgs.rendering.sensitivity import local_scale
 
 
 @given(st.lists(st.integers(-3, 3), min_size=0, max_size=60), st.integers(1, 8))

@@ -10,7 +10,7 @@ from helpers.reference_harmonics import real_harmonics
 from helpers.render_scenes import blobs, camera, in_float64, one, together
 
 import kissgs
-from kissgs.cameras.virtual.regions import sensitivity_cameras
+from kissgs.cameras.virtual.samples import sensitivity_cameras
 from kissgs.core.sensitivity import OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.spherical_harmonics import sh_basis
 from kissgs.core.splats import SH_C0, clean

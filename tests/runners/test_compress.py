@@ -14,7 +14,7 @@ from helpers.command_line import KISSGS, failure, run
 from helpers.running import is_alive, wait_until
 
 import kissgs
-from kissgs.cli.compress_cluster import compress_scene
+from kissgs.cli.compress_scenes import compress_scene
 from kissgs.cli.options import with_default_values
 from kissgs.io.ply import write_ply
 

@@ -10,7 +10,7 @@ import pytest
 from helpers.running import MB, item
 
 import kissgs
-from kissgs.cli.compress_cluster import ClusterCompression
+from kissgs.cli.compress_scenes import ClusterCompression
 from kissgs.runners import Resources, WorkItem
 from kissgs.runners.contract import refusal_of
 from kissgs.runners.process import ItemProcess, json_lines

@@ -12,8 +12,7 @@ import pytest
 from helpers.ray_cluster import PATHS
 from helpers.running import item, pid_in, wait_until
 
-from kissgs.runners.process import ItemProcess
-from kissgs.runners.temporary_folder import temporary_folder
+from kissgs.runners.process import ItemProcess, temporary_folder
 
 SUPERVISOR = """
 import sys
@@ -68,7 +67,7 @@ def test_what_is_left_by_a_kill_at_any_step_is_removed(temporary, function):
     """Regression: a process killed before it had locked its folder left that for ever."""
     code = f"""
 import fcntl, os, shutil
-from kissgs.runners.temporary_folder import temporary_folder
+from kissgs.runners.process import temporary_folder
 {function} = lambda *words, **options: os.kill(os.getpid(), 9)
 with temporary_folder() as folder:
     (folder / "file").touch()

@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from kissgs import Settings, compress, decompress
-from kissgs.core.signed_log import signed_log
+from kissgs.core.positions import signed_log
 from kissgs.core.splats import clean
 from kissgs.sogxt.encode import encode
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from kissgs import KissgsError, Settings, compress, decompress
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.sogxt.names import CHECKSUM
+from kissgs.sogxt.container import CHECKSUM
 
 MEMORY = 30_000_000
 """Bytes; the containers here hold a few dozen Gaussians, so anything near this came from trusting a number."""

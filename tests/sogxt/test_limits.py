@@ -9,10 +9,10 @@ from helpers.memory import takes_less_than
 
 import kissgs
 from kissgs.core.errors import UnsupportedError
-from kissgs.io.webp import encode_plane
+from kissgs.io.images import encode_plane
 from kissgs.settings import EncodeSettings
+from kissgs.sogxt.container import PLANES
 from kissgs.sogxt.encode import encode
-from kissgs.sogxt.names import PLANES
 
 
 def bomb(side):

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from kissgs import Settings, compress, decompress
 from kissgs.io.containers import MemorySource
-from kissgs.sogxt.metadata import CHANNELS, Layout
-from kissgs.sogxt.metadata_reader import read_layout
+from kissgs.sogxt.metadata import CHANNELS, Layout, read_layout
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs/reference/container_meta.schema.json").read_text())
 

@@ -12,9 +12,8 @@ from helpers.metadata_files import FILES, assert_same, document
 
 from kissgs import InvalidContainerError, KissgsError, Settings, UnsupportedError, compress, decompress
 from kissgs.io.containers import MemorySource
-from kissgs.sogxt.metadata import CHANNELS
-from kissgs.sogxt.metadata_reader import read_layout
-from kissgs.sogxt.names import CHECKSUM, JSON_NAME, YAML_NAME
+from kissgs.sogxt.container import CHECKSUM, JSON_NAME, YAML_NAME
+from kissgs.sogxt.metadata import CHANNELS, read_layout
 
 STEP = 11
 REFUSED = (InvalidContainerError, UnsupportedError)

@@ -18,8 +18,7 @@ import kissgs
 from kissgs import KissgsError, UnsupportedError, decompress
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.io.containers import MAX_METADATA_BYTES, MemorySource
-from kissgs.sogxt.metadata import CHANNELS
-from kissgs.sogxt.metadata_reader import read_layout
+from kissgs.sogxt.metadata import CHANNELS, read_layout
 
 JSON_ERRORS = [
     (lambda meta: meta.pop("means"), "meta.json lacks something that a SOG-XT container has: 'means'"),

@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from kissgs.core.coarse_positions import Cuts
+from kissgs.core.positions import Cuts
 from kissgs.core.splats import sampled_rows
-from kissgs.streaming.partition import chunk_depth, leaf_groups
+from kissgs.streaming.levels import chunk_depth, leaf_groups
 
 
 def positions(count, seed=0):

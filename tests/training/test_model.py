@@ -7,8 +7,7 @@ from helpers.training_scenes import cloud, same
 
 from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN
 from kissgs.rendering.cpu.backward import Gradients
-from kissgs.training.model import GaussianModel
-from kissgs.training.optimizer import PrunableAdam, _step_by_torch
+from kissgs.training.model import GaussianModel, PrunableAdam, _step_by_torch
 
 RATES = {name: 0.01 * (n + 1) for n, name in enumerate(ATTRIBUTES)}
 

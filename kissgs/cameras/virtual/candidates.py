@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kissgs.cameras.random_cameras import UP, Vec3
-from kissgs.cameras.views import black
+from kissgs.cameras.views import UP, Vec3, black
 from kissgs.core.array_types import Float64, Int
 from kissgs.core.progress import Progress
 from kissgs.core.resources import Workers

@@ -1,20 +1,282 @@
-"""Sampled cameras: where photographs might have been taken, close to single Gaussians, anywhere around a scene."""
+"""Cameras for parts of a scene at their own scale, and sampled ones: photographs, close-ups, anywhere around."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
 import numpy as np
 
-from kissgs.cameras.random_cameras import Vec3, camera_facing, log_uniform, random_direction
-from kissgs.cameras.views import Views
-from kissgs.cameras.virtual.candidates import horizontal_axes, opacity, proxy_scene, scene_bounds
-from kissgs.cameras.virtual.regions import Region, allocate_cameras, find_regions, scene_views
-from kissgs.cameras.virtual.select import ScoredCandidates, split_views
+from kissgs.cameras.views import Vec3, Views, black, camera_facing, log_uniform, random_direction
+from kissgs.cameras.virtual.candidates import (
+    FIELD_OF_VIEW,
+    PROXY_GAUSSIANS,
+    SceneBounds,
+    ViewScorer,
+    horizontal_axes,
+    opacity,
+    proxy_scene,
+    scene_bounds,
+)
+from kissgs.cameras.virtual.select import (
+    ScoredCandidates,
+    check_request,
+    score_candidates,
+    select_diverse,
+    split_views,
+    with_size,
+)
+from kissgs.core.array_types import Bool, Float32, Float64, Int
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
-from kissgs.core.splats import Splats
+from kissgs.core.sensitivity import BLOCK, Sensitivity
+from kissgs.core.splats import Splats, concatenate
 from kissgs.rendering.camera import Camera, look_at
-from kissgs.rendering.coverage import local_scale
+from kissgs.rendering.sensitivity import Coverage, WeightedCameras, local_scale
+
+# ``find_regions``: parts of a scene that each need cameras at their own scale.
+#
+# The first region is the densest part of the scene, with all that can be seen from there. Where its cameras leave
+# Gaussians that they do not see, or see too small to resolve, further regions are found: a distant or a much smaller
+# object, the inside of another room.
+
+MAX_FURTHER_REGIONS = 16
+"""Largest number of further regions that are looked for."""
+
+MIN_SHARE = 0.01
+"""Share of the scene's visible opacity that a further region must add, and below which the search ends."""
+
+MIN_UNSEEN_GAUSSIANS = 8
+"""Number of unseen Gaussians below which the search ends."""
+
+CANDIDATES_PER_REGION = 40
+"""Number of candidate cameras around each further region."""
+
+PROBE_CAMERAS = 6
+"""Number of a region's cameras from which coverage is measured."""
+
+PROBE_SIZE = 160
+"""Longer side of the images in which coverage is measured, pixels."""
+
+TYPICAL_SIZE = 384
+"""Longer side of the images that the selected cameras will have, pixels; what they resolve depends on it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Region:
+    """A part of the scene that needs cameras around or inside it."""
+
+    candidates: ScoredCandidates
+    share: float
+    """Share of the scene's visible opacity that only this region's cameras show, 0 to 1; of the first region, all
+    that its cameras show."""
+
+    def cameras(self, count: int) -> list[Camera]:
+        """Return ``count`` good cameras that are far from each other."""
+        return [self.candidates.cameras[n] for n in select_diverse(self.candidates, count)]
+
+
+def find_regions(
+    splats: Splats, size: tuple[int, int], pool: Workers, progress: Progress, *, camera_count: int
+) -> list[Region]:
+    """Return the regions of a scene in the order in which they were found, at least one; shares add up to 1.
+
+    ``camera_count`` is the number of cameras that will be selected for the first region, at most.
+    """
+    candidates = score_candidates(splats, size, pool, progress).refined(camera_count)
+    proxy = proxy_scene(splats)
+    visible, coverage, spacing = _visible_opacity(proxy), Coverage(proxy), local_scale(proxy)
+    regions = [Region(candidates, 1.0)]
+    unseen = visible * (1 - _updated_coverage(coverage, proxy, regions[0], pool))
+    gains = [float(visible.sum() - unseen.sum())]
+    for _ in range(MAX_FURTHER_REGIONS):
+        remaining = np.flatnonzero(unseen > 0.5 * visible)
+        if len(remaining) < MIN_UNSEEN_GAUSSIANS or visible[remaining].sum() < MIN_SHARE * visible.sum():
+            break
+        bounds = replace(_densest_part(proxy, remaining, spacing), up=candidates.bounds.up)
+        region = _further_region(splats, bounds, candidates.cameras[0], pool, progress)
+        before = float(unseen.sum())
+        unseen = visible * (1 - _updated_coverage(coverage, proxy, region, pool))
+        gain = before - float(unseen.sum())
+        if gain >= MIN_SHARE * float(visible.sum()):
+            regions.append(region)
+            gains.append(gain)
+        near = np.linalg.norm(proxy.means[remaining] - bounds.centre, axis=1) <= 2 * bounds.radius
+        visible[remaining[near]] = 0.0  # what its cameras still do not show is hidden from all sides
+        unseen = np.minimum(unseen, visible)
+    total = max(sum(gains), 1e-30)
+    return [replace(region, share=gain / total) for region, gain in zip(regions, gains, strict=True)]
+
+
+def allocate_cameras(regions: list[Region], count: int, min_per_region: int = 4) -> list[int]:
+    """Divide ``count`` cameras among regions in proportion to their shares; return how many each gets, at least one.
+
+    A share of less than ``min_per_region`` cameras counts as so many, where ``count`` suffices. The sum is more than
+    ``count`` only if there are more regions than that.
+    """
+    min_per_region = min(min_per_region, max(1, count // len(regions)))
+    wanted = np.maximum(np.array([region.share for region in regions]) * count, min_per_region)
+    counts = np.maximum(np.floor(wanted * count / wanted.sum()), min(min_per_region, 1)).astype(int)
+    counts[0] += max(0, count - int(counts.sum()))
+    return [int(n) for n in counts]
+
+
+def _visible_opacity(splats: Splats) -> Float64[np.ndarray, " n"]:
+    """Return opacities, ``(n,)`` float64, with 0 for those at or below 1/255, which no renderer draws."""
+    visible = opacity(splats)
+    return np.where(visible > 1 / 255, visible, 0.0)
+
+
+def _updated_coverage(coverage: Coverage, proxy: Splats, region: Region, pool: Workers) -> Float32[np.ndarray, " n"]:
+    """Add some of the region's cameras to ``coverage``; return the coverage of each Gaussian of the proxy, 0 to 1."""
+    from kissgs.rendering.cpu.frame import add_sensitivities, draw
+
+    for camera in region.cameras(PROBE_CAMERAS):
+        probe = camera.at_most(PROBE_SIZE)
+        frame = draw(proxy, probe, black(), pool)
+        seen = add_sensitivities(frame, 1.0, 0.0, Sensitivity.none(len(proxy), 0), pool)
+        coverage.add(frame, seen, pool, TYPICAL_SIZE / PROBE_SIZE)
+    return coverage.share
+
+
+def _densest_part(proxy: Splats, remaining: Int[np.ndarray, " m"], spacing: Float32[np.ndarray, " n"]) -> SceneBounds:
+    """Return the bounds of the part where the Gaussians ``remaining`` are densest.
+
+    Mean shift starts at the 5 % quantile of spacing, because the smallest spacings are often single pairs.
+    """
+    densest = remaining[np.argsort(spacing[remaining], kind="stable")[len(remaining) // 20]]
+    start = proxy.means[densest].astype(np.float64), 4 * float(spacing[densest])
+    return scene_bounds(proxy.select(remaining), start)
+
+
+def _further_region(splats: Splats, bounds: SceneBounds, like: Camera, pool: Workers, progress: Progress) -> Region:
+    """Return a region with candidates all around ``bounds``, whose thumbnails have the size of ``like``.
+
+    Half of the proxy scene shows what is near the region, the other half what is in front of it and behind.
+    """
+    near = _within(splats.means, bounds.centre, 6 * bounds.radius)
+    parts = np.flatnonzero(near), np.flatnonzero(~near)
+    proxy = concatenate([proxy_scene(splats, PROXY_GAUSSIANS // 2, part) for part in parts])
+    scorer = ViewScorer(proxy, bounds, pool, progress)
+    cameras = list(_surrounding_cameras(bounds, like))
+    return Region(ScoredCandidates(scorer, "object", cameras, scorer.measure(cameras), np.zeros(len(cameras))), 0.0)
+
+
+def _within(means: Float32[np.ndarray, "N 3"], centre: Vec3, radius: float) -> Bool[np.ndarray, " N"]:
+    """Return which positions are within ``radius`` of ``centre``."""
+    found = np.empty(len(means), bool)
+    for first in range(0, len(means), BLOCK):
+        offsets = means[first : first + BLOCK] - centre
+        found[first : first + BLOCK] = np.einsum("nc,nc->n", offsets, offsets) <= radius**2
+    return found
+
+
+def _surrounding_cameras(bounds: SceneBounds, like: Camera) -> Iterator[Camera]:
+    """Yield cameras evenly from all directions (a Fibonacci sphere), at 1.3, 2 and 3 radii in turn.
+
+    The region fills the image of the nearest, and has a margin around it in that of the farthest.
+    """
+    for n in range(CANDIDATES_PER_REGION):
+        height, azimuth = 1 - (2 * n + 1) / CANDIDATES_PER_REGION, n * np.pi * (3 - np.sqrt(5))  # the golden angle
+        horizontal = np.sqrt(1 - height**2)
+        direction = np.array([horizontal * np.cos(azimuth), height, horizontal * np.sin(azimuth)])
+        position = bounds.centre + bounds.radius * (1.3, 2.0, 3.0)[n % 3] * direction
+        yield look_at(position, bounds.centre, bounds.up, fov=FIELD_OF_VIEW, width=like.width, height=like.height)
+
+
+# ``scene_views``: virtual cameras that together see every region of a scene.
+
+
+def scene_views(
+    splats: Splats,
+    *,
+    width: int,
+    height: int,
+    count: int,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Views:
+    """Return views of every region of a scene, more of regions that show more; every 8th is held out.
+
+    The result is the same for any number of threads.
+    """
+    check_request(count, (width, height))
+    with Workers(threads) as pool:
+        regions = find_regions(splats, (width, height), pool, progress, camera_count=count)
+    progress("cameras", 1.0)
+    counts = allocate_cameras(regions, count)
+    cameras = [camera for region, n in zip(regions, counts, strict=True) for camera in region.cameras(n)]
+    return split_views(with_size(cameras[:count], width, height))
+
+
+# ``sensitivity_cameras``: cameras that sensitivity and the colour refit see a scene from.
+#
+# These are a capture's cameras and some virtual ones around the scene, or virtual ones alone.
+
+VIRTUAL_WEIGHT = 0.3
+"""Weight of all virtual cameras together, relative to all cameras of a capture. Parts that no photograph shows must not
+fall apart, and the photographed parts lose almost nothing by it."""
+
+WIDE_FOCAL_SCALE = 0.6
+"""Focal length of every other virtual camera, relative to the others: parts just outside their images count too."""
+
+MAX_VIEWS, MIN_VIEWS = 48, 16
+"""Largest and smallest number of cameras that are chosen by the size of the scene."""
+
+FEW_GAUSSIANS = 150_000
+"""Number of Gaussians up to which there are :data:`MAX_VIEWS`."""
+
+
+def default_view_count(gaussians: int) -> int:
+    """Return how many cameras measure a scene of so many Gaussians.
+
+    The number falls with the fourth root: in a large scene, errors of single Gaussians matter less.
+    """
+    return round(min(max(MAX_VIEWS * (FEW_GAUSSIANS / max(gaussians, 1)) ** 0.25, MIN_VIEWS), MAX_VIEWS))
+
+
+def sensitivity_cameras(
+    splats: Splats,
+    views: Views | None,
+    *,
+    count: int,
+    size: int,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> WeightedCameras:
+    """Return the cameras, each with its weight, that measure sensitivity and refit colours.
+
+    Of a capture, only training views are used, at most ``count``, evenly selected, and two thirds as many virtual
+    cameras are added; without any, ``count`` are virtual. ``size`` is the longer side of the images, pixels; a
+    capture's smaller images keep their size, larger ones are sampled.
+    """
+    if views is None or not views.train:
+        side = size * 4 // 5
+        virtual = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        cameras = [_widened(view.camera) if n % 2 else view.camera for n, view in enumerate(virtual.all)]
+        return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
+    captured = [view.camera for view in views.train]
+    chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
+    selected = [captured[n].sampled_at_most(size) for n in chosen]  # virtual cameras see what is between the samples
+    side = round(float(np.sqrt(selected[0].width * selected[0].height)))
+    virtual = scene_views(
+        splats, width=side, height=side, count=max(1, count * 2 // 3), threads=threads, progress=progress
+    )
+    weight = VIRTUAL_WEIGHT * len(selected) / len(virtual.all)
+    cameras = [*selected, *(view.camera for view in virtual.all)]
+    weights = [1.0] * len(selected) + [weight] * len(virtual.all)
+    return WeightedCameras(cameras, weights, views.background, captured=len(selected))
+
+
+def _widened(camera: Camera) -> Camera:
+    """Return the camera with a shorter focal length, that is, a wider field of view."""
+    K = camera.K.copy()
+    K[[0, 1], [0, 1]] *= WIDE_FOCAL_SCALE
+    return Camera(camera.viewmat, K, camera.width, camera.height)
+
+
+# Sampled cameras: where photographs might have been taken, close to single Gaussians, anywhere around a scene.
 
 # ``random_poses``: virtual cameras to train or to measure losses with, from where photographs might have been taken.
 #
@@ -144,11 +406,11 @@ class _PoseSampler:
 #
 # A scene that is pruned without them gets holes behind and between what other cameras see.
 
-FIELD_OF_VIEW = np.radians(70)
+PHOTOGRAPH_FIELD_OF_VIEW = np.radians(70)
 """Angle of view along both sides, radians, where no longer lens is needed."""
 
 OCTAVES = 3.0
-"""Distances are one local scale (:func:`~kissgs.rendering.coverage.local_scale`) to this many octaves more."""
+"""Distances are one local scale (:func:`~kissgs.rendering.sensitivity.local_scale`) to this many octaves more."""
 
 
 def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[Camera]:
@@ -165,7 +427,7 @@ def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[C
     for target in rng.choice(len(splats), count, p=weights / weights.sum()):
         distance = float(scales[target] * 2 ** rng.uniform(0, OCTAVES))
         position = splats.means[target].astype(np.float64)
-        cameras.append(camera_facing(position, random_direction(rng), distance, FIELD_OF_VIEW, (side, side)))
+        cameras.append(camera_facing(position, random_direction(rng), distance, PHOTOGRAPH_FIELD_OF_VIEW, (side, side)))
     return cameras
 
 
@@ -174,7 +436,7 @@ def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[C
 # They preserve what is seen from beside, behind and above the cameras of a capture, from afar and from within.
 
 NEAREST, FARTHEST = 10.0, 3.0
-"""Smallest distance from the Gaussian in the centre, local scales (:func:`~kissgs.rendering.coverage.local_scale`)
+"""Smallest distance from the Gaussian in the centre, local scales (:func:`~kissgs.rendering.sensitivity.local_scale`)
 of the proxy scene but at most a radius of the scene, and the largest one, radii."""
 
 ACROSS = 3
@@ -208,5 +470,5 @@ def scattered_cameras(splats: Splats, *, side: int, count: int, seed: int = 0, t
         else:
             nearest = min(NEAREST * float(scales[looked_at]), radius)
             distance = log_uniform(rng, nearest, FARTHEST * radius)
-        cameras.append(camera_facing(target, direction, distance, FIELD_OF_VIEW, (side, side)))
+        cameras.append(camera_facing(target, direction, distance, PHOTOGRAPH_FIELD_OF_VIEW, (side, side)))
     return cameras

@@ -15,7 +15,7 @@ from kissgs.core.array_types import Bool, Float32, Int32, Shaped
 from kissgs.core.numba_kernels import compiled
 from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_C0
-from kissgs.rendering.cpu import shading
+from kissgs.rendering.cpu import projection as shading
 from kissgs.rendering.cpu.blending import (
     _FAST,
     Place,

@@ -1,14 +1,4 @@
-"""Numba kernels of sensitivity: Hessians of the squared image error by stored parameters, from one backward pass.
-
-The derivative of a pixel by the logarithm of a footprint's alpha is w = alpha T (colour - B), B being the colour behind
-it. To first order, the change of that logarithm is a polynomial of degree 2 in the footprint's own coordinates u, v:
-the opacity changes its constant term, the centre its linear terms, the covariance its quadratic terms. The squared
-change of the image is then a quadratic form in these six coefficients, whose entries are moments, sums of |w|² uⁱ vʲ
-over pixels with i + j of 0, 2 and 4. The chain rule gives J ᵀ J of the image by the stored parameters, without random
-probes.
-
-The background that a scene will be shown with is unknown, so it is random: |w|² is the mean over backgrounds.
-"""
+"""Numba kernels of coverage and of sensitivity: Hessians of the squared image error, from one backward pass."""
 
 from __future__ import annotations
 
@@ -40,6 +30,7 @@ from kissgs.rendering.cpu.projection import (
     _dot,
     _ellipsoid,
     _frustum,
+    _harmonics,
     _helper,
     _image_axes,
     _image_rows,
@@ -65,7 +56,57 @@ from kissgs.rendering.cpu.records import (
     TileLists,
     named_tuple,
 )
-from kissgs.rendering.cpu.shading import _harmonics
+
+# Numba kernel of coverage: how well an image shows each Gaussian, by visibility and resolution.
+
+
+@compiled(void(GAUSSIANS, PROJECTION, float32[::1], int32[::1], int64, int64, float32[::1], float64[::1], float32[::1]))
+def raise_coverage(
+    gaussians: Gaussians,
+    projection: Projection,
+    local_scale: np.ndarray,
+    visible: np.ndarray,
+    first: int,
+    last: int,
+    seen: np.ndarray,
+    limits: np.ndarray,
+    share: np.ndarray,
+) -> None:
+    """Raise the coverage, ``share``, of the Gaussians of footprints ``first`` to ``last`` (exclusive) by one image.
+
+    ``seen`` is the sum of (alpha T)² over the pixels of each footprint. ``limits``: share of the squared alpha from
+    which a Gaussian counts as seen; length in the image of the local scale from which it counts as resolved, pixels;
+    area of a squared Gaussian that is a dilated point, pixels.
+    """
+    means, scales, K, eye = gaussians.means, gaussians.scales, projection.K, projection.eye
+    seen_share, resolved_length, dilated_area = limits[0], limits[1], limits[2]
+    focal, pixels = np.sqrt(K[0, 0] * K[1, 1]), np.float64(projection.width * projection.height)
+    for row in range(first, last):
+        n = visible[row]
+        x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
+        per_unit = focal / max(np.sqrt(x * x + y * y + z * z), projection.near)
+        a, b, c = np.float64(scales[n, 0]), np.float64(scales[n, 1]), np.float64(scales[n, 2])
+        across = a + b + c - min(a, b, c)  # of the two largest
+        area = np.pi * np.exp(across) * per_unit * per_unit + dilated_area  # of a squared Gaussian
+        opacity = 1.0 / (1.0 + np.exp(-np.float64(gaussians.opacities[n])))
+        if projection.antialiased:
+            opacity *= (area - dilated_area) / area
+        shown = max(opacity * opacity * min(area, pixels), 1e-300)
+        visibility = min(seen[row] / (seen_share * shown), 1.0)
+        resolution = min(np.float64(local_scale[n]) * per_unit / resolved_length, 1.0)
+        share[n] = max(share[n], np.float32(visibility * resolution * resolution))
+
+
+# Numba kernels of sensitivity: Hessians of the squared image error by stored parameters, from one backward pass.
+#
+# The derivative of a pixel by the logarithm of a footprint's alpha is w = alpha T (colour - B), B being the colour
+# behind it. To first order, the change of that logarithm is a polynomial of degree 2 in the footprint's own coordinates
+# u, v: the opacity changes its constant term, the centre its linear terms, the covariance its quadratic terms. The
+# squared change of the image is then a quadratic form in these six coefficients, whose entries are moments, sums of
+# |w|² uⁱ vʲ over pixels with i + j of 0, 2 and 4. The chain rule gives J ᵀ J of the image by the stored parameters,
+# without random probes.
+#
+# The background that a scene will be shown with is unknown, so it is random: |w|² is the mean over backgrounds.
 
 MOMENTS = 10
 """Number of moments of each footprint in each tile."""

@@ -15,7 +15,7 @@ from kissgs.core.numba_kernels import compiled
 from kissgs.core.resources import Workers
 from kissgs.rendering import constants
 from kissgs.rendering.cpu import projection as projection_kernels
-from kissgs.rendering.cpu import shading
+from kissgs.rendering.cpu import projection as shading
 from kissgs.rendering.cpu.records import (
     FOOTPRINTS,
     SLOTS,

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from kissgs.cameras.captures.camera_json import (
+from kissgs.cameras.captures.transforms_json import (
     camera_as_dict,
     is_camera_file,
     pick_view,

@@ -10,9 +10,8 @@ from helpers.reference_cameras import PINHOLE, camera_bytes, image_bytes, poses,
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.cameras.captures import colmap as colmap_records
-from kissgs.cameras.captures.colmap import read_colmap
-from kissgs.cameras.captures.load import load_views
+from kissgs.cameras.captures import load as colmap_records
+from kissgs.cameras.captures.load import load_views, read_colmap
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 
 CAMERAS, IMAGES = {1: PINHOLE}, poses(["a.jpg", "b.jpg"])

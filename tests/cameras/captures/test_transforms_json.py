@@ -10,7 +10,7 @@ from helpers.reference_cameras import assert_camera, frames, poses, write_json, 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.cameras.captures import posed_image
+from kissgs.cameras.captures import photos as posed_image
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.captures.transforms_json import read_transforms
 from kissgs.cameras.photographs import Distortion

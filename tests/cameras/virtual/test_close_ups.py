@@ -9,7 +9,7 @@ from helpers.whole_scenes import moved, two
 
 from kissgs import render, sample_scene
 from kissgs.cameras.virtual.samples import close_ups, scattered_cameras
-from kissgs.rendering.coverage import local_scale
+from kissgs.rendering.sensitivity import local_scale
 
 
 def test_objects_of_all_sizes_have_close_ups():

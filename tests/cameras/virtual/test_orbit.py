@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kissgs.cameras.virtual.orbit import Orbit
+from kissgs.cameras.render import Orbit
 from kissgs.core.errors import InvalidViewsError
 
 UP = np.array([0.0, -1, 0])

@@ -8,9 +8,9 @@ from helpers.fewer_cameras import try_fewer
 from helpers.hollow_scenes import box
 
 from kissgs import sample_scene
+from kissgs.cameras import render as orbit_search
 from kissgs.cameras.captures.load import load_views
-from kissgs.cameras.virtual import orbit as orbit_search
-from kissgs.cameras.virtual.orbit import MIN_SWEEP, Orbit, _longest_run, _with_arc, find_orbit
+from kissgs.cameras.render import MIN_SWEEP, Orbit, _longest_run, _with_arc, find_orbit
 from kissgs.core.errors import Cancelled, InvalidViewsError
 from kissgs.core.splats import Splats, clean
 from kissgs.io.ply import read_ply

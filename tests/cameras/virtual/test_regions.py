@@ -8,8 +8,7 @@ from helpers.fewer_cameras import try_fewer
 from helpers.whole_scenes import SCENES, joined, moved
 
 from kissgs import Camera, Splats, clean, sample_scene
-from kissgs.cameras.virtual.regions import scene_views
-from kissgs.cameras.virtual.samples import random_poses
+from kissgs.cameras.virtual.samples import random_poses, scene_views
 
 
 @pytest.fixture(autouse=True)

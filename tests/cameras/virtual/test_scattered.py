@@ -7,7 +7,7 @@ from helpers.whole_scenes import two
 from kissgs import sample_scene
 from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.cameras.virtual.samples import scattered_cameras
-from kissgs.rendering.coverage import local_scale
+from kissgs.rendering.sensitivity import local_scale
 
 
 def test_distances_directions_and_fields_of_view():

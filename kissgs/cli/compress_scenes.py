@@ -1,4 +1,4 @@
-"""``compress_scene``: compression of one scene as a work item, for ``kissgs compress --ray``."""
+"""Compression of one scene, of many on a cluster, or of one as a streamed scene, as the command line shows it."""
 
 from __future__ import annotations
 
@@ -16,17 +16,139 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kissgs.cli.compact import CHECKPOINT
-from kissgs.cli.console import output, progress_bar
-from kissgs.cli.files import show, sibling
+from kissgs.cli.files import output, progress_bar, say_notes, show, sibling, source, write_stdout
+from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
+from kissgs.cli.options import CHECKPOINT
+from kissgs.cli.signals import stoppable
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.io.files import move_into_place, open_scene_file, reason_of
+from kissgs.pipeline.pipeline import compress
+from kissgs.pipeline.training_choice import decided
 from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of
 from kissgs.sogxt.container import check_destination
+from kissgs.training.checkpoint import delete_checkpoints
 
 if TYPE_CHECKING:
+    from kissgs.cameras.views import Views
     from kissgs.cli.options import CompressOptions
+
+
+# ``compress_here``: ``kissgs compress`` of one scene, in this process.
+
+
+def compress_here(options: CompressOptions, capture: Views | None, scene: str, target: Path) -> dict[str, Any]:
+    """Compress a scene, show a table of the result and return its report; ``capture`` are the ``options.views``."""
+    piped = str(target) == "-"
+    searches = decided(options.settings, capture).searches
+    with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:
+        if options.evaluate:  # reported here, because evaluation reports only one stage
+            from kissgs.core.progress import load_kernels
+
+            load_kernels(progress)
+        result = compress(
+            source(scene),
+            None if piped else target,
+            settings=options.settings,
+            reading=options.reading,
+            container=options.container,
+            cache=sibling(scene, ".sensitivity.npz") if options.cache else None,
+            evaluate=options.evaluate,
+            views=capture,
+            force_views=options.force_views,
+            checkpoint=sibling(scene, CHECKPOINT) if options.checkpoint else None,
+            overwrite=options.force,
+            threads=options.threads,
+            device=options.device,
+            progress=progress,
+        )
+    if piped:
+        say_notes(scene, (result.report.note, *result.report.cleaned.notes), options.quiet)
+        write_stdout(result.to_zip())
+        delete_checkpoints(*result.checkpoints)
+    elif not options.quiet:
+        from kissgs.cli.tables import report_table
+
+        show(report_table(result.report, str(target)))
+    return result.report.as_dict()
+
+
+# ``compress_streamed``: ``kissgs compress -o FOLDER/lod-meta.json`` of one scene, into levels of detail.
+
+
+def refuse_options(manifest: Path, options: CompressOptions, *, container: str | None, unpacked: bool) -> None:
+    """Raise UnsupportedError for options that levels of detail do not have."""
+    unused = {
+        "--views": options.views,
+        "--evaluate": options.evaluate,
+        "--cache": options.cache,
+        "--container": container,
+        "--unpacked": unpacked,
+    }
+    if wrong := next((name for name, value in unused.items() if value), None):
+        raise UnsupportedError(f"levels of detail ({manifest.name}) are made without {wrong}")
+
+
+def compress_streamed(options: CompressOptions, ray: str | None, scene: str, target: Path) -> dict[str, Any]:
+    """Compress a scene into a streamed scene, show a table and return its report; ``ray`` is an address or None."""
+    if scene == "-":
+        raise UnsupportedError("levels of detail need a file: it is read more than once")
+    with _stages(options.quiet) as progress, contextlib.ExitStack() as ending:
+        from kissgs.streaming.layout import continuation, work_folder
+
+        work = work_folder(target)
+        say_when_interrupted(continuation(work))  # a second signal may stop the removal of what was made
+        ending.callback(_say_what_is_left, work)
+        progress("kernels", 0.0)
+        from kissgs.streaming.compress import compress_streamed as run
+
+        runner = None
+        if ray is not None:
+            from kissgs.runners import RayRunner
+
+            progress("cluster", 0.0)
+            runner = RayRunner(ray)
+            ending.callback(runner.close)
+        report = run(
+            scene,
+            target,
+            settings=options.settings,
+            reading=options.reading,
+            overwrite=options.force,
+            runner=runner,
+            threads=options.threads,
+            progress=progress,
+        )
+    if not options.quiet:
+        from kissgs.cli.tables import streamed_table
+
+        show(streamed_table(report, str(target)))
+    return asdict(report)
+
+
+@contextlib.contextmanager
+def _stages(quiet: bool) -> Iterator[Progress]:
+    """Yield a receiver of progress that announces the scratch folder, and says when an interruption leaves it."""
+    with progress_bar(quiet) as bar:
+
+        def receive(stage: str, fraction: float, note: str = "") -> None:
+            if stage == "scratch" and not quiet:
+                sys.stderr.write(f"kissgs: {note}\n")
+            if stage in ("merge", "cameras", "images"):  # what is interrupted earlier begins anew
+                say_when_interrupted("the same command goes on where it was")
+            bar(stage, fraction, note)
+
+        yield receive
+
+
+def _say_what_is_left(work: Path) -> None:
+    """Let the message of an interruption say whether something is left, and what the same command does with it."""
+    from kissgs.streaming.layout import continuation
+
+    say_when_interrupted(continuation(work) if work.exists() else NOTHING_LEFT)
+
+
+# ``compress_scene``: compression of one scene as a work item, for ``kissgs compress --ray``.
 
 
 def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
@@ -218,7 +340,7 @@ class ClusterCompression:
             )
             self._bar("scenes", ended / max(len(self._handles), 1), details)
 
-        return runner.submit(WorkItem("kissgs.cli.compress_cluster:compress_scene", arguments, resources), progress)
+        return runner.submit(WorkItem("kissgs.cli.compress_scenes:compress_scene", arguments, resources), progress)
 
     def _with_memory(self, runner: Runner, requested: Resources, memory: int) -> Resources:
         """Return a request with memory, at most that of the largest node that has the rest of it."""

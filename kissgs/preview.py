@@ -1,20 +1,28 @@
-"""The preview page: its files, and scenes and folders of streamed scenes in the forms that it reads."""
+"""The preview page: scenes in the forms that it reads, as one file, or served on this machine."""
 
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
+import html
 import io
+import json
 import os
+import posixpath
 import re
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote, urlsplit
 
+from kissgs._version import __version__
 from kissgs.core.errors import InvalidSceneError, KissgsError, UnsupportedError
-from kissgs.core.origin import WORLD
+from kissgs.core.positions import WORLD
 from kissgs.core.progress import Progress, silent
 from kissgs.formats import CONTAINERS, FORMATS, ending_of
 from kissgs.io.containers import META_NAME, Source, open_source
@@ -28,6 +36,8 @@ from kissgs.sog import streamed as streamed_sog
 from kissgs.sog.metadata import read_layout
 from kissgs.sogxt import streamed as streamed_sogxt
 from kissgs.sogxt.container import zip_bytes
+
+# The preview page: its files, and scenes and folders of streamed scenes in the forms that it reads.
 
 PAGE_GAUSSIANS = 1_000_000
 """Largest number of Gaussians of the level that a page of one file gets, so that phones open it."""
@@ -113,7 +123,7 @@ def fitting_level(source: Path | bytes, max_gaussians: int | None = None) -> tup
 
 # Files of the preview page: where they are, which belong to it, and its content security policy.
 
-_PACKAGE = Path(__file__).parents[1]
+_PACKAGE = Path(__file__).parent
 
 ROOT = _PACKAGE if (_PACKAGE / "web_decoder").is_dir() else _PACKAGE.parent
 """Folder of ``web_decoder`` and ``scripts``: the package itself in a wheel, the folder around it in a checkout."""
@@ -239,3 +249,214 @@ def _stem(source: Path | bytes) -> str:
         return "scene"
     root = scene_root(source).absolute()
     return os.fsencode(root.name if root.is_dir() else root.stem).decode(errors="replace") or "scene"
+
+
+# The preview page and a scene in one HTML file, which works from disk and without a network.
+#
+# Modules cannot be imported from ``file:``. They are therefore embedded as text, in an order in which each comes after
+# those that it imports; ``web_decoder/standalone.js`` makes a blob of each, and their imports name the blobs'
+# addresses.
+
+_START, _PROGRAM, _STYLE = "standalone.js", "preview.js", "preview.css"
+
+_COMMENT = re.compile(r"/\*\*.*?\*/", re.DOTALL)
+"""Comments with types and examples, whose imports are none; minified files have no others than licences."""
+
+_IMPORT = re.compile(r"""(\b(?:from|import)\s*\(?\s*)(["'])([^"'\n]+)\2""")
+_WORKER = re.compile(r"""new URL\("([^"]+)", import\.meta\.url\)""")
+
+_STANDALONE_POLICY = (
+    "default-src 'none'; script-src {script} blob: 'wasm-unsafe-eval'; worker-src blob:; style-src {style}; "
+    "img-src data:; connect-src 'none'; form-action 'none'; base-uri 'none'"
+)
+
+
+def standalone_page(scene: PageScene) -> bytes:
+    """Return the page with a container inside: UTF-8, equal bytes for equal input."""
+    files = page_files()
+    page = read_page(files)
+    style, start = _text(files[_STYLE]), _text(files[_START])
+    modules = _Modules(files, json.loads(import_map(page))["imports"])
+    modules.add(_PROGRAM)
+    packed = gzip.compress(json.dumps(modules.linked, ensure_ascii=False).encode(), compresslevel=9, mtime=0)
+    title = html.escape(scene.name)
+    policy = _STANDALONE_POLICY.format(script=hash_source(start), style=hash_source(style))
+    meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}" />\n    '
+    blocks = (
+        f'<script type="text/plain" id="modules">{_base64(packed)}</script>\n'
+        f'<script type="text/plain" id="embedded-scene" data-name="{title}">{_base64(scene.data)}</script>\n'
+    )
+    for pattern, text in (
+        (r'<meta charset="utf-8" />\n\s*', lambda found: found + meta),
+        (r"<title>.*?</title>", lambda _: f"<title>{title} · kissgs</title>"),
+        (r'<link rel="stylesheet"[^>]*>', lambda _: f"<style>{style}</style>"),
+        (r'<script type="importmap">.*?</script>', lambda _: _licences(files)),
+        (r'<script type="module" src=[^>]*></script>\n', lambda _: ""),
+        (r"</body>", lambda found: f'{blocks}<script type="module">{start}</script>\n{found}'),
+    ):
+        page, count = re.subn(pattern, lambda match: text(match[0]), page, flags=re.DOTALL)  # noqa: B023  called at once
+        assert count == 1, pattern  # noqa: S101
+    return page.encode()
+
+
+class _Modules:
+    """Modules of the page in the order of their imports; ``linked`` holds names and texts."""
+
+    def __init__(self, files: dict[str, Path], imports: dict[str, str]) -> None:
+        self._files = files
+        self._imports = imports
+        self._begun: set[str] = set()
+        self.linked: list[tuple[str, str]] = []
+
+    def add(self, name: str) -> None:
+        """Add a module after all modules that it imports."""
+        if name in self._begun:
+            assert any(name == known for known, _ in self.linked), f"{name} imports itself"  # noqa: S101
+            return
+        self._begun.add(name)
+        text = _text(self._files[name])
+        if not name.endswith(".min.js"):
+            text = _COMMENT.sub("", text)
+            text = _WORKER.sub(lambda match: self._link(name, match[1]) or match[0], text)
+        text = _IMPORT.sub(lambda match: match[1] + (self._link(name, match[3]) or match[0][len(match[1]) :]), text)
+        self.linked.append((name, text))
+
+    def _link(self, name: str, specifier: str) -> str | None:
+        """Return what a module's text imports instead of ``specifier``; None if that is no file of the page."""
+        target = self._resolve(name, specifier)
+        if target not in self._files:
+            return None
+        self.add(target)
+        return f'"module:{target}"'
+
+    def _resolve(self, name: str, specifier: str) -> str:
+        for known, address in self._imports.items():
+            if specifier == known or (known.endswith("/") and specifier.startswith(known)):
+                return posixpath.normpath(address + specifier[len(known) :])
+        return posixpath.normpath(posixpath.join(posixpath.dirname(name), specifier))
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8").replace("\r\n", "\n")
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+def _licences(files: dict[str, Path]) -> str:
+    """Return a comment with the licences of the libraries inside, which ask for that."""
+    texts = [
+        f"{name.split('/')[1]}: {_text(path).strip()}" for name, path in files.items() if name.endswith("/LICENSE")
+    ]
+    return "<!--\n" + "\n\n".join(texts).replace("--", "- -") + "\n-->"
+
+
+# A server of the preview page and one scene, for browsers on this machine.
+
+HOST = "127.0.0.1"
+SLOWEST_SECONDS = 60
+"""A client that sends or takes nothing for this long is disconnected."""
+
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    "": "text/plain; charset=utf-8",
+}
+_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+}
+_SERVED_POLICY = (
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' {hash}; worker-src 'self' blob:; style-src 'self'; "
+    "img-src 'self' data:; connect-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
+)
+"""Spark sorts in WebAssembly, in workers that it creates from blobs; the hash is that of the inline import map."""
+
+
+class PageServer(ThreadingHTTPServer):
+    """Server of the page at ``/``, of its files and of the scene, and of nothing else.
+
+    Only requests whose ``Host`` is this machine by number or as ``localhost`` are answered, so that a web site whose
+    name resolves to 127.0.0.1 cannot read the scene. Port 0 is a free one.
+    """
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, scene: PageScene | StreamedFolder, port: int = 0) -> None:
+        files = page_files()
+        page = read_page(files)
+        self.contents: dict[str, bytes | Path] = {f"/{name}": path for name, path in files.items()}
+        self.contents |= {"/": page.encode(), f"/{PAGE}": page.encode()}
+        address = f"scene/{scene.name}"
+        if isinstance(scene, StreamedFolder):
+            self.contents |= {f"/{address}/{name}": path for name, path in scene.files.items()}
+            address = f"{address}/{scene.manifest}"
+        else:
+            self.contents[f"/{address}"] = scene.data
+        self.policy = _SERVED_POLICY.format(hash=hash_source(import_map(page)))
+        try:
+            super().__init__((HOST, port), _Handler)
+        except OSError as error:
+            raise UnsupportedError(
+                f"cannot serve on port {port}: {reason_of(error)}; choose another --port, or none"
+            ) from error
+        self.port: int = self.server_address[1]
+        self.hosts = {f"{name}:{self.port}" for name in (HOST, "localhost")} | ({HOST} if self.port == 80 else set())
+        self.url = f"http://{HOST}:{self.port}/?src={quote(quote(address))}"
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401  as in the base class
+        """Let a connection that breaks pass in silence."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: PageServer
+    protocol_version = "HTTP/1.1"
+    timeout = SLOWEST_SECONDS
+
+    def do_GET(self) -> None:
+        self._answer(body=True)
+
+    def do_HEAD(self) -> None:
+        self._answer(body=False)
+
+    def _answer(self, *, body: bool) -> None:
+        status, content, media_type = self._find()
+        self.send_response(status)
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        self.send_header("Content-Type", media_type)
+        self.send_header("Content-Length", str(len(content)))
+        if media_type == _TYPES[".html"]:
+            self.send_header("Content-Security-Policy", self.server.policy)
+        self.end_headers()
+        if body:
+            self.wfile.write(content)
+
+    def _find(self) -> tuple[HTTPStatus, bytes, str]:
+        """Return the status, the content and its media type for the path of this request."""
+        path = unquote(urlsplit(self.path).path)
+        if self.headers.get("Host") not in self.server.hosts:
+            return HTTPStatus.FORBIDDEN, b"this server answers requests to this machine only\n", _TYPES[""]
+        found = self.server.contents.get(path)
+        if found is None:
+            return HTTPStatus.NOT_FOUND, b"there is no such file\n", _TYPES[""]
+        suffix = ".html" if path == "/" else Path(path).suffix
+        try:
+            content = found if isinstance(found, bytes) else found.read_bytes()
+        except OSError:  # a file of a streamed scene that has been removed meanwhile
+            return HTTPStatus.NOT_FOUND, b"there is no such file\n", _TYPES[""]
+        return HTTPStatus.OK, content, _TYPES.get(suffix, "application/octet-stream")
+
+    def version_string(self) -> str:
+        """Return the header ``Server``."""
+        return f"kissgs/{__version__}"
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Print nothing for a request."""
