@@ -37,8 +37,6 @@ from kissgs.sog.metadata import read_layout
 from kissgs.sogxt import streamed as streamed_sogxt
 from kissgs.sogxt.container import zip_bytes
 
-# The preview page: its files, and scenes and folders of streamed scenes in the forms that it reads.
-
 PAGE_GAUSSIANS = 1_000_000
 """Largest number of Gaussians of the level that a page of one file gets, so that phones open it."""
 

@@ -86,7 +86,7 @@ const valuesOf = ([lowest, highest], ranges, levels = 256, finish = (value) => v
   });
 
 /**
- * Whether a YAML file beside meta.json states the same, as in kissgs/sogxt/metadata_reader.py: numbers by the word before
+ * Whether a YAML file beside meta.json states the same, as in kissgs/sogxt/metadata.py: numbers by the word before
  * them, and the word after "model".
  * @param {Uint8Array} yaml
  * @param {Record<string, number[]>} numbers by word; those of the first two must be there

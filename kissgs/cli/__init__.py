@@ -1,1 +1,1 @@
-"""The command line: one module per command; prints what the library returns."""
+"""The command line, which prints what the library returns."""

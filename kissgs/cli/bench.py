@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from kissgs.cameras.views import Views
+    from kissgs.core.progress import Progress
+    from kissgs.evaluation.html import ReportScene
     from kissgs.evaluation.results import Evaluation
     from kissgs.formats import ContainerName
     from kissgs.pipeline.report import Report
@@ -142,13 +144,11 @@ def evaluate(
     common: SceneOptions,
 ) -> None:
     """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""
-    from kissgs.cli.files import progress_bar
     from kissgs.core.positions import with_origin
     from kissgs.evaluation.evaluate import evaluate as measure
-    from kissgs.evaluation.html import ReportScene, html_report
+    from kissgs.evaluation.html import html_report
     from kissgs.evaluation.results import Split
     from kissgs.io.files import atomic_file, refuse_existing
-    from kissgs.pipeline.scene_files import load, stored_bytes
 
     quiet, threads = common.quiet or as_json, common.threads
     used_split = cast(Split, choice("--split", split, Split))
@@ -157,15 +157,7 @@ def evaluate(
         refuse_existing(html, overwrite=force)
     capture = open_views(views, scale=scale, images=images)
     with progress_bar(quiet) as progress:
-        reading = asdict(common.reading())
-        sides = [
-            ReportScene(
-                name=path.name,
-                splats=load(path, threads=threads, progress=progress, **reading),
-                bytes=stored_bytes(path),
-            )
-            for path in (reference, candidate)
-        ]
+        sides = _sides_of((reference, candidate), common, progress)
         sides[1] = replace(sides[1], splats=with_origin(sides[1].splats, sides[0].splats.origin))
         scenes = sides[0].splats, sides[1].splats
         result = measure(
@@ -201,6 +193,22 @@ def evaluate(
         show(evaluation_table(result, sides[0], sides[1], asked=split))
         if html is not None:
             show(f"\nreport  {html}")
+
+
+def _sides_of(paths: Sequence[Path], common: SceneOptions, progress: Progress) -> list[ReportScene]:
+    """Read the scenes to compare; the level of detail concerns those that have levels, which one of them must."""
+    from kissgs.evaluation.html import ReportScene
+    from kissgs.pipeline.scene_files import has_levels, load, stored_bytes
+
+    streamed = [path for path in paths if has_levels(path)]
+    sides = []
+    for path in paths:
+        reading = asdict(common.reading())
+        if streamed and path not in streamed:
+            reading["level"] = 0
+        splats = load(path, threads=common.threads, progress=progress, **reading)
+        sides.append(ReportScene(name=path.name, splats=splats, bytes=stored_bytes(path)))
+    return sides
 
 
 # ``kissgs bench``: bytes, seconds and quality of a scene with each preset and in limited times.
@@ -271,7 +279,6 @@ def bench(
 
     Each is compressed, decompressed and evaluated in a process of its own.
     """
-    from kissgs.cli.files import progress_bar
     from kissgs.settings import Preset
 
     if not presets and not times:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from kissgs.cli.files import for_each_input, say_notes, show, sibling, source, stdout
+from kissgs.cli.files import for_each_input, progress_bar, say_notes, show, sibling, source, stdout
 from kissgs.cli.options import (
     CHECKPOINT,
     CheckpointOption,
@@ -95,7 +95,6 @@ def compact(
 
     The preset fast only prunes; balanced, small and paper also train.
     """
-    from kissgs.cli.files import progress_bar
     from kissgs.cli.signals import stoppable
     from kissgs.io.ply import write_ply
     from kissgs.pipeline.pipeline import compact as run
@@ -136,8 +135,6 @@ def compact(
                 progress=progress,
             )
         if piped:
-            import sys
-
             say_notes(scene, (result.report.note, *result.report.cleaned.notes), quiet)
             with stdout():
                 write_ply(sys.stdout.buffer, result.splats)

@@ -104,8 +104,6 @@ def compress_streamed(options: CompressOptions, ray: str | None, scene: str, tar
 
         runner = None
         if ray is not None:
-            from kissgs.runners import RayRunner
-
             progress("cluster", 0.0)
             runner = RayRunner(ray)
             ending.callback(runner.close)
@@ -159,7 +157,6 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
     """
     from kissgs.cli.options import open_views
     from kissgs.io.scene_format import ReadOptions
-    from kissgs.pipeline.pipeline import compress
     from kissgs.settings import Settings
 
     scene, work = Path(arguments["scene"]), Path(arguments["work"])

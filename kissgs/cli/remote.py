@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kissgs.cli.files import for_each_input, print_json, show
+from kissgs.cli.files import for_each_input, print_json, progress_bar, show
 from kissgs.cli.options import (
     CompactOption,
     ContainerOption,
@@ -70,7 +70,6 @@ def compress(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job."""
-    from kissgs.cli.files import progress_bar
     from kissgs.cli.tables import status_table
     from kissgs.client import Remote
     from kissgs.core.errors import UnsupportedError
@@ -138,7 +137,6 @@ def get(
     force: ForceOption = False,
 ) -> None:
     """Wait for a job to finish, and download its container."""
-    from kissgs.cli.files import progress_bar
     from kissgs.cli.tables import status_table
     from kissgs.client import Remote
     from kissgs.core.errors import OutputError

@@ -1,4 +1,4 @@
-"""Numba kernels that convert rotations and scales to covariances, and back."""
+"""Merging: two neighbouring Gaussians become one with their mean, covariance, colour and opacity, again and again."""
 
 from __future__ import annotations
 
@@ -109,8 +109,6 @@ def decompose(
             scales[n, c] = 0.5 * math.log(max(matrix[c, c], 1e-14 * largest))
         _quaternion(turn, quats[n])
 
-
-# Merging: two neighbouring Gaussians become one with their mean, covariance, colour and opacity, again and again.
 
 # Numba kernels of merging: moments, opacity and error of two Gaussians that become one.
 #
@@ -347,10 +345,8 @@ def merge(
             colors[i, c] = share * colors[i, c] + (1 - share) * colors[j, c]
 
 
-# Merging: two neighbouring Gaussians become one with their mean, covariance, colour and opacity, again and again.
-#
-# No image is rendered. What a merge costs is the squared error of its image, in closed form
-# (:mod:`kissgs.compaction.merging`); the cheapest pairs merge first.
+# No image is rendered. What a merge costs is the squared error of its image, in closed form;
+# the cheapest pairs merge first.
 
 NEIGHBOURS = 8
 """Number of nearest neighbours that a Gaussian may merge with."""

@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from kissgs.training.supervision import TrainingTargets
 
 
-# ``Popspa``: score and prune, train while pruning further, refine (POPSpa, KISS-GS, section 3.1).
-
 # ``StepLog``: the steps of a compaction for the report.
 
 

@@ -112,8 +112,6 @@ def _nearby_scores(scores: Float[np.ndarray, " N"], close_up: Float[np.ndarray, 
     return np.asarray(np.median(scores[seen] / close_up[seen]) * close_up)
 
 
-# ``SceneTraining``: a scene that is pruned and trained in turn, by a schedule (KISS-GS, section 3.1).
-
 # Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.1).
 
 BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}

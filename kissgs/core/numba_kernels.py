@@ -21,8 +21,8 @@ Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 kernels: list[Any] = []
 """All kernels of the modules that are imported; the method ``load`` of each compiles it without a call."""
 
-UNREADABLE = (ImportError, AttributeError, EOFError, pickle.UnpicklingError)
-"""Errors by which numba fails to read its cache of a kernel."""
+UNREADABLE = (ImportError, AttributeError, EOFError, LookupError, TypeError, ValueError, pickle.UnpicklingError)
+"""Errors of reading a cache that is damaged, or that another version left and that names modules which are gone."""
 
 _compiling = threading.RLock()
 _uncached: list[str] = []
@@ -56,8 +56,9 @@ def _defer(kernel: Any, signature: str | Signature) -> None:  # noqa: ANN401
                 _load_called(kernel)
                 try:
                     kernel.compile(signature)
-                except UNREADABLE:  # another version's cache may name modules that are gone
-                    kernel._cache.flush()
+                except UNREADABLE:
+                    with contextlib.suppress(OSError):
+                        kernel._cache.flush()
                     kernel.compile(signature)
                 kernel.disable_compile()
             return next(iter(kernel.overloads.values()))

@@ -23,8 +23,6 @@ def format_metric(value: float, digits: int, *, signed: bool = False) -> str:
     return f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # -0.0 + 0.0 is 0.0
 
 
-# Results of an evaluation: metrics per view and their means, and the loss as goals define it.
-
 # Results of an evaluation: metrics per view and their means, as text and as JSON.
 
 Split = Literal["test", "train", "all"]

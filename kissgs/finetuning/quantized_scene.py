@@ -16,9 +16,9 @@ from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.positions import signed_exp
 from kissgs.core.progress import Pace
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.finetuning import planes as kernels
+from kissgs.finetuning import planes
 from kissgs.finetuning.planes import Plane, each_part, planes_of, sum_by_label
-from kissgs.planning import rotation_forms as smallest_three
+from kissgs.planning import rotation_forms
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import Grid
 from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel, Quantized
@@ -29,8 +29,6 @@ from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.tensors import Parameters
 from kissgs.training.loop import TrainableScene
 from kissgs.training.model import PrunableAdam
-
-# ``QuantizedScene``: the differentiable decoder of fine-tuning, from latents to levels to a scene.
 
 # The decoders' own functions for training: exact values forward, gradients backward.
 
@@ -59,7 +57,7 @@ class _SmallestThree(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, small: Float64[Tensor, "M 3"], omitted: Int[Tensor, "M 1"]) -> Float32[Tensor, "M 4"]:  # noqa: ANN401
-        whole = smallest_three.whole(small.detach().cpu().numpy(), omitted[:, 0].cpu().numpy())
+        whole = rotation_forms.whole(small.detach().cpu().numpy(), omitted[:, 0].cpu().numpy())
         quats = torch.from_numpy(whole).to(small.device)
         ctx.save_for_backward(small, omitted, quats.gather(1, omitted))
         return quats.float()
@@ -68,7 +66,7 @@ class _SmallestThree(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Float32[Tensor, "M 4"]) -> tuple[Float64[Tensor, "M 3"], None]:  # noqa: ANN401
         small, omitted, missing = ctx.saved_tensors
-        kept = torch.from_numpy(smallest_three.KEPT).to(small.device)[omitted[:, 0]]
+        kept = torch.from_numpy(rotation_forms.KEPT).to(small.device)[omitted[:, 0]]
         wide = gradient.double()
         return wide.gather(1, kept) - wide.gather(1, omitted) * small / missing.clamp(SMALLEST_DIVISOR), None
 
@@ -286,8 +284,6 @@ def _values(name: str, fields: Mapping[str, Quantized]) -> Float64[np.ndarray, "
     return decoded_quats(dict(fields)) if name == "quaternions" else fields[name].values()
 
 
-# Loss terms of fine-tuning for the size of the container: estimated bits of the levels, and total variation.
-
 # ``CodebookRate``: estimated bits of the SH codebook's image, for fine-tuning.
 
 DIFFERENCE_OFFSET = 0.3
@@ -500,9 +496,9 @@ class _Bits(torch.autograd.Function):
         slopes = np.empty(tuple(latents.shape), np.float32)
 
         def part(first: int, last: int) -> float:
-            return float(kernels.level_bits(start, found, codes, bits_of, symbols, first, last, slopes))
+            return float(planes.level_bits(start, found, codes, bits_of, symbols, first, last, slopes))
 
-        bits = kernels.each_part(part, len(slopes), torch.get_num_threads())
+        bits = planes.each_part(part, len(slopes), torch.get_num_threads())
         ctx.save_for_backward(torch.from_numpy(slopes))
         return torch.tensor(math.fsum(bits), dtype=torch.float32)
 

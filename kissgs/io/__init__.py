@@ -1,1 +1,1 @@
-"""Reading and writing of scene files, one module per format. Takes files or bytes; gives Splats, and back."""
+"""Reading and writing of scene files. Takes files or bytes; gives Splats, and back."""

@@ -490,6 +490,8 @@ class _Columns:
 
     def origin(self, blocks: Iterable[np.ndarray]) -> Origin:
         """Return the origin of a scene whose positions may have more digits than float32."""
+        if not self.vertex.count:
+            return WORLD
         each = (np.column_stack([_float64(block, _POSITION), self.splats(block, WORLD).scales]) for block in blocks)
         some = sampled_rows(each, self.vertex.count)
         return origin_for(some[:, :3], some[:, 3:6].astype(np.float32))

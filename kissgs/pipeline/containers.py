@@ -11,8 +11,8 @@ from kissgs.settings import EncodeSettings
 from kissgs.sog import encode as sog
 from kissgs.sog.decode import decode as decode_sog
 from kissgs.sog.encode import SOG
-from kissgs.sogxt import container as names
 from kissgs.sogxt import encode as sogxt
+from kissgs.sogxt.container import FILES as SOGXT_FILES
 from kissgs.sogxt.decode import decode as decode_sogxt
 
 MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}
@@ -21,7 +21,7 @@ MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}
 DECODERS = {"sogxt": decode_sogxt, "sog": decode_sog}
 """Decoder of each container."""
 
-FILES = frozenset({*names.FILES, *sog.FILES})
+FILES = frozenset({*SOGXT_FILES, *sog.FILES})
 """Names of all files that containers may have: a folder with no others may be replaced by a container."""
 
 

@@ -30,8 +30,6 @@ from kissgs.io.files import BinaryWriter, atomic_file, listed, parse_json, reaso
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Facts, Match, ReadOptions
 from kissgs.sogxt.container import YAML_NAME, is_packed
 
-# Scenes in files: recognise and read every format, write those that are no containers.
-
 # Recognition of scene formats: by content where a format has a mark, else by the ending of the name.
 
 HEAD_BYTES = 512
@@ -332,13 +330,20 @@ def _read(
     root = scene_root(source) if isinstance(source, Path) else source
     if only_containers and found == "ply":
         found = "sogxt"  # whose reader says what is wrong
-    refuse_level(found, reading.level)
+    refuse_level(found, root, reading.level)
     return FORMATS[found].codec.read(root, reading, threads, progress)
 
 
-def refuse_level(kind: str, level: int) -> None:
-    """Refuse a level of detail, but for the finest, of a format that has none."""
+def has_levels(path: Path) -> bool:
+    """Whether a scene is streamed, so that it has levels of detail."""
+    return bool(FORMATS[recognise(path)].manifest)
+
+
+def refuse_level(kind: str, source: Path | bytes | Mapping[str, bytes], level: int) -> None:
+    """Refuse a level of detail, but for the finest, of a readable scene in a format that has none."""
     if level and not FORMATS[kind].manifest:
+        if not isinstance(source, Mapping):
+            FORMATS[kind].codec.info(source, 0)  # says what is wrong with a scene that is not readable
         raise UnsupportedError(f"there is no level {level}: this scene has no levels of detail, so leave the level out")
 
 
@@ -484,7 +489,7 @@ def describe(path: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS) -> Info:
     No image of a container is decoded, except SOG-XT's mask if the metadata does not state the number of Gaussians.
     """
     kind = recognise(path)
-    refuse_level(kind, reading.level)
+    refuse_level(kind, scene_root(path), reading.level)
     facts = FORMATS[kind].codec.info(scene_root(path), reading.level)
     if FORMATS[kind].is_container:
         refuse_more_than(reading.max_gaussians, facts.count, str(path))  # no default: no image is decoded

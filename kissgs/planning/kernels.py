@@ -8,8 +8,6 @@ from numba import njit
 from kissgs.core.array_types import Float32, Float64, Int32, Int64, UInt8, UInt64
 from kissgs.core.numba_kernels import compiled
 
-# Compiled inner loops of the encoder.
-
 
 @compiled("void(uint16[:, ::1], uint64[::1])")
 def hilbert_keys(cells: np.ndarray, keys: np.ndarray) -> None:

@@ -16,7 +16,7 @@ from kissgs.core.progress import Progress, load_kernels, silent
 from kissgs.core.resources import Workers, blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS, Splats
-from kissgs.planning import rd_fields as table_fields
+from kissgs.planning import rd_fields
 from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import hilbert_order, layout_grid
 from kissgs.planning.quantize import (
@@ -144,14 +144,14 @@ def _blocks(ends: list[int], first_size: int) -> list[slice]:
 
 def _block_order(means: UInt16[np.ndarray, "B 3"], pixels: UInt8[np.ndarray, "B 6"]) -> Int32[np.ndarray, " B"]:
     """Return the refined order of some Gaussians, of which the first and the last stay."""
-    from kissgs.planning import kernels as tour_kernels
+    from kissgs.planning import kernels
 
     order = np.arange(len(means), dtype=np.int32)
     bits = _difference_bits(pixels)
     curves = np.stack([hilbert_order(means[:, axes] + np.uint16(shift)) for *axes, shift in CURVES])
     near = np.empty((len(means), NEAR), np.int32)
-    tour_kernels.near_pixels(pixels, bits, curves, REACH, near)
-    tour_kernels.improve(pixels, bits, near, PASSES, order)
+    kernels.near_pixels(pixels, bits, curves, REACH, near)
+    kernels.improve(pixels, bits, near, PASSES, order)
     return order
 
 
@@ -180,8 +180,6 @@ def _with_equal_positions_in_order(
     order[places] = order[places][np.lexsort((order[places], group))]
     return order
 
-
-# ``plan_encoding``: rate-distortion planning if the scene's sensitivity is known, else uniform planning.
 
 # Uniform planning: the steps of the settings for all Gaussians, without rendering the scene.
 
@@ -253,12 +251,12 @@ def _table_fields(
         steps = (FINEST, FINEST, FINEST, FINEST)
     opacity, scale, rotation, color = (step * equal for step in steps)
     unit = log_extent(means) / MEANS_TOP
-    wanted = table_fields.stored_values(values, tables)
-    shapes = table_fields.rounded_shapes(wanted, equal, (opacity, scale, rotation), tables)
+    wanted = rd_fields.stored_values(values, tables)
+    shapes = rd_fields.rounded_shapes(wanted, equal, (opacity, scale, rotation), tables)
     fields = {
-        **table_fields.finished_shapes(shapes, values[:, 0], tables),
-        "means": table_fields.means_field(means, max(unit, 1e-30) * 2.0 ** (16 - bits)),
-        "f_dc": table_fields.color_field(colors.astype(np.float64), color, equal),
+        **rd_fields.finished_shapes(shapes, values[:, 0], tables),
+        "means": rd_fields.means_field(means, max(unit, 1e-30) * 2.0 ** (16 - bits)),
+        "f_dc": rd_fields.color_field(colors.astype(np.float64), color, equal),
     }
     return fields, largest_errors(fields, values, means, colors)
 

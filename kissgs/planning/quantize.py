@@ -121,10 +121,10 @@ def row_range(values: Rows, pool: Workers | None = None) -> tuple[np.ndarray, np
 
 def sorted_order(keys: UInt64[np.ndarray, " N"], bits: int = 64) -> Int32[np.ndarray, " N"]:
     """Sort ``keys``, below 2^``bits``, in place; return the permutation that does, stably."""
-    from kissgs.planning import kernels as order_kernels
+    from kissgs.planning import kernels
 
     order, scratch = np.empty(len(keys), np.int32), np.empty(len(keys), np.int32)
-    order_kernels.sort_keys(keys, order, np.empty_like(keys), scratch, 2 * -(-bits // 24))
+    kernels.sort_keys(keys, order, np.empty_like(keys), scratch, 2 * -(-bits // 24))
     return order
 
 

@@ -13,7 +13,7 @@ from kissgs.core.array_types import Float, Float32, Float64, Int, Integer, UInt8
 from kissgs.core.positions import signed_exp, signed_log
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.planning import rotation_forms as smallest_three
+from kissgs.planning import rotation_forms
 from kissgs.planning.quantize import (
     MEANS_TOP,
     SIZE,
@@ -261,15 +261,15 @@ def rounded_shapes(
     finest = float(steps[1].min())
     scales = _on_lattice(values[:, 1:4], np.clip(np.rint(steps[1] / finest), 1, 255) * finest)
     scale_table = fit_table(scales.ravel(), np.repeat(weights, 3), finest)
-    omitted = smallest_three.omitted_components(quats)
-    small = smallest_three.stored_components(quats, omitted)
+    omitted = rotation_forms.omitted_components(quats)
+    small = rotation_forms.stored_components(quats, omitted)
     return {
         "opacities": Quantized(
             np.clip(opacities, tables.first_drawn, tables.last_drawn), tables.opacity_logits[:, None]
         ),
         "scales": Quantized(nearest_levels(scale_table, scales), scale_table.astype(np.float64)[:, None]),
         "quaternions": Quantized(
-            smallest_three.lattice_levels(small, smallest_three.strides(steps[2])), smallest_three.TABLE[:, None]
+            rotation_forms.lattice_levels(small, rotation_forms.strides(steps[2])), rotation_forms.TABLE[:, None]
         ),
         "omitted": Quantized(omitted[:, None], np.arange(4.0)[:, None]),
     }
@@ -330,12 +330,12 @@ def decoded_quats(fields: dict[str, Quantized]) -> Float64[np.ndarray, "M 4"]:
     """Return the quaternions of a plan's fields, stored whole or as three components."""
     if "omitted" not in fields:
         return fields["quaternions"].values()
-    return smallest_three.whole(fields["quaternions"].values(), fields["omitted"].levels[:, 0])
+    return rotation_forms.whole(fields["quaternions"].values(), fields["omitted"].levels[:, 0])
 
 
 def shape_quats(quats: Float64[np.ndarray, "M 4"]) -> Float64[np.ndarray, "M 4"]:
     """Return the quaternions with the sign in which they are quantised."""
-    return smallest_three.with_sign(quats, smallest_three.omitted_components(quats))
+    return rotation_forms.with_sign(quats, rotation_forms.omitted_components(quats))
 
 
 def _on_lattice(values: Float64[np.ndarray, "M C"], steps: Float[np.ndarray, " M"]) -> Float64[np.ndarray, "M C"]:

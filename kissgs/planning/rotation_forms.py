@@ -178,10 +178,10 @@ def choose_forms(
 
 def unit_quats(splats: Splats, index: Int[np.ndarray, " M"]) -> Float64[np.ndarray, "M 4"]:
     """Return the rotations of some Gaussians; float32 lengths are exact to 1e-7 only."""
-    from kissgs.planning import kernels as form_kernels
+    from kissgs.planning import kernels
 
     unit = np.empty((len(index), 4))
-    form_kernels.normalize(splats.quats.take(index, axis=0), unit)
+    kernels.normalize(splats.quats.take(index, axis=0), unit)
     return unit
 
 
@@ -189,11 +189,11 @@ def apply_forms(
     quats: Float64[np.ndarray, "N 4"], scales: Float32[np.ndarray, "N 3"], forms: UInt8[np.ndarray, " N"]
 ) -> tuple[Float64[np.ndarray, "N 4"], Float32[np.ndarray, "N 3"]]:
     """Rewrite each Gaussian in its form: 0 to 23, a row of the table; plus 24 if the quaternion is negated."""
-    from kissgs.planning import kernels as form_kernels
+    from kissgs.planning import kernels
 
     quats, scales, forms = (np.ascontiguousarray(array) for array in (quats, scales, forms))
     turned, permuted = np.empty_like(quats), np.empty_like(scales)
-    form_kernels.apply_forms(quats, scales, forms, ROTATIONS, PERMUTATIONS, turned, permuted)
+    kernels.apply_forms(quats, scales, forms, ROTATIONS, PERMUTATIONS, turned, permuted)
     return turned, permuted
 
 
@@ -202,10 +202,10 @@ def canonical_forms(quats: Float64[np.ndarray, "N 4"]) -> UInt8[np.ndarray, " N"
 
     All rotations are then within 63° of the identity: w is at least 0.85 and x, y, z use 40 % of their range.
     """
-    from kissgs.planning import kernels as form_kernels
+    from kissgs.planning import kernels
 
     forms = np.empty(len(quats), np.uint8)
-    form_kernels.largest_w(np.ascontiguousarray(quats), ROTATIONS, forms)
+    kernels.largest_w(np.ascontiguousarray(quats), ROTATIONS, forms)
     return forms
 
 
@@ -257,6 +257,6 @@ def covariance_error(
     new_scales: Float32[np.ndarray, "N 3"],
 ) -> float:
     """Return the largest relative difference of the covariances, Frobenius norm, over all Gaussians."""
-    from kissgs.planning import kernels as form_kernels
+    from kissgs.planning import kernels
 
-    return float(form_kernels.covariance_error(*map(np.ascontiguousarray, (quats, scales, new_quats, new_scales))))
+    return float(kernels.covariance_error(*map(np.ascontiguousarray, (quats, scales, new_quats, new_scales))))

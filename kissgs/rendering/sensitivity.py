@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from kissgs.rendering.cpu.frame import Frame
 
 
-# Coverage: how well the best camera has seen each Gaussian; local scale: the distance between Gaussians.
-
 LEAF = 512
 """Largest number of Gaussians in a leaf of the tree, among which neighbours are searched."""
 
@@ -186,7 +184,6 @@ def measure_sensitivity(
     """
     from kissgs.rendering.cpu.frame import add_sensitivities, draw, for_kernels
     from kissgs.rendering.cpu.sensitivity import moments_to_hessians
-    from kissgs.rendering.cpu.tiles import each_part, even
 
     splats = for_kernels(splats)
     coverage = Coverage(splats)

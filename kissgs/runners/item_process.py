@@ -24,6 +24,9 @@ from kissgs.core.errors import KissgsError
 EVENT_SECONDS = 0.25
 """Minimum seconds between progress events of a stage."""
 
+WITHOUT_MEMORY = ("can't start new thread", "error return without exception set", "failed to map")
+"""Parts of messages of Python and of its loader of libraries when there is no memory."""
+
 PR_SET_PDEATHSIG = 1  # of Linux' prctl: the signal that a process gets when its parent dies
 
 Send = Callable[[dict[str, Any]], None]
@@ -49,10 +52,20 @@ def main() -> None:
             send({"error": {"code": error.code, "message": str(error)}})
     except MemoryError:
         send({"out_of_memory": True})
-    except Exception:  # noqa: BLE001  a bug, reported by standard error and the exit status
-        traceback.print_exc()
-        os._exit(1)
+    except Exception as error:  # noqa: BLE001  a bug, reported by standard error and the exit status
+        if not _lacks_memory(error, task["memory_limit"]):
+            traceback.print_exc()
+            os._exit(1)
+        send({"out_of_memory": True})
     os._exit(0)  # without waiting for threads of libraries
+
+
+def _lacks_memory(error: Exception, limit: int | None) -> bool:
+    """Whether more than half of the memory is in use, and the error is one that a lack of it causes, among others."""
+    if sys.platform != "linux" or limit is None or not any(words in str(error) for words in WITHOUT_MEMORY):
+        return False
+    used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5]) * os.sysconf("SC_PAGE_SIZE")
+    return used > limit / 2
 
 
 class Throttle:
@@ -93,12 +106,20 @@ def _limit_resources(memory: int | None) -> None:
         import resource
 
         if memory is not None:
-            # numba would load its OpenBLAS, which no kernel calls and which loops forever when it gets no memory.
-            sys.modules["scipy"] = None  # type: ignore[assignment]
+            _load_numba()
             resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         with contextlib.suppress(OSError):
             Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
+
+
+def _load_numba() -> None:
+    """Load what numba loads for its first kernel: imports that lack memory may never end."""
+    sys.modules["scipy"] = None  # type: ignore[assignment]  # its BLAS, which no kernel calls, takes 50 MB
+    from numba.core.registry import cpu_target
+
+    cpu_target.typing_context.refresh()
+    cpu_target.target_context.refresh()
 
 
 def _first_line() -> bytes:

@@ -109,9 +109,7 @@ def _remove(folder: Path) -> None:
 # processes, below which it runs on a cluster, run many tasks and have no hard limit of memory.
 
 OUT_OF_MEMORY = re.compile(
-    "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory|failed to map|can't start new thread"
-    "|error return without exception set",
-    re.IGNORECASE,
+    "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.IGNORECASE
 )
 """Messages of Python, C++, LLVM, OpenBLAS and the C library when an allocation fails; any of them may be the first."""
 

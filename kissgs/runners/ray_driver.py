@@ -1,4 +1,8 @@
-"""The process that talks to a Ray cluster: its connection, its tasks, and the files that they need."""
+"""Driver process of :class:`kissgs.runners.ray_runner.RayRunner`: ``python -m kissgs.runners.ray_driver ADDRESS``.
+
+Lines of JSON: items to submit and to cancel come from standard input, nodes and events of items go to standard output.
+When standard input closes, it ends all items and exits.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,6 @@ import os
 import secrets
 import shutil
 import signal
-import socket
 import sys
 import tempfile
 import traceback
@@ -24,145 +27,9 @@ from ray.exceptions import RayError, RayTaskError, TaskCancelledError
 
 from kissgs._version import __version__
 from kissgs.core.errors import OutputError, RunnerError
+from kissgs.runners import file_transfer
 from kissgs.runners.contract import INTERNAL, LOST, NODE_UNUSABLE, Outcome, WorkItem
-
-# Connection of a process to a Ray cluster that runs, or to one that it starts on this machine.
-
-CONNECT_SECONDS = 5.0
-"""Maximum seconds for a connection to the head's port."""
-
-OBJECT_STORE_BYTES = 80 << 20
-"""Size of the object store of a cluster that is started here: nearly the smallest; nothing is kept there."""
-
-
-class NoCluster(Exception):
-    """The address is "auto", and there is no cluster on this machine."""
-
-
-def connect(address: str) -> None:
-    """Connect this process to a cluster."""
-    given = address if address != "auto" else os.environ.get("RAY_ADDRESS", "")
-    if "://" in given:
-        raise RunnerError(
-            f"{given} is an address for Ray's client; give HOST:PORT of the cluster's head, on a machine of the cluster"
-        )
-    if given:
-        _check_port(given)
-    try:
-        ray.init(address=given or "auto", log_to_driver=False, configure_logging=False)
-    except ConnectionError as error:
-        if given:
-            raise RunnerError(_refused(given, error)) from error
-        raise NoCluster from error
-    except Exception as error:  # among them RuntimeError for another version of Ray or Python
-        raise RunnerError(_refused(given or "of this machine", error)) from error
-
-
-def start_here(folder: str) -> None:
-    """Start a cluster on this machine, with its files in ``folder``, which ends with this process."""
-    try:
-        ray.init(
-            address="local",
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE_BYTES,
-            log_to_driver=False,
-            configure_logging=False,
-            _temp_dir=folder,
-        )
-    except Exception as error:
-        raise RunnerError(f"Ray cannot be started on this machine: {first_line(error)}") from error
-
-
-def _check_port(address: str) -> None:
-    host, colon, port = address.rpartition(":")
-    if not colon or not port.isdecimal():
-        raise RunnerError(f"{address} is no address of a Ray cluster; give HOST:PORT of its head, usually port 6379")
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RunnerError(f"no Ray cluster answers at {address}: {reason}; is its head running there?") from error
-
-
-def _refused(address: str, error: Exception) -> str:
-    return (
-        f"cannot join the Ray cluster {address}: {first_line(error)}; this machine must be one of its nodes "
-        f"(ray start --address={address} --num-cpus=0), and have its token if it has one (RAY_AUTH_MODE=token)"
-    )
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message, for the middle of a sentence."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")[:300]
-
-
-# Files of an item whose folder its node does not see, in blocks that are small beside Ray's object store.
-
-BLOCK_BYTES = 8 << 20
-"""Bytes of a block; the object store of a small cluster has 80 MB."""
-
-CHECKPOINT_SECONDS = 30.0
-"""Seconds between two looks for files that the function has written while it runs."""
-
-Times = dict[str, int]
-"""Times of the last change of files, by their names relative to a folder, ns."""
-
-
-def is_seen(folder: str | None) -> bool:
-    """Return whether this machine can use an item's folder."""
-    return folder is None or (Path(folder).is_dir() and os.access(folder, os.R_OK | os.W_OK | os.X_OK))
-
-
-def blocks_of(path: Path) -> Iterator[bytes]:
-    """Yield the content of a file; of an empty one, one empty block."""
-    with path.open("rb") as file:
-        yield file.read(BLOCK_BYTES)
-        while block := file.read(BLOCK_BYTES):
-            yield block
-
-
-def times_of(folder: Path) -> Times:
-    """Return all files of a folder but hidden ones, which are incomplete."""
-    paths = [path for path in folder.rglob("[!.]*") if path.is_file()]
-    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in paths}
-
-
-def changed(folder: Path, before: Times, *, complete: bool) -> Iterator[dict[str, Any]]:
-    """Yield the blocks of new and changed files as events, and bring ``before`` up to date.
-
-    Files in folders of the folder may be incomplete, and are left out, unless ``complete``. Of each file, the last
-    event has ``last``: only then is it to be seen at its destination.
-    """
-    for name, time in sorted(times_of(folder).items()):
-        if time != before.get(name) and (complete or "/" not in name):
-            offset = 0
-            for block in blocks_of(folder / name):
-                yield {"file": name, "offset": offset, "block": block, "last": False}
-                offset += len(block)
-            yield {"file": name, "offset": offset, "block": b"", "last": True}
-            before[name] = time
-
-
-def receive(folder: Path, event: dict[str, Any]) -> None:
-    """Write a block of an incomplete file, and give that its name once it is complete and on the disk."""
-    path = folder / event["file"]
-    part = path.with_name(f".{path.name}.part")
-    if path.parent != folder and folder.is_dir():
-        path.parent.mkdir(parents=True, exist_ok=True)
-    with part.open("r+b" if event["offset"] else "wb") as file:
-        file.seek(event["offset"])
-        file.write(event["block"])
-        if event["last"]:
-            file.flush()
-            os.fsync(file.fileno())
-    if event["last"]:
-        part.replace(path)
-
-
-# Driver process of :class:`kissgs.runners.ray_runner.RayRunner`: ``python -m kissgs.runners.ray_driver ADDRESS``.
-#
-# Lines of JSON: items to submit and to cancel come from standard input, nodes and events of items go to standard
-# output. When standard input closes, it ends all items and exits.
+from kissgs.runners.ray_connection import NoCluster, connect, first_line, start_here
 
 NODES_SECONDS = 1.0
 """Seconds between two looks at the cluster's nodes."""
@@ -339,7 +206,7 @@ class Driver:
                 if "unseen" in event:
                     return None
                 if "file" in event:
-                    await asyncio.to_thread(receive, Path(item.folder or ""), event)
+                    await asyncio.to_thread(file_transfer.receive, Path(item.folder or ""), event)
                     continue
                 if "outcome" in event:
                     return Outcome(**{**event["outcome"], "node": node})
@@ -364,7 +231,7 @@ class Driver:
 def _stored_files(item: WorkItem) -> dict[str, list[Any]]:
     """Store an item's files as blocks in Ray's object store; return references to them by name."""
     folder = Path(item.folder or "")
-    return {name: [ray.put(block) for block in blocks_of(folder / name)] for name in item.files}
+    return {name: [ray.put(block) for block in file_transfer.blocks_of(folder / name)] for name in item.files}
 
 
 def _unusable_files(error: OSError) -> Outcome:
@@ -387,6 +254,7 @@ def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]
     import ray
 
     from kissgs._version import __version__
+    from kissgs.runners import file_transfer
     from kissgs.runners.contract import Outcome, WorkItem
     from kissgs.runners.process import ItemProcess, temporary_folder
 
@@ -397,7 +265,7 @@ def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]
         return
     item, before, folder = WorkItem.from_dict(values), None, Path()
     with contextlib.ExitStack() as stack:
-        if item.files and not is_seen(item.folder):
+        if item.files and not file_transfer.is_seen(item.folder):
             if files is None:
                 yield {"unseen": True}
                 return
@@ -406,7 +274,7 @@ def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]
                 with (folder / name).open("wb") as file:
                     for block in blocks:
                         file.write(ray.get(block))
-            item, before = replace(item, folder=str(folder)), times_of(folder)
+            item, before = replace(item, folder=str(folder)), file_transfer.times_of(folder)
         yield {"node": node}
         process, looked, outcome = ItemProcess(item), time.monotonic(), None
         try:
@@ -415,13 +283,13 @@ def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]
                     outcome = event
                     break
                 yield {"progress": list(event)}
-                if before is not None and time.monotonic() - looked > CHECKPOINT_SECONDS:
-                    yield from changed(folder, before, complete=False)
+                if before is not None and time.monotonic() - looked > file_transfer.CHECKPOINT_SECONDS:
+                    yield from file_transfer.changed(folder, before, complete=False)
                     looked = time.monotonic()
         finally:
             process.kill()
         if before is not None and outcome is not None:
-            yield from changed(folder, before, complete=outcome.kind == "done")
+            yield from file_transfer.changed(folder, before, complete=outcome.kind == "done")
         if outcome is not None:
             yield {"outcome": asdict(outcome)}
 

@@ -21,8 +21,7 @@ from kissgs.planning.quantize import Quantized, observed_range
 from kissgs.planning.rate_distortion import ColorRefit
 from kissgs.planning.sh_codebook import Codebook
 from kissgs.settings import GOALS, EncodeSettings
-from kissgs.sogxt import container as names
-from kissgs.sogxt import metadata
+from kissgs.sogxt import container, metadata
 
 
 def encode(
@@ -84,8 +83,8 @@ def write_files(
         ),
         crc32={name: pixels_crc32(image) for name, image in images.items()},
     )
-    files = {names.JSON_NAME: layout.to_meta_json(), **files}
-    files = {names.YAML_NAME: layout.to_yaml(), names.SCENE_NAME: metadata.scene_json(files), **files}
+    files = {container.JSON_NAME: layout.to_meta_json(), **files}
+    files = {container.YAML_NAME: layout.to_yaml(), container.SCENE_NAME: metadata.scene_json(files), **files}
     return Encoded.of(plan, files)
 
 

@@ -8,7 +8,7 @@ from kissgs.core.errors import InvalidContainerError
 from kissgs.formats import LEVELS_NAME
 from kissgs.io.containers import Source, ZipSource, stored_size
 from kissgs.io.streamed import Container, StreamedFormat
-from kissgs.sogxt import container as names
+from kissgs.sogxt import container
 from kissgs.sogxt.decode import decode_files
 from kissgs.sogxt.info import ranges_of
 from kissgs.sogxt.metadata import Layout, read_layout
@@ -34,6 +34,6 @@ def _opened(files: Source, name: str) -> Container[Layout]:
     )
 
 
-STREAMED = StreamedFormat("streamed SOG-XT scene", LEVELS_NAME, names.FORMAT, _opened, ranges_of)
+STREAMED = StreamedFormat("streamed SOG-XT scene", LEVELS_NAME, container.FORMAT, _opened, ranges_of)
 
 FORMAT = STREAMED.codec

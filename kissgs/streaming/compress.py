@@ -236,7 +236,7 @@ def _check_settings(settings: Settings) -> None:
 def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, int, int]:
     """Return a function that reads the scene in blocks, the number of its Gaussians, and their SH degree."""
     if recognise(source) == "ply":
-        refuse_level("ply", reading.level)
+        refuse_level("ply", source, reading.level)
         info = read_ply_info(source)
         if not info.compressed:
             origin = None

@@ -20,8 +20,6 @@ from kissgs.io.files import atomic_file, reason_of
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.rasterizer import render
 
-# Partition of a scene into chunks of nearby Gaussians, in two passes over blocks that fit into memory.
-
 # Gaussians as rows of float32 numbers in scratch files, which can be appended to and read back bit by bit.
 
 
@@ -106,8 +104,6 @@ def leaf_groups(
         order[first:last].sort()
     return order.astype(np.int64), edges
 
-
-# Levels of detail of one chunk, how much they differ from its finest, and the far surroundings of the scene.
 
 # ``level_errors``: how much the coarser levels of a leaf differ from its finest, measured in rendered images.
 #

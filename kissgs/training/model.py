@@ -29,8 +29,6 @@ from kissgs.rendering.cpu.backward import Gradients
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.tensors import tensors_of
 
-# ``PrunableAdam``: Adam over named tensors whose rows can be removed during training.
-
 # Numba kernel of Adam: gradients of some rows, of all or both, in one pass over parameters and moments.
 #
 # Kingma and Ba, "Adam: A Method for Stochastic Optimization" (ICLR 2015), algorithm 1, with beta1 = 0.9, beta2 = 0.999

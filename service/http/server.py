@@ -224,4 +224,5 @@ def config_of(app: object) -> uvicorn.Config:
         server_header=False,
         proxy_headers=False,
         timeout_graceful_shutdown=10,
+        timeout_keep_alive=15,  # clients that reuse idle connections for 5 s, as httpx does, must not meet a closed one
     )

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 import kissgs
 from kissgs import CompactSettings
-from kissgs.compaction import merging as covariance_kernels
-from kissgs.compaction import merging as merge_kernels
+from kissgs.compaction import merging
 from kissgs.compaction.budget import Compactor, compact_scene
 from kissgs.compaction.merging import BLUR, CONTRAST, merge_gaussians
 from kissgs.compaction.scene_training import highest_indices
@@ -80,7 +79,7 @@ def test_moments_opacity_and_error_of_a_pair(seed):
     spacing, pixels = np.full(2, 3.0), Pixels()
     blur = BLUR * 3
     weights = np.empty(2)
-    merge_kernels.opacity_areas(packed(full), alphas, spacing, BLUR, 0, 2, weights)
+    merging.opacity_areas(packed(full), alphas, spacing, BLUR, 0, 2, weights)
     areas = [sum(math.sqrt(np.linalg.det(one[np.ix_(rows, rows)] + blur * np.eye(2))) for rows in AXES) for one in full]
     np.testing.assert_allclose(weights, alphas * areas, rtol=1e-12)
     share = weights / weights.sum()
@@ -109,13 +108,13 @@ def test_moments_opacity_and_error_of_a_pair(seed):
     pairs, before = np.array([[0, 1]], np.int32), np.array([0.3, 0.2])
     added = np.empty(1)
     gaussians = means, packed(full), alphas, colors, weights, spacing
-    merge_kernels.pair_errors(*gaussians, before, BLUR, CONTRAST, pairs, 0, 1, added)
+    merging.pair_errors(*gaussians, before, BLUR, CONTRAST, pairs, 0, 1, added)
     assert added[0] == pytest.approx(error + 2 * math.sqrt(error * 0.5), rel=1e-3)
 
     merged, index = merge_gaussians(scene, 1)
     spacing_of_two = np.full(2, ((means[0] - means[1]) ** 2).sum())
     own = np.empty(2)
-    merge_kernels.opacity_areas(packed(full), alphas, spacing_of_two, BLUR, 0, 2, own)
+    merging.opacity_areas(packed(full), alphas, spacing_of_two, BLUR, 0, 2, own)
     assert index.tolist() == [int(np.argmax(own))]
     own /= own.sum()
     np.testing.assert_allclose(merged.means[0], own @ means, rtol=1e-5, atol=1e-6)
@@ -123,7 +122,7 @@ def test_moments_opacity_and_error_of_a_pair(seed):
     np.testing.assert_allclose(merged.shN[0], np.tensordot(own, scene.shN, 1), rtol=1e-5, atol=1e-6)
     spread = sum(s * (c + np.outer(m - own @ means, m - own @ means)) for s, c, m in zip(own, full, means, strict=True))
     np.testing.assert_allclose(covariance(merged)[0], spread, rtol=1e-4, atol=1e-5)
-    merge_kernels.merge(*gaussians, BLUR, pairs, 0, 1)
+    merging.merge(*gaussians, BLUR, pairs, 0, 1)
     assert alphas[0] == pytest.approx(alpha, rel=1e-5)
 
 
@@ -139,10 +138,10 @@ def test_errors_and_opacities_of_needles_far_apart_along_their_own_direction(len
     alphas, colors = np.full(2 * count, 0.9), np.zeros((2 * count, 3), np.float32)
     pairs, added = np.arange(2 * count, dtype=np.int32).reshape(-1, 2), np.empty(count)
     gaussians = means, covariances, alphas, colors, weights, spacing
-    merge_kernels.pair_errors(*gaussians, np.zeros(2 * count), BLUR, CONTRAST, pairs, 0, count, added)
+    merging.pair_errors(*gaussians, np.zeros(2 * count), BLUR, CONTRAST, pairs, 0, count, added)
     assert np.isfinite(added).all()
     assert (added >= 0).all()
-    merge_kernels.merge(*gaussians, BLUR, pairs, 0, count)
+    merging.merge(*gaussians, BLUR, pairs, 0, count)
     assert (alphas[::2] < 0.9).all()  # both together cover little of what the joint Gaussian covers
 
 
@@ -195,10 +194,10 @@ def test_covariances_become_rotations_and_scales_again(seed):
     scene = cloud(20, seed=seed)
     scene = replace(scene, scales=rng.uniform(-4, 4, (20, 3)).astype(np.float32))
     packed_ones = np.empty((20, 6))
-    covariance_kernels.covariances_of(scene.quats, scene.scales, 0, 20, packed_ones)
+    merging.covariances_of(scene.quats, scene.scales, 0, 20, packed_ones)
     np.testing.assert_allclose(matrices(packed_ones), covariance(scene), rtol=1e-6, atol=1e-9)
     quats, scales = np.empty((20, 4), np.float32), np.empty((20, 3), np.float32)
-    covariance_kernels.decompose(packed_ones, np.arange(20), 0, 20, quats, scales)
+    merging.decompose(packed_ones, np.arange(20), 0, 20, quats, scales)
     np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1, rtol=1e-6)
     values = np.linalg.eigvalsh(matrices(packed_ones))
     np.testing.assert_allclose(np.sort(scales, axis=1)[:, 2], 0.5 * np.log(values[:, 2]), atol=1e-4)

@@ -53,14 +53,19 @@ def allocate(arguments, progress):
     return {"bytes": len(bytearray(arguments["bytes"]))}
 
 
+def fail_with(arguments, progress):
+    ballast = bytearray(arguments["bytes"])
+    raise RuntimeError(arguments["message"], len(ballast))
+
+
 def load_kernels(arguments, progress):
     """Load a kernel, and what numba loads for the first one, when only so many bytes are left."""
     import resource
 
     from kissgs.core.numba_kernels import kernels
-    from kissgs.rendering.cpu import sensitivity as coverage
+    from kissgs.rendering.cpu import sensitivity
 
-    assert coverage
+    assert sensitivity
     used = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
     ballast = bytearray(resource.getrlimit(resource.RLIMIT_DATA)[0] - used - arguments["left"])
     kernels[0].load()

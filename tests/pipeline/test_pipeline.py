@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import kissgs
-from kissgs import Cancelled, InvalidContainerError, InvalidSceneError, OutputError, Settings
+from kissgs import Cancelled, InvalidContainerError, InvalidSceneError, KissgsError, OutputError, Settings
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.io.ply import write_ply
 from kissgs.pipeline.scene_files import is_container
@@ -187,6 +187,12 @@ def test_a_folder_of_other_things_is_refused_before_the_work(tmp_path):
     assert events.events == []
 
 
+def test_only_ply_is_decompressed(tmp_path):
+    with pytest.raises(OutputError, match=r"a scene is written as \.ply; use compress to write a container"):
+        kissgs.decompress(b"", tmp_path / "scene.zip")
+    assert names(tmp_path) == []
+
+
 def test_decompressed_numbers_are_exact_whatever_the_name(tmp_path):
     """A container of a.compressed.ply has the name a.compressed.zip, and gives a.compressed.ply back."""
     packed = compress(SCENE).to_zip()
@@ -296,6 +302,23 @@ def test_missing_files(tmp_path, name, kind):
 def test_a_folder_that_is_no_container(tmp_path):
     with pytest.raises(InvalidContainerError, match=r"it has neither container_meta\.yaml nor meta\.json"):
         kissgs.load(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["x" * 300 + ".zip", "nul\0.ply", "nul\0"])
+@pytest.mark.parametrize("act", ["load", "compress", "decompress", "write", "save", "write ply"])
+def test_paths_that_no_file_system_has_are_refused_in_a_sentence(tmp_path, act, name):
+    """Regression: checking whether they exist raised a bare OSError or ValueError."""
+    path = tmp_path / name
+    with pytest.raises(KissgsError):
+        {
+            "load": lambda: kissgs.load(path),
+            "compress": lambda: compress(path),
+            "decompress": lambda: kissgs.decompress(path),
+            "write": lambda: compress(SCENE, path),
+            "save": lambda: kissgs.save(SCENE, path),
+            "write ply": lambda: kissgs.decompress(compress(SCENE).files, path),
+        }[act]()
+    assert names(tmp_path) == []
 
 
 def test_given_sensitivity_is_used():

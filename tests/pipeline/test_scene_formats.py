@@ -143,8 +143,21 @@ def test_a_scene_without_levels_has_no_other_level_than_the_finest(ending, tmp_p
         kissgs.load(scene, level=1)
     with pytest.raises(KissgsError, match="there is no level -1"):
         describe(scene, ReadOptions(level=-1))
+    with pytest.raises(KissgsError, match="no such file"):
+        kissgs.load(tmp_path / f"none{ending}", level=1)
     with pytest.raises(KissgsError, match="there is no level 1"):
         kissgs.compress_streamed(scene, target, reading=ReadOptions(level=1))
+
+
+def test_a_coarse_level_is_evaluated_against_the_scene_that_it_is_of(tmp_path):
+    scene, packed = tmp_path / "scene.ply", tmp_path / "lod.zip"
+    packed.write_bytes(zip_of(next(iter(STREAMED.values()))))
+    kissgs.save(kissgs.load(packed), scene)
+    done = run("evaluate", str(scene), str(packed), "--level", "1", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["mean"]["candidate_vs_reference"]["psnr"] < 60
+    done = run("evaluate", str(scene), str(scene), "--level", "1")
+    assert (done.returncode, b"no levels of detail" in done.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("container", ["sogxt", "sog"])

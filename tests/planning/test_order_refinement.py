@@ -7,8 +7,7 @@ from helpers.random_sensitivity import random_sensitivity
 import kissgs
 from kissgs import Settings
 from kissgs.core.resources import Workers
-from kissgs.planning import kernels as tour_kernels
-from kissgs.planning import planner as order_refinement
+from kissgs.planning import kernels, planner
 from kissgs.planning.layout import hilbert_order
 from kissgs.planning.planner import refined_order
 from kissgs.sogxt.encode import encode
@@ -47,7 +46,7 @@ def test_no_single_move_makes_the_result_better(count):
     pairs = np.array([[cost(pixels, bits, np.array([a, b])) for b in range(count)] for a in range(count)])
     near = np.argsort(pairs + 10**8 * np.eye(count, dtype=int), axis=1, kind="stable").astype(np.int32)[:, : count - 1]
     order = np.arange(count, dtype=np.int32)
-    tour_kernels.improve(pixels, bits, np.ascontiguousarray(near), 1000, order)
+    kernels.improve(pixels, bits, np.ascontiguousarray(near), 1000, order)
     assert sorted(order) == list(range(count))
     assert (order[0], order[-1]) == (0, count - 1)
     best = cost(pixels, bits, order)
@@ -60,7 +59,7 @@ def test_near_pixels_are_those_of_the_fewest_bits_within_reach():
     pixels, bits = rng.integers(0, 256, (60, 3)).astype(np.uint8), symmetric_bits(rng, 3)
     curves = np.stack([rng.permutation(60) for _ in range(2)]).astype(np.int32)
     near = np.empty((60, 5), np.int32)
-    tour_kernels.near_pixels(pixels, bits, curves, 4, near)
+    kernels.near_pixels(pixels, bits, curves, 4, near)
     places = np.argsort(curves, axis=1)
     for n in range(60):
         within = np.flatnonzero((np.abs(places - places[:, n : n + 1]) <= 4).any(axis=0))
@@ -87,8 +86,8 @@ def test_gaussians_stay_in_their_run_and_differences_become_smaller(count):
     np.testing.assert_array_equal(np.sort(order), np.arange(count))
     np.testing.assert_array_equal(runs[order], runs)
     if count > 100:
-        pixels = order_refinement._pixels(means, colors)
-        bits = order_refinement._difference_bits(pixels)
+        pixels = planner._pixels(means, colors)
+        bits = planner._difference_bits(pixels)
         assert cost(pixels, bits, order) < 0.95 * cost(pixels, bits, np.arange(count))
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.codec_scenes import unit
 
-from kissgs.planning import rotation_forms as three
+from kissgs.planning import rotation_forms
 from kissgs.planning.rotation_forms import apply_forms, canonical_forms
 
 
@@ -21,10 +21,10 @@ def quats():
 
 
 def test_decoded_rotations_are_near_and_of_length_one(quats):
-    omitted = three.omitted_components(quats)
-    signed = three.with_sign(quats, omitted)
-    levels = three.lattice_levels(three.stored_components(signed, omitted), 1)
-    found = three.whole(three.TABLE[levels], omitted)
+    omitted = rotation_forms.omitted_components(quats)
+    signed = rotation_forms.with_sign(quats, omitted)
+    levels = rotation_forms.lattice_levels(rotation_forms.stored_components(signed, omitted), 1)
+    found = rotation_forms.whole(rotation_forms.TABLE[levels], omitted)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-12)
     assert np.degrees(angles(found, quats)).max() < 2
     missing = np.take_along_axis(found, omitted[:, None].astype(np.int64), axis=1)
@@ -33,15 +33,15 @@ def test_decoded_rotations_are_near_and_of_length_one(quats):
 
 
 def test_coarse_levels_are_multiples_and_exist(quats):
-    omitted = three.omitted_components(quats)
-    small = three.stored_components(three.with_sign(quats, omitted), omitted)
-    levels = three.lattice_levels(small, np.full(len(quats), 16)).astype(np.int64)
-    assert three.fits(levels).all()
+    omitted = rotation_forms.omitted_components(quats)
+    small = rotation_forms.stored_components(rotation_forms.with_sign(quats, omitted), omitted)
+    levels = rotation_forms.lattice_levels(small, np.full(len(quats), 16)).astype(np.int64)
+    assert rotation_forms.fits(levels).all()
     assert ((levels - 127) % 16 == 0).mean() > 0.9
 
 
 def test_canonical_forms_leave_out_w(quats):
     forms = canonical_forms(quats)
     turned, _ = apply_forms(quats, np.zeros((len(quats), 3), np.float32), forms)
-    assert (three.omitted_components(turned) == 0).all()
+    assert (rotation_forms.omitted_components(turned) == 0).all()
     assert (turned[:, 0] > 0.85).all()

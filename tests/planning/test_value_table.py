@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.planning import quantize as value_table
+from kissgs.planning import quantize
 from kissgs.planning.quantize import fit_table, nearest_levels, refit_table, table_field, without_unused
 
 
@@ -33,8 +33,8 @@ def test_few_points_are_all_kept_whatever_the_distance_between_them():
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.quick(3)
 def test_joined_points_are_nearly_as_good_as_the_best_partition(seed, monkeypatch):
-    monkeypatch.setattr(value_table, "SIZE", 4)
-    monkeypatch.setattr(value_table, "WIDEST", 1.0)
+    monkeypatch.setattr(quantize, "SIZE", 4)
+    monkeypatch.setattr(quantize, "WIDEST", 1.0)
     rng = np.random.default_rng(seed)
     values, weights = np.sort(rng.normal(size=12)), rng.exponential(size=12) + 0.1
     table = fit_table(values, weights, 1e-6)

@@ -233,6 +233,13 @@ def test_a_parameter_changed_before_the_backward_pass_is_an_error():
         images.sum().backward()
 
 
+def test_arrays_of_a_scene_need_not_be_contiguous():
+    splats, view = blobs(40, 2), camera()
+    every_other = splats.select(slice(None, None, 2))
+    image, _ = render(every_other, view)
+    assert np.array_equal(image, render(splats.select(np.arange(0, 40, 2)), view)[0])
+
+
 def test_tensors_need_not_be_contiguous():
     splats, view = blobs(30, 2), camera()
     expected, _, _ = render_tensors(splats, [view])
@@ -310,9 +317,9 @@ def test_read_only_scenes_are_rendered():
 
 
 def test_too_many_gaussians_in_one_tile_are_refused(monkeypatch):
-    from kissgs.rendering.cpu import tiles as lists
+    from kissgs.rendering.cpu import tiles
 
-    monkeypatch.setattr(lists, "MAX_MEMBERS", 10)
+    monkeypatch.setattr(tiles, "MAX_MEMBERS", 10)
     with pytest.raises(UnsupportedError, match="touch the same 16x16 pixels"):
         render(blobs(50), camera())
 
@@ -329,8 +336,8 @@ def test_an_image_that_does_not_fit_into_memory_is_refused(monkeypatch):
 
 
 def test_too_many_pairs_of_gaussians_and_tiles_are_refused(monkeypatch):
-    from kissgs.rendering.cpu import tiles as lists
+    from kissgs.rendering.cpu import tiles
 
-    monkeypatch.setattr(lists, "MAX_PAIRS", 10)
+    monkeypatch.setattr(tiles, "MAX_PAIRS", 10)
     with pytest.raises(KissgsError, match="render a smaller image"):
         render(blobs(50), camera(200, 200))

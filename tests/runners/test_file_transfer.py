@@ -7,8 +7,8 @@ import shutil
 import pytest
 from helpers.running import item, wait_until
 
-from kissgs.runners import ray_driver as file_transfer
-from kissgs.runners.ray_driver import changed, receive, times_of
+from kissgs.runners import file_transfer
+from kissgs.runners.file_transfer import changed, receive, times_of
 
 BLOCK = 10
 

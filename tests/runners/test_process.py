@@ -36,7 +36,27 @@ def test_what_a_crash_is_attributed_to(status, used, output, expected):
     assert process._explain(None, status, io.BytesIO(output.encode())).code == expected
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the memory of a process")
+LIMITED = pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the memory of a process")
+
+
+@LIMITED
+@pytest.mark.parametrize(
+    ("message", "share", "code"),
+    [
+        ("can't start new thread", 0.6, "memory-limit"),
+        ("error return without exception set", 0.6, "memory-limit"),
+        ("libx.so: failed to map segment from shared object", 0.6, "memory-limit"),
+        ("can't start new thread", 0.0, "internal"),
+        ("another error", 0.3, "internal"),
+    ],
+)
+def test_an_error_with_several_reasons_is_a_lack_of_memory_where_most_is_used(message, share, code):
+    work = item("fail_with", message=message, bytes=int(share * 400 * MB), memory_limit=400 * MB)
+    *_, outcome = ItemProcess(work).events()
+    assert outcome.code == code
+
+
+@LIMITED
 @pytest.mark.parametrize("left", [2, 14, 30, 60])
 def test_libraries_that_lack_memory_end_the_work(left):
     """OpenBLAS of scipy, which numba loads, waited forever."""

@@ -12,7 +12,7 @@ from helpers.streamed_scenes import FAST, TARGETS, files_of, small_sizes
 import kissgs
 from kissgs import Settings
 from kissgs.streaming import compress as time_left
-from kissgs.streaming import levels as environment
+from kissgs.streaming import levels
 from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.levels import FEWEST, MOST, Environment
 
@@ -20,7 +20,7 @@ from kissgs.streaming.levels import FEWEST, MOST, Environment
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     small_sizes(monkeypatch, chunk=800, leaf=150, coarsest=500)
-    monkeypatch.setattr(environment, "FEWEST", 100)
+    monkeypatch.setattr(levels, "FEWEST", 100)
 
 
 def directions(count, seed=0):

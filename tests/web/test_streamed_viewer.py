@@ -10,7 +10,7 @@ from helpers.viewers import chromium, opened, psnr, scattered, seen_from
 import kissgs
 from kissgs import Settings
 from kissgs.core.splats import concatenate
-from kissgs.streaming import levels as environment
+from kissgs.streaming import levels
 from kissgs.streaming.compress import compress_streamed
 
 FIRST_IMAGE_BYTES = 1_000_000
@@ -58,7 +58,7 @@ def with_sky(scene):
 @pytest.mark.quick(0)
 def test_the_environment_is_drawn_at_every_level(playcanvas, tmp_path, monkeypatch):
     small_sizes(monkeypatch, chunk=400, leaf=80, coarsest=200)
-    monkeypatch.setattr(environment, "FEWEST", 100)
+    monkeypatch.setattr(levels, "FEWEST", 100)
     viewer, site = playcanvas
     source, url = streamed(with_sky(scattered(1000, 2)), tmp_path, site)
     assert any(path.endswith("environment/meta.json") for path in site.files)

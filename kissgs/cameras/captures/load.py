@@ -39,8 +39,6 @@ from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.rendering.camera import Camera
 
-# COLMAP models: ``cameras`` and ``images``, as ``.bin`` or ``.txt``. Points, rigs and frames are not read.
-
 # Parsers of COLMAP's ``cameras`` and ``images`` files, binary and text, into records.
 
 MAX_NAME_BYTES = 4096

@@ -276,8 +276,6 @@ def _widened(camera: Camera) -> Camera:
     return Camera(camera.viewmat, K, camera.width, camera.height)
 
 
-# Sampled cameras: where photographs might have been taken, close to single Gaussians, anywhere around a scene.
-
 # ``random_poses``: virtual cameras to train or to measure losses with, from where photographs might have been taken.
 #
 # :func:`kissgs.virtual_views` selects a few cameras that are as good as possible. A scene that is trained from such

@@ -15,7 +15,6 @@ from kissgs.core.array_types import Bool, Float32, Int32, Shaped
 from kissgs.core.numba_kernels import compiled
 from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_C0
-from kissgs.rendering.cpu import projection as shading
 from kissgs.rendering.cpu.blending import (
     _FAST,
     Place,
@@ -53,6 +52,7 @@ from kissgs.rendering.cpu.projection import (
     _times,
     _unit,
     _whitened,
+    shade_backward,
 )
 from kissgs.rendering.cpu.records import (
     BLENDED,
@@ -439,7 +439,7 @@ def differentiate(
     def part(first: int, last: int) -> None:
         scene = frame.gaussians, frame.projection
         project_backward(*scene, frame.footprints, slots, v_slots, changed, first, last, indices, gradients, v_colors)
-        shading.shade_backward(*scene, indices, first, last, v_colors, gradients)
+        shade_backward(*scene, indices, first, last, v_colors, gradients)
 
     each_part(part, even(count, pool), pool)
     return Gradients(indices, *gradients)

@@ -14,8 +14,7 @@ from kissgs.core.errors import UnsupportedError
 from kissgs.core.numba_kernels import compiled
 from kissgs.core.resources import Workers
 from kissgs.rendering import constants
-from kissgs.rendering.cpu import projection as projection_kernels
-from kissgs.rendering.cpu import projection as shading
+from kissgs.rendering.cpu.projection import project, shade
 from kissgs.rendering.cpu.records import (
     FOOTPRINTS,
     SLOTS,
@@ -246,8 +245,8 @@ def find_footprints(gaussians: Gaussians, projection: Projection, pool: Workers)
     found = Footprints(np.empty(count, np.int32), np.empty(count, np.float32), np.empty((count, 11), np.float32))
 
     def part(first: int, last: int) -> Part:
-        end = first + projection_kernels.project(gaussians, projection, first, last, found)
-        shading.shade(gaussians, projection, first, end, found)
+        end = first + project(gaussians, projection, first, last, found)
+        shade(gaussians, projection, first, end, found)
         return first, end
 
     return found, each_part(part, even(count, pool), pool)

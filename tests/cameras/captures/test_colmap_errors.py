@@ -10,7 +10,7 @@ from helpers.reference_cameras import PINHOLE, camera_bytes, image_bytes, poses,
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.cameras.captures import load as colmap_records
+from kissgs.cameras.captures import load as loading
 from kissgs.cameras.captures.load import load_views, read_colmap
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 
@@ -124,7 +124,7 @@ def test_text(tmp_path, sentence):
 
 
 def test_lines_beyond_the_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(colmap_records, "MAX_LINE_BYTES", 100)
+    monkeypatch.setattr(loading, "MAX_LINE_BYTES", 100)
     write_text(tmp_path, CAMERAS, IMAGES)
     (tmp_path / "images.txt").write_text("1" * 101)
     assert message(tmp_path) == "images.txt, line 1: longer than the limit of 100 bytes; the file is damaged"

@@ -10,7 +10,7 @@ from helpers.reference_cameras import assert_camera, frames, poses, write_json, 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.cameras.captures import photos as posed_image
+from kissgs.cameras.captures import photos as captures
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.captures.transforms_json import read_transforms
 from kissgs.cameras.photographs import Distortion
@@ -259,7 +259,7 @@ def test_files_that_are_not_json(tmp_path, monkeypatch):
         path.write_bytes(text.encode("utf-8", "surrogateescape"))
         with pytest.raises(InvalidViewsError, match=r"transforms\.json is not JSON: "):
             load_views(path)
-    monkeypatch.setattr(posed_image, "MAX_JSON_BYTES", 10)
+    monkeypatch.setattr(captures, "MAX_JSON_BYTES", 10)
     path.write_text("{          }")
     with pytest.raises(InvalidViewsError, match=r"has 12 bytes; at most 10 are read; is it a camera file\?$"):
         load_views(path)

@@ -8,7 +8,7 @@ from helpers.fewer_cameras import try_fewer
 from helpers.hollow_scenes import box
 
 from kissgs import sample_scene
-from kissgs.cameras import render as orbit_search
+from kissgs.cameras import render as camera_paths
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.render import MIN_SWEEP, Orbit, _longest_run, _with_arc, find_orbit
 from kissgs.core.errors import Cancelled, InvalidViewsError
@@ -23,9 +23,9 @@ FULL = Orbit(target=np.zeros(3), radius=4.0, elevation=0.3, up=UP)
 def use_fewer_thumbnails(patch):
     """Reduce circles and thumbnails, for tests that do not depend on their number."""
     try_fewer(patch)
-    patch.setattr(orbit_search, "RADII", (1.1, 2.0))
-    patch.setattr(orbit_search, "COARSE_STEPS", 12)
-    patch.setattr(orbit_search, "FINE_STEPS", 24)
+    patch.setattr(camera_paths, "RADII", (1.1, 2.0))
+    patch.setattr(camera_paths, "COARSE_STEPS", 12)
+    patch.setattr(camera_paths, "FINE_STEPS", 24)
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def test_the_orbit_of_a_room_stays_inside():
 @pytest.mark.quick(0)
 def test_only_the_photographed_side_is_shown(shared_data, monkeypatch):
     """Behind the fox is a wall, before which the path turns back."""
-    monkeypatch.setattr(orbit_search, "COARSE_STEPS", 12)
+    monkeypatch.setattr(camera_paths, "COARSE_STEPS", 12)
     splats, _ = clean(read_ply(shared_data / "fox" / "point_cloud.ply"))
     orbit = find_orbit(splats)
     assert np.radians(45) < orbit.sweep < np.radians(150)
