@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 COUNT, SIDE = 24, 320
 """Number and side, pixels, of the views without a capture, apart from those drawn over the whole scene."""
 
+KEPT_PIXELS = 2**24
+"""Pixels of all held-out views of a capture up to which the renderings of the original are kept, 0.2 GB."""
+
 
 @dataclass(slots=True, eq=False)
 class SearchEvaluation:
@@ -46,37 +49,30 @@ class SearchEvaluation:
     near what it loses in photographs: for fox 0.7 to 1.5 dB more PSNR to the original, with and without training. Drawn
     cameras find 3 to 4 dB more without training and 0.5 with it, but they see every part of the scene.
 
-    Attributes:
-        original: the original scene, clean.
-        views: the capture, or some of its held-out views; None for no capture.
-        threads: number of threads; 0 means one per processor.
-        seconds: time that the latest comparison took; 0 before the first.
+    ``views`` are the capture, or some of its held-out views.
     """
 
     original: Splats
     views: Views | None
     threads: int = 0
-    seconds: float = field(init=False, default=0.0)
+    seconds: float = field(init=False, default=0.0)  # that the latest comparison took
     _poses: Views | None = field(init=False, default=None)
     _drawn: Views | None = field(init=False, default=None)
     _images: dict[str, Rendering] = field(init=False, default_factory=dict)
     _drawn_images: dict[str, Rendering] = field(init=False, default_factory=dict)
 
     def __call__(self, candidate: Splats, progress: Progress = silent) -> Evaluation:
-        """Evaluate a candidate; reports the stages "cameras", "kernels" and "evaluate".
-
-        Raises:
-            InvalidViewsError: a photograph cannot be read.
-            UnsupportedError: an image would take too much memory.
-        """
+        """Evaluate a candidate; reports the stages "cameras", "kernels" and "evaluate"."""
         started = time.perf_counter()
         found = self._evaluation(candidate, progress)
         self.seconds = time.perf_counter() - started
         return found
 
     def _evaluation(self, candidate: Splats, progress: Progress) -> Evaluation:
-        if self.views is not None:  # whose images are too many to be kept
-            return self._compare(candidate, self.views, None, progress)
+        if self.views is not None:
+            pixels = sum(view.camera.width * view.camera.height for view in self.views.test)
+            images = self._images if pixels <= KEPT_PIXELS else None
+            return self._compare(candidate, self.views, images, progress)
         if self._poses is None or self._drawn is None:
             scene, threads = self.original, self.threads
             poses = random_poses(scene, side=SIDE, count=COUNT, seed=SEARCH_SEED, threads=threads, progress=progress)
@@ -127,25 +123,10 @@ def compact_scene(
     device: Device = "cpu",
     progress: Progress = silent,
 ) -> Compacted:
-    """Reduce the number of Gaussians to the budget of the settings.
+    """Reduce the number of Gaussians to the budget of the settings; no more than that are returned unchanged.
 
-    Args:
-        splats: the scene, clean.
-        settings: settings with a budget; a scene with no more Gaussians than that is returned unchanged.
-        views: a capture: its training views train and score, its held-out views evaluate. By default, virtual views
-            train and score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate,
-            with ``max_psnr_drop`` beside others, see :class:`kissgs.compaction.budget.SearchEvaluation`.
-        evaluate: measure PSNR, SSIM, MS-SSIM and compressed bytes after every step. Ignored with ``max_psnr_drop``.
-        checkpoint: file for the state of the training, see :class:`kissgs.compaction.popspa.Popspa`.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        device: device of the training, see :class:`kissgs.compaction.popspa.Popspa`.
-        progress: receives the stages "cameras" and those of :class:`kissgs.compaction.popspa.Popspa`.
-
-    Raises:
-        InvalidViewsError: a photograph cannot be read.
-        OutputError: ``checkpoint`` belongs to other work, or cannot be written.
-        UnsupportedError: the settings have no budget; torch or a GPU is missing for the training; an image would take
-            too much memory.
+    With a capture, its training views train and score, and its held-out views evaluate. Without one, virtual views
+    train and score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate.
     """
     if not settings.enabled:
         raise UnsupportedError("missing the number of Gaussians to keep: give count, ratio or max_psnr_drop")
@@ -163,7 +144,7 @@ def compact_scene(
     compactor = Compactor.of(splats, settings, views, threads=threads, device=device, progress=progress)
     if settings.max_psnr_drop is None:
         return compactor(count, evaluate=evaluate, checkpoint=checkpoint)
-    return _DropSearch(compactor).run(settings.max_psnr_drop)
+    return _search_drop(compactor, settings.max_psnr_drop)
 
 
 def unchanged(splats: Splats, reason: str) -> Compacted:
@@ -207,17 +188,7 @@ def _merge(
 
 @dataclass(slots=True, eq=False)
 class Compactor:
-    """Compacts one scene to any number of counts; views and training targets are prepared once.
-
-    Attributes:
-        splats: the scene, clean.
-        settings: settings of pruning and training.
-        supervision: views that score and train.
-        threads: number of threads; 0 means one per processor.
-        device: device of the training.
-        progress: receives events, see :func:`compact_scene`.
-        compare: compares a scene with the original one.
-    """
+    """Compacts one scene to any number of counts; views and training targets are prepared once."""
 
     splats: Splats
     settings: CompactSettings
@@ -239,7 +210,7 @@ class Compactor:
         device: Device = "cpu",
         progress: Progress = silent,
     ) -> Compactor:
-        """Choose the views. Arguments and errors are those of :func:`compact_scene`."""
+        """Choose the views."""
         if settings.trains and find_spec("torch") is None:
             raise UnsupportedError(
                 "training needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough); the "
@@ -258,10 +229,7 @@ class Compactor:
         return cls(splats, settings, supervision, threads, device, progress, compare)
 
     def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
-        """Return the scene with exactly ``count`` Gaussians, from 1 to fewer than it has.
-
-        ``evaluate`` and ``checkpoint`` are those of :func:`compact_scene`.
-        """
+        """Return the scene with exactly ``count`` Gaussians, from 1 to fewer than it has."""
         if self.settings.method == "merge":
             return _merge(
                 self.splats, count, self.threads, self.progress, evaluate=evaluate, supervision=self.supervision
@@ -285,59 +253,36 @@ class Compactor:
             progress=self.progress,
         )
 
-    def evaluate(self, splats: Splats) -> Evaluation:
-        """Compare a result with the scene in views that no training used; reports the stage "evaluate"."""
-        return self.compare(splats, as_stage("evaluate", self.progress))
-
     @property
     def note(self) -> str:
         """Note that drops of PSNR are estimates; empty if photographs measure them."""
         return "" if any(view.photo for view in self.supervision.test) else ESTIMATED_DROP
 
 
-class _DropSearch:
-    """Search for the fewest Gaussians whose renderings lose no more PSNR than allowed.
+def _search_drop(compactor: Compactor, allowed: float) -> Compacted:
+    """Return the fewest Gaussians that lose at most ``allowed`` decibels; the unchanged scene if there are none."""
+    total, trials = len(compactor.splats), dict[int, float]()
+    best: Compacted | None = None
 
-    Attributes:
-        compactor: compactor of the scene.
-        trials: drop of PSNR by count, decibels, in the order of the trials.
-        best: the smallest result that loses no more than allowed.
-    """
-
-    def __init__(self, compactor: Compactor) -> None:
-        self.compactor = compactor
-        self.trials: dict[int, float] = {}
-        self.best: Compacted | None = None
-
-    def run(self, allowed: float) -> Compacted:
-        """Return the smallest result that loses at most ``allowed`` decibels; the unchanged scene if there is none."""
-        splats = self.compactor.splats
-        min_log2 = -math.log2(len(splats))
-        try:
-            find_root(
-                lambda log2_share: allowed - self._drop(log2_share, allowed),
-                max(START_LOG2, min_log2),
-                DROP_PER_HALVING,
-                TOLERANCE_DB,
-                (min_log2, MAX_LOG2),
-                GRAIN_LOG2,
-            )
-        except StopSearch:
-            if self.best is None:
-                raise
-        best = self.best or unchanged(splats, f"and every smaller count that was tried loses more than {allowed:g} dB")
-        note = "; ".join(filter(None, [best.report.note, self.compactor.note]))
-        trials = tuple(CountTrial(count, drop) for count, drop in self.trials.items())
-        return replace(best, report=replace(best.report, trials=trials, note=note))
-
-    def _drop(self, log2_share: float, allowed: float) -> float:
-        """Compact to this share of the Gaussians and return the drop of PSNR, decibels."""
-        total = len(self.compactor.splats)
+    def room(log2_share: float) -> float:
+        nonlocal best
         count = min(max(1, round(total * 2**log2_share)), total - 1)
-        if count in self.trials:
-            return self.trials[count]
-        compacted = self.compactor(count)
-        drop = self.trials[count] = drop_of(self.compactor.evaluate(compacted.splats))
-        if drop <= allowed and (self.best is None or count < len(self.best.splats)):
-            self.best = compacted
-        return drop
+        if count not in trials:
+            compacted = compactor(count)
+            evaluation = compactor.compare(compacted.splats, as_stage("evaluate", compactor.progress))
+            trials[count] = drop_of(evaluation)
+            if trials[count] <= allowed and (best is None or count < len(best.splats)):
+                best = compacted
+        return allowed - trials[count]
+
+    least = -math.log2(total)
+    try:
+        find_root(room, max(START_LOG2, least), DROP_PER_HALVING, TOLERANCE_DB, (least, MAX_LOG2), GRAIN_LOG2)
+    except StopSearch:
+        if best is None:
+            raise
+    if best is None:
+        best = unchanged(compactor.splats, f"and every smaller count that was tried loses more than {allowed:g} dB")
+    note = "; ".join(filter(None, [best.report.note, compactor.note]))
+    report = replace(best.report, trials=tuple(CountTrial(count, drop) for count, drop in trials.items()), note=note)
+    return replace(best, report=report)

@@ -287,21 +287,13 @@ With photographs, a third of them saves 42 % of the processor time of a first co
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathPoint:
-    """The scene at one number of Gaussians.
+    """The scene at one number of Gaussians."""
 
-    Attributes:
-        number: number of the point on its path, 0 for the whole scene.
-        splats: the scene there, clean.
-        index: ``(M,)`` index in the whole scene of each of its Gaussians, ascending.
-        trained: whether it was trained.
-        state: state of the training, from which it continues; None if it is not trained, or forgotten.
-    """
-
-    number: int
+    number: int  # on its path, 0 for the whole scene
     splats: Splats
-    index: Int[np.ndarray, " M"]
+    index: Int[np.ndarray, " M"]  # in the whole scene, ascending
     trained: bool = False
-    state: Mapping[str, np.ndarray] | None = None
+    state: Mapping[str, np.ndarray] | None = None  # from which training continues; None if it is forgotten
 
     def __len__(self) -> int:
         return len(self.splats)
@@ -313,18 +305,12 @@ class TrainingPath:
 
     Learning rates stay high along the path. :meth:`compacted` lets them fall from any of its points, which a compaction
     to that number alone would do at its end. So several numbers of Gaussians share one training.
-
-    Attributes:
-        task: scene, settings and views.
-        keep_states: whether every point, not just the last one, can be refined: that takes three times the memory.
-        points: the points so far, the whole scene first.
-        whole: the whole scene without training, also after the first point was trained.
     """
 
     task: Popspa
-    keep_states: bool = True
-    points: list[PathPoint] = field(init=False)
-    whole: PathPoint = field(init=False)
+    keep_states: bool = True  # every point, not just the last one, can be refined: that takes three times the memory
+    points: list[PathPoint] = field(init=False)  # the whole scene first
+    whole: PathPoint = field(init=False)  # without training, also after the first point was trained
     _loaded: TrainingTargets | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
@@ -361,12 +347,9 @@ class TrainingPath:
         return self._add(training, point.number)
 
     def compacted(self, point: PathPoint, *, refine: bool, deadline: Deadline | None = None) -> Compacted:
-        """Return a point as a compacted scene.
+        """Return a point as a compacted scene; ``refine`` completes its training with falling learning rates.
 
-        Args:
-            point: a point of this path.
-            refine: complete its training with falling learning rates; reports the stage "refine".
-            deadline: time until which that shall be done, with as many of the steps as fit in.
+        With a ``deadline``, as many of its steps are made as fit in; reports the stage "refine".
         """
         task, splats = self.task, point.splats
         if refine and task.settings.refine_steps:

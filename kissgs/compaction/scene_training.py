@@ -120,13 +120,7 @@ BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "s
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """Training steps, and the number of Gaussians that the pruning after them leaves.
-
-    Attributes:
-        name: name in progress events and of the steps in the report.
-        steps: number of training steps.
-        count: number of Gaussians left.
-    """
+    """Training steps, and the number of Gaussians that the pruning after them leaves."""
 
     name: Literal["sparsify", "refine"]
     steps: int
@@ -134,13 +128,7 @@ class Phase:
 
 
 def first_pruning_count(settings: CompactSettings, source_count: int, count: int) -> int:
-    """Return the number of Gaussians that the first pruning leaves, before any training.
-
-    Args:
-        settings: settings of compaction.
-        source_count: number of Gaussians of the scene.
-        count: number of Gaussians to keep in the end, from 1 to ``source_count``.
-    """
+    """Return the number of Gaussians that the first pruning leaves, before any training."""
     fraction = settings.initial_prune_fraction if settings.sparsify_steps else 1.0
     return round(source_count * (count / source_count) ** fraction)
 
@@ -149,7 +137,6 @@ def training_phases(settings: CompactSettings, source_count: int, count: int) ->
     """Return all phases of training: one before each further pruning, then refinement; none if nothing is trained.
 
     The prunings are spread evenly over ``sparsify_steps``, and each keeps the same share of the Gaussians.
-    Arguments are those of :func:`first_pruning_count`.
     """
     phases = []
     if settings.sparsify_steps:
@@ -206,18 +193,11 @@ STATUS_ENTRY = "status"
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """Progress of a compaction.
+    """Progress of a compaction."""
 
-    Attributes:
-        phase: number of the current phase of training; the number of phases once all are done.
-        done: number of steps done in this phase.
-        seconds: wall time since the last recorded step, seconds.
-        steps: recorded steps.
-    """
-
-    phase: int
-    done: int
-    seconds: float
+    phase: int  # the number of phases once all are done
+    done: int  # steps of this phase
+    seconds: float  # since the last recorded step
     steps: Sequence[CompactionStep]
 
     def as_state(self) -> State:
@@ -239,19 +219,7 @@ def work_key(
     evaluate: bool,
     device: Device,
 ) -> str:
-    """Return the key of the work's checkpoint: equal only for equal results.
-
-    Args:
-        scenes: the scene and the original scene.
-        count: number of Gaussians to keep.
-        settings: settings of compaction.
-        supervision: all views; their photographs are read.
-        evaluate: whether steps are evaluated; a report without evaluations cannot be completed later.
-        device: device of the training.
-
-    Raises:
-        InvalidViewsError: a photograph cannot be read.
-    """
+    """Return the key of the work's checkpoint, equal only for equal results; ``scenes`` include the original scene."""
     text = f"{__version__} {count} {evaluate} {device} {settings.model_dump_json()} {supervision.background} "
     key = hashlib.sha256(f"{text}{supervision.synthetic} {supervision.synthetic_per_epoch}".encode())
     for view in (*supervision.train, *supervision.score, *supervision.test):
@@ -286,13 +254,7 @@ show what matters, False for virtual views."""
 class SceneTraining:
     """Prunes and trains one scene, step by step.
 
-    Attributes:
-        source: the scene before any pruning, clean.
-        settings: settings of pruning and training.
-        supervision: views that score and train.
-        threads: number of threads; 0 means one per processor. The result does not depend on it.
-        device: device of the training. Scores are always computed on the CPU.
-        index: ``(M,)`` index in ``source`` of each Gaussian that is left, ascending.
+    ``source`` is the scene before any pruning, and ``index`` that in it of each Gaussian that is left, ascending.
     """
 
     source: Splats

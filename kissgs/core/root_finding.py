@@ -18,17 +18,22 @@ MIN_SLOPE_SHARE = 0.15
 
 @dataclass(frozen=True, slots=True)
 class StopRule:
-    """When :func:`find_root` ends without a margin within the tolerance.
+    """How far :func:`find_root` goes, and when it ends without a margin within the tolerance.
 
     Attributes:
         attempts: largest number of evaluations.
-        tries_bound: whether one at the bound is added if several did not meet the goal.
+        tries_bound: whether the bound is tried where long steps make no progress, and if no point met the goal.
         settled: whether the search between a point that meets the goal and the next one that does not can end.
+        most_step: largest distance of an evaluation from known points, except for one at a bound.
+        caution: share of the distance to the nearest point that meets the goal by which the last point is nearer, and
+            the largest such step.
     """
 
     attempts: int = ATTEMPTS
     tries_bound: bool = True
     settled: Callable[[float, float], bool] = lambda inside, outside: False
+    most_step: float = MAX_EXTRAPOLATION
+    caution: tuple[float, float] = (0.0, 0.0)
 
 
 def find_root(
@@ -44,7 +49,7 @@ def find_root(
     """Find where a monotone function is slightly above zero.
 
     False position between points that meet the goal and points that do not; before both exist, Newton steps of at most
-    :data:`MAX_EXTRAPOLATION`, and the bound once these make no progress, so that a goal that is met at the bound is
+    ``most_step``, and the bound once these make no progress, so that a goal that is met at the bound is
     found.
 
     Args:
@@ -72,10 +77,14 @@ def find_root(
             inside is not None and outside is not None and stop.settled(inside, outside)
         ):
             break
-        if (inside is None or outside is None) and _no_progress(known, slope):
+        if stop.tries_bound and (inside is None or outside is None) and _no_progress(known, slope):
             x = bounds[(inside is None) == (slope > 0)]
         else:
-            x = min(max(_rounded(_next(known, slope, tolerance_at(x) / 2), grain), bounds[0]), bounds[1])
+            x = _next(known, slope, tolerance_at(x) / 2, stop.most_step)
+            if len(known) == attempts - 1 and inside is not None:
+                share, most = stop.caution
+                x += min(max(share * (inside - x), -most), most)
+            x = min(max(_rounded(x, grain), bounds[0]), bounds[1])
     bound = bounds[slope > 0]
     if stop.tries_bound and len(known) > 1 and bound not in known and all(found < 0 for found in known.values()):
         known[bound] = margin(bound)
@@ -87,7 +96,7 @@ def _rounded(x: float, grain: float) -> float:
     return round(x / grain) * grain if grain else x
 
 
-def _next(known: dict[float, float], slope: float, aim: float) -> float:
+def _next(known: dict[float, float], slope: float, aim: float, most_step: float) -> float:
     inside, outside = _bracket(known, slope)
     if inside is not None and outside is not None:
         latest = [found >= 0 for found in known.values()][-3:]
@@ -100,7 +109,7 @@ def _next(known: dict[float, float], slope: float, aim: float) -> float:
         measured = (known[last] - known[before[-1]]) / (last - before[-1])
         slope *= min(max(measured / slope, 0.1), 10.0)
     start = last if inside is None else inside
-    return start + min(max((aim - known[start]) / slope, -MAX_EXTRAPOLATION), MAX_EXTRAPOLATION)
+    return start + min(max((aim - known[start]) / slope, -most_step), most_step)
 
 
 def _bracket(known: Mapping[float, float], slope: float) -> tuple[float | None, float | None]:

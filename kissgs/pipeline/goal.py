@@ -1,10 +1,10 @@
-"""``Goal``: what a search for a container is to meet; ``Trial``: a container that it made."""
+"""``Goal``: what a search for a container is to meet; ``Attempt``: a container, with its size and quality."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import ROUND_CEILING, Context
 from typing import TYPE_CHECKING, Any
 
@@ -12,15 +12,25 @@ from kissgs.evaluation.results import MAX_VIEW_PSNR, as_json, drop_of, over_scen
 from kissgs.settings import EncodeSettings
 
 if TYPE_CHECKING:
+    from kissgs.compaction.result import Compacted
     from kissgs.evaluation.results import Evaluation
+    from kissgs.finetuning.result import FinetuneReport
+    from kissgs.planning.encoding_plan import Encoded
 
 
-# ``Trial``: one container that a search for a goal made, with its size and quality.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Container:
+    """A container in memory: its files with the report of the encoder, and how they were made."""
+
+    encoded: Encoded
+    settings: EncodeSettings
+    finetuning: FinetuneReport | None = None
+    compacted: Compacted | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
-    """One container that a search for a goal made.
+class Attempt:
+    """One container, or a scene before any encoding (0 bytes).
 
     Attributes:
         count: Gaussians of the scene that was encoded.
@@ -32,9 +42,10 @@ class Trial:
         drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.results.drop_of`).
         ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.results.ssim_drop_of`); None where that is
             no goal.
-        against: what ``drop`` is a loss against: "photos", or "renderings", from which it is estimated.
         worst: PSNR of the worst view, decibels.
         fifth_percentile: fifth percentile of the views' PSNR, decibels.
+        against: what ``drop`` is a loss against: "photos", or "renderings", from which it is estimated.
+        container: the container itself; None in reports.
     """
 
     count: int
@@ -46,18 +57,29 @@ class Trial:
     worst: float | None = None
     fifth_percentile: float | None = None
     against: str | None = None
+    container: Container | None = field(default=None, repr=False, compare=False)
 
-    def with_evaluation(self, evaluation: Evaluation, *, ssim: bool = False) -> Trial:
+    @property
+    def made(self) -> Container:
+        """The container, of an attempt that has one."""
+        assert self.container is not None  # noqa: S101  attempts in reports are not encoded again
+        return self.container
+
+    @property
+    def trained(self) -> bool:
+        """Whether its levels were fine-tuned."""
+        return self.container is not None and self.container.finetuning is not None
+
+    def with_evaluation(self, evaluation: Evaluation, *, ssim: bool = False) -> Attempt:
         """Return a copy with the figures of an evaluation, also those of SSIM if requested."""
         scene = over_scene(evaluation)
-        worst, fifth = scene.worst.comparison.candidate_vs_reference.psnr, scene.fifth_percentile
         return replace(
             self,
             psnr=psnr_of(evaluation),
             drop=drop_of(evaluation),
             ssim_drop=ssim_drop_of(evaluation) if ssim else None,
-            worst=worst,
-            fifth_percentile=fifth,
+            worst=scene.worst.comparison.candidate_vs_reference.psnr,
+            fifth_percentile=scene.fifth_percentile,
             against=evaluation.against,
         )
 
@@ -78,64 +100,46 @@ class Trial:
         return ", ".join(filter(None, parts))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all fields for JSON: infinity as null, NaN (a failed rendering) as the string ``"NaN"``."""
-        return {name: as_json(value) if isinstance(value, float) else value for name, value in asdict(self).items()}
-
-
-# ``Goal``: what a search for a container is to meet, and how far a container is from it.
-
-HALF_ERROR_DB = 10 * math.log10(2)
-"""Increase of PSNR, decibels, by half of the squared error."""
+        """Return all figures for JSON: infinity as null, NaN (a failed rendering) as the string ``"NaN"``."""
+        values = {name: getattr(self, name) for name in self.__slots__ if name != "container"}
+        return {name: as_json(value) if isinstance(value, float) else value for name, value in values.items()}
 
 
 TRAINED_NEAR, TRAINED_SIZE_NEAR, MOST_NEAR = 4.0, 2.5, 0.4
-"""Factors on the room that stops a search where each container takes a training, the second for a size, and the largest
+"""Factors on the room that ends a search where each container takes a training, the second for a size, and the largest
 such room: with it, three quarters of an allowed drop are used. Another container would save some 7 % of the bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A limit that one setting names.
-
-    Attributes:
-        setting: name of the setting.
-        value: value of the setting: bytes, decibels, or a difference of SSIM.
-        slope: typical change of :meth:`room` per doubling of lambda.
-        near: room that is small enough to stop the search.
-        half: room of a scene that has half of the error allowed; 0 for a size.
-        per_halving: typical change of :meth:`figure` by half as many Gaussians, for a size of its log2; NaN for a PSNR,
-            for which no number is searched with training.
-        quarter_loss: loss expected of a trained container with a quarter of the Gaussians, on the safe side; None for a
-            size or a PSNR.
-    """
+    """A limit that one setting names."""
 
     setting: str
-    value: float
-    slope: float
-    near: float
-    half: float
-    per_halving: float
-    quarter_loss: float | None = None
+    value: float  # bytes, decibels, or a difference of SSIM
+    slope: float  # typical change of the room per doubling of lambda
+    near: float  # room that is small enough to end a search
+    per_halving: float  # typical change of the figure by half as many Gaussians, of a size that of its log2
+    quarter_loss: float | None = None  # loss expected with a quarter of the Gaussians and training, on the safe side
 
-    def figure(self, trial: Trial) -> float | None:
-        """Return what is limited of a trial, in the unit of ``value``; None if it is unknown."""
+    def figure(self, attempt: Attempt) -> float | None:
+        """Return what is limited of an attempt, in the unit of ``value``; None if it is unknown."""
         match self.setting:
             case "target_size":
-                return trial.bytes
+                return attempt.bytes
             case "psnr":
-                return trial.psnr
+                return attempt.psnr
             case "max_psnr_drop":
-                return trial.drop
+                return attempt.drop
             case _:
-                return trial.ssim_drop
+                return attempt.ssim_drop
 
-    def room(self, trial: Trial) -> float:
-        """Return by how much a trial exceeds the limit: at least 0 where it is met.
+    def room(self, attempt: Attempt) -> float:
+        """Return by how much an attempt stays within the limit: at least 0 where it is met.
 
         The unit is log2 of a ratio for sizes and drops, and decibels for a PSNR. Infinite where nothing is lost at all:
         then the distance to the limit is unknown. -∞ where the figure is unknown or not a number.
         """
-        found = self.figure(trial)
+        found = self.figure(attempt)
         if found is None or math.isnan(found):
             return -math.inf
         if self.setting == "psnr":
@@ -146,22 +150,17 @@ class Limit:
         return math.log2(self.value / found) if found < math.inf else -math.inf
 
     def near_enough(self, *, trained: bool) -> float:
-        """Return the room that is small enough to stop a search, more if each container takes a training."""
+        """Return the room that is small enough to end a search, more if each container takes a training."""
         factor = TRAINED_SIZE_NEAR if self.setting == "target_size" else TRAINED_NEAR
         return max(min(factor * self.near, MOST_NEAR), self.near) if trained else self.near
 
-    def halvings(self, trial: Trial) -> float:
-        """Return how often the number of Gaussians could typically be halved to come near the limit; below 0 for more.
-
-        NaN for a PSNR, and where the figure is unknown or not a number.
-        """
-        found = self.figure(trial)
+    def halvings(self, attempt: Attempt) -> float:
+        """Return the room in halvings of the number of Gaussians, which is linear in a loss; NaN where unknown."""
+        found = self.figure(attempt)
         if found is None:
             return math.nan
-        aim = self.value * 2 ** (-self.near / 2)
-        if self.setting == "target_size":
-            return math.log2(aim / found) / self.per_halving
-        return (aim - found) / self.per_halving
+        room = math.log2(self.value / found) if self.setting == "target_size" else self.value - found
+        return room / self.per_halving
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,21 +184,16 @@ class Goal:
         """
         limits, size = list[Limit](), settings.target_size
         if settings.psnr is not None:
-            psnr = settings.psnr
-            limits.append(Limit("psnr", psnr, slope=-1.5, near=0.1, half=HALF_ERROR_DB, per_halving=math.nan))
+            limits.append(Limit("psnr", settings.psnr, slope=-1.5, near=0.1, per_halving=math.nan))
         if settings.max_psnr_drop is not None:
             drop = settings.max_psnr_drop
             near = -math.log2(max(1 - 0.02 / drop, 0.5))
-            limits.append(
-                Limit("max_psnr_drop", drop, slope=-0.5, near=near, half=1.0, per_halving=0.32, quarter_loss=0.1)
-            )
+            limits.append(Limit("max_psnr_drop", drop, slope=-0.5, near=near, per_halving=0.32, quarter_loss=0.1))
         if settings.max_ssim_drop is not None:
             drop, near = settings.max_ssim_drop, -math.log2(0.95)
-            limits.append(
-                Limit("max_ssim_drop", drop, slope=-0.6, near=near, half=1.0, per_halving=0.01, quarter_loss=0.007)
-            )
+            limits.append(Limit("max_ssim_drop", drop, slope=-0.6, near=near, per_halving=0.01, quarter_loss=0.007))
         if not limits and size is not None:
-            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-0.75))
+            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), per_halving=0.75))
             size = None
         return cls(tuple(limits), size)
 
@@ -208,22 +202,21 @@ class Goal:
         """Whether the goal is a size, so that no rendering is needed to evaluate it."""
         return self.limits[0].setting == "target_size"
 
-    def measured(self, trial: Trial, evaluation: Evaluation) -> Trial:
-        """Return a copy of a trial with the figures of its evaluation, those of SSIM only if they decide."""
-        return trial.with_evaluation(evaluation, ssim=self.limits[-1].setting == "max_ssim_drop")
+    def measured(self, attempt: Attempt, evaluation: Evaluation) -> Attempt:
+        """Return a copy of an attempt with the figures of its evaluation, those of SSIM only if they decide."""
+        return attempt.with_evaluation(evaluation, ssim=self.limits[-1].setting == "max_ssim_drop")
 
-    def decisive(self, trial: Trial) -> Limit:
-        """Return the limit to which a trial has the least room."""
-        return min(self.limits, key=lambda limit: limit.room(trial))
+    def decisive(self, attempt: Attempt) -> Limit:
+        """Return the limit to which an attempt has the least room."""
+        return min(self.limits, key=lambda limit: limit.room(attempt))
 
-    def margin(self, trial: Trial) -> float:
-        """Return the room of a trial to the limit that decides (:meth:`Limit.room`): at least 0 where all are met."""
-        return self.decisive(trial).room(trial)
+    def margin(self, attempt: Attempt) -> float:
+        """Return the room to the limit that decides (:meth:`Limit.room`): at least 0 where all are met."""
+        return self.decisive(attempt).room(attempt)
 
-    def leaves_half(self, trial: Trial) -> bool:
-        """Whether a scene that is not encoded leaves half of the allowed error to the encoder."""
-        limit = self.decisive(trial)
-        return limit.room(trial) >= limit.half
+    def halvings(self, attempt: Attempt) -> float:
+        """Return the room to the limit that decides in halvings of the number of Gaussians (:meth:`Limit.halvings`)."""
+        return min(limit.halvings(attempt) for limit in self.limits)
 
     @property
     def allowed_halvings(self) -> float:
@@ -234,27 +227,16 @@ class Goal:
         known = [(limit, limit.quarter_loss) for limit in self.limits if limit.quarter_loss is not None]
         return min(((limit.value - expected) / limit.per_halving for limit, expected in known), default=0.0)
 
-    def failure_message(
-        self, trials: Sequence[Trial], trained: Sequence[Trial] = (), *, suggest_compaction: bool
-    ) -> str:
-        """Return why no trial meets the goal.
-
-        Args:
-            trials: trials of one search for lambda, of which those at the last lambda count.
-            trained: other trials.
-            suggest_compaction: whether fewer Gaussians might meet it, untried so far.
-        """
-        lambdas = [trial.rd_lambda for trial in trials if trial.rd_lambda]
-        extreme = (max if self.by_size else min)(lambdas, default=None)
-        trials = [*(trial for trial in trials if trial.rd_lambda in (None, extreme)), *trained]
+    def failure_message(self, attempts: Sequence[Attempt], *, suggest_compaction: bool) -> str:
+        """Return why no attempt meets the goal; fewer Gaussians may be suggested where none were tried."""
         if self.by_size:
-            smallest, target = min(trial.bytes for trial in trials), int(self.limits[0].value)
+            smallest, target = min(attempt.bytes for attempt in attempts), int(self.limits[0].value)
             return (
                 f"target_size {target:,} byte{'' if target == 1 else 's'} cannot be met: the smallest container found "
                 f"has {smallest:,}; ask for at least that"
                 + (", or for fewer Gaussians: compact with auto_count" * suggest_compaction)
             )
-        finest = max(trials, key=self.margin)
+        finest = max(attempts, key=self.margin)
         missed = {limit: limit.figure(finest) for limit in self.limits if limit.room(finest) < 0}
         first = next(iter(missed))
         if first.setting == "psnr":  # one thing at a time

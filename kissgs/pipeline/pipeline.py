@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,15 +13,15 @@ from kissgs.compaction.result import Compacted
 from kissgs.core.array_types import Int
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Deadline, Progress, SearchNote, as_stage, ignore_stop_search, silent
-from kissgs.core.resources import StageTimer, peak_memory
+from kissgs.core.resources import StageTimer, peak_memory, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import MAX_GAUSSIANS, Splats
+from kissgs.core.splats import MAX_GAUSSIANS, Splats, empty_splats
 from kissgs.formats import ContainerName, named_container
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
-from kissgs.pipeline.training_choice import decided, work_plan
+from kissgs.pipeline.training_choice import choose, decided
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import GOALS, EncodeSettings, Settings
 from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
@@ -30,10 +30,8 @@ from kissgs.training.checkpoint import delete_checkpoints, finetune_checkpoint_p
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
     from kissgs.evaluation.results import Evaluation
-    from kissgs.pipeline.encoding import Encoding
-    from kissgs.pipeline.goal import Trial
-    from kissgs.pipeline.rate_control import RateControl
-    from kissgs.pipeline.search_time import SearchTime
+    from kissgs.pipeline.encoding import Work
+    from kissgs.pipeline.goal import Attempt, Container
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,54 +200,67 @@ def compress(
     Raises:
         KissgsError: one of its subclasses, with a message for the user.
     """
-    from kissgs.pipeline.encoding import Encoding
+    from kissgs.pipeline.encoding import Work, encode, make_tuner, measure
 
-    requested = settings or Settings()
-    settings = decided(requested, views, keep_all=sensitivity is not None)
-    target = Path(destination) if destination is not None else None
-    kind = named_container(container, destination)
-    if target is not None:
-        check_destination(target, overwrite=overwrite, names=FILES)
-    finetune_checkpoint = _check_finetuning(settings, views, checkpoint, device)
+    requested, keep_all = settings or Settings(), sensitivity is not None
+    settings = decided(requested, views, keep_all=keep_all)
+    target, kind = None if destination is None else Path(destination), named_container(container, destination)
+    checkpoint = None if checkpoint is None else Path(checkpoint)
+    _check(settings, views, target, checkpoint, overwrite=overwrite, device=device)
     deadline = None if settings.time_limit is None else Deadline.after(settings.time_limit)
     clock = StageTimer(progress)
+
+    # Read.
     original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
-    source_count, sh_degree = len(original) + cleaned.removed, original.sh_degree
-    keep_all = sensitivity is not None
-    views_note = ""
+    notes, source_count, sh_degree = reading_notes(original), len(original) + cleaned.removed, original.sh_degree
     if evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled:
         views, views_note = _fitting(original, views, force_views, threads, clock)
-    plan = work_plan(requested, views, len(original), deadline, keep_all=keep_all, threads=threads)
-    settings = plan.settings
-    encoding = Encoding(
+        notes.append(views_note)
+    choice = choose(requested, views, len(original), deadline, keep_all=keep_all, threads=threads)
+    settings = choice.settings
+    work = Work(
         splats=original,
         original=original,
         settings=settings,
         sensitivity=sensitivity,
-        cache=Path(cache) if cache is not None else None,
+        cache=None if cache is None else Path(cache),
         views=views,
         cleaned=cleaned,
-        checkpoint=finetune_checkpoint,
-        device=device,
         container=kind,
         packed=target is None or is_packed(target),
+        device=device,
         threads=threads,
         progress=SearchNote(clock),
-        deadline=deadline,
-        disposable=not (evaluate or isinstance(source, Splats)),
+        time=choice.time,
     )
-    notes = reading_notes(original)
     del original
-    compacted, search, trials = _compact_first(encoding, checkpoint, plan.time, aims=requested.aims)
     after_search = ignore_stop_search(clock) if settings.searches else clock
-    if compacted is not None:
-        encoding = replace(encoding, splats=compacted.splats)
-    if not settings.encode.has_goal:
-        encoding = replace(encoding, progress=SearchNote(after_search))
-    result, more = encoding.run(search, trials)
-    encoded = result.encoded
-    container_bytes, file_bytes = stored_sizes(encoded.files, packed=encoding.packed)
-    evaluation = _evaluate(encoding.original, encoded.files, views, threads, after_search) if evaluate else None
+
+    # Compact, plan, tune and write the files: once, or several times towards a goal.
+    compacted = _compact_first(work, checkpoint)
+    finetune_checkpoint = None
+    attempts: tuple[Attempt, ...] = ()
+    if settings.encode.has_goal:
+        from kissgs.pipeline.search import Search
+
+        search = Search(work, requested.aims)
+        best = search.run()
+        made, attempts, compacted = best.made, tuple(search.attempts), compacted or search.compacted(best)
+        finetuning, search_note = search.finetuning(best), search.note(best)
+    else:
+        work.progress, search_note = SearchNote(after_search), ""
+        if settings.finetune.enabled and len(work.splats) > 0:
+            finetune_checkpoint = None if checkpoint is None else finetune_checkpoint_path(checkpoint)
+            scene = measure(work, work.splats, settings.encode)
+            made = encode(work, scene, settings.encode, make_tuner(work), checkpoint=finetune_checkpoint)
+        else:
+            made = _encode_once(work, disposable=not (evaluate or isinstance(source, Splats)))
+        finetuning = made.finetuning
+
+    # Evaluate, store, report.
+    encoded = made.encoded
+    container_bytes, file_bytes = stored_sizes(encoded.files, packed=work.packed)
+    evaluation = _evaluate(work.original, encoded.files, views, threads, after_search) if evaluate else None
     checkpoints = (None if compacted is None else compacted.checkpoint, finetune_checkpoint)
     if target is not None:
         after_search("write", 0.0)
@@ -265,19 +276,19 @@ def compress(
         file_bytes=file_bytes,
         cleaned=cleaned,
         compaction=None if compacted is None else compacted.report,
-        finetuning=result.finetuning,
+        finetuning=finetuning,
         invisible=encoded.invisible,
         pruned_by_rd=encoded.pruned_by_rd,
-        note="; ".join(filter(None, [*notes, views_note, encoded.coarse, encoded.note, result.note, plan.note])),
+        note="; ".join(filter(None, [*notes, encoded.coarse, encoded.note, search_note, choice.note])),
         clipped_colors=encoded.clipped_colors,
         form_error=encoded.form_error,
         max_quantization_error=encoded.errors,
         rd_lambda=encoded.rd_lambda,
-        trials=trials + more,
+        trials=attempts,
         seconds=clock.seconds,
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
-        settings=_settings_as_used(settings, result.settings, requested),
+        settings=_settings_as_used(settings, made.settings, requested),
         evaluation=evaluation,
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
@@ -296,18 +307,64 @@ def _fitting(
     return fitting_views(splats, views, force=force, threads=threads, progress=progress)
 
 
-def _check_finetuning(
-    settings: Settings, views: Views | None, checkpoint: AnyPath | None, device: Device
-) -> Path | None:
-    """Check that fine-tuning is possible if the settings ask for it; return its checkpoint file if it has one."""
+def _check(
+    settings: Settings,
+    views: Views | None,
+    target: Path | None,
+    checkpoint: Path | None,
+    *,
+    overwrite: bool,
+    device: Device,
+) -> None:
+    """Refuse what cannot be done, before any work."""
     from kissgs.pipeline.encoding import check_finetuning
 
+    if target is not None:
+        check_destination(target, overwrite=overwrite, names=FILES)
     if checkpoint is not None and settings.time_limit is not None:
         raise UnsupportedError("no checkpoint is kept with a time limit; leave out one of them")
-    if not settings.finetune.enabled:
+    if settings.finetune.enabled:
+        check_finetuning(settings, views, device)
+
+
+def _compact_first(work: Work, checkpoint: Path | None) -> Compacted | None:
+    """Compact the scene of the work to the budget of its settings, unless a goal chooses the number of Gaussians."""
+    settings = work.settings.compact
+    if not settings.enabled:
         return None
-    check_finetuning(settings, views, device)
-    return None if checkpoint is None or settings.encode.has_goal else finetune_checkpoint_path(Path(checkpoint))
+    from kissgs.compaction.budget import NO_CHECKPOINT, compact_scene, unchanged
+
+    if work.sensitivity is not None:
+        raise UnsupportedError("this sensitivity is of the scene before compaction; compact first, then measure it")
+    if settings.auto_count:
+        if checkpoint is not None:
+            raise UnsupportedError(NO_CHECKPOINT.format("goal"))
+        return unchanged(work.splats, "too few to remove any") if len(work.splats) < 2 else None
+    compacted = compact_scene(
+        work.splats,
+        settings,
+        work.views,
+        checkpoint=checkpoint,
+        threads=work.threads,
+        device=work.device,
+        progress=work.progress,
+    )
+    work.splats = compacted.splats
+    return compacted
+
+
+def _encode_once(work: Work, *, disposable: bool) -> Container:
+    """Plan and write the files; a disposable scene is forgotten in between, so that its memory is free for them."""
+    from kissgs.pipeline.encoding import measure, plan, write
+    from kissgs.pipeline.goal import Container
+
+    settings, compacted = work.settings.encode, len(work.original) - len(work.splats)
+    chosen = plan(work, measure(work, work.splats, settings), settings, work.progress)
+    if disposable:
+        work.splats = work.original = empty_splats(0, 0)
+        work.sensitivity = None
+    return_free_memory()
+    return Container(encoded=write(work, chosen, settings, compacted, work.progress), settings=settings)
 
 
 def _settings_as_used(decided: Settings, used: EncodeSettings, requested: Settings) -> dict[str, Any]:
@@ -323,34 +380,6 @@ def _settings_as_used(decided: Settings, used: EncodeSettings, requested: Settin
         groups["compact"] = decided.compact.model_copy(update={"auto_count": auto_count})
         groups["finetune"] = decided.finetune.model_copy(update={"enabled": tuned})
     return decided.model_copy(update=groups).as_json()
-
-
-class _Common(TypedDict):
-    threads: int
-    device: Device
-    progress: Progress
-
-
-def _compact_first(
-    encoding: Encoding, checkpoint: AnyPath | None, time: SearchTime | None, *, aims: bool
-) -> tuple[Compacted | None, RateControl | None, tuple[Trial, ...]]:
-    """Compact the scene if requested; return the result, the search made with ``auto_count``, and its trials."""
-    splats, settings, path = encoding.splats, encoding.settings.compact, Path(checkpoint) if checkpoint else None
-    if not settings.enabled:
-        return None, None, ()
-    from kissgs.compaction.budget import NO_CHECKPOINT, Compactor, compact_scene, unchanged
-    from kissgs.pipeline.count_search import CountSearch
-
-    if encoding.sensitivity is not None:
-        raise UnsupportedError("this sensitivity is of the scene before compaction; compact first, then measure it")
-    common: _Common = {"threads": encoding.threads, "device": encoding.device, "progress": encoding.progress}
-    if not settings.auto_count:
-        return compact_scene(splats, settings, encoding.views, checkpoint=path, **common), None, ()
-    if path is not None:
-        raise UnsupportedError(NO_CHECKPOINT.format("goal"))
-    if len(splats) < 2:
-        return unchanged(splats, "too few to remove any"), None, ()
-    return CountSearch(encoding, Compactor.of(splats, settings, encoding.views, **common), time, aims).run()
 
 
 def _evaluate(

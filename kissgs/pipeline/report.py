@@ -9,7 +9,7 @@ from kissgs.compaction.result import CompactionReport
 from kissgs.core.splats import Cleaned
 from kissgs.evaluation.results import Evaluation
 from kissgs.finetuning.result import FinetuneReport
-from kissgs.pipeline.goal import Trial
+from kissgs.pipeline.goal import Attempt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +58,7 @@ class Report:
     form_error: float
     max_quantization_error: dict[str, list[float]]
     rd_lambda: float | None
-    trials: tuple[Trial, ...]
+    trials: tuple[Attempt, ...]
     seconds: dict[str, float]
     cpu_seconds: float
     peak_memory: int

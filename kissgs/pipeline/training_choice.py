@@ -1,14 +1,14 @@
-"""The choice of compaction and fine-tuning where the settings leave it open."""
+"""The choice of compaction and fine-tuning where the settings leave it open, and by a limited time."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from kissgs.core.progress import Deadline
-from kissgs.pipeline.search_time import TimePlan, time_plan
-from kissgs.settings import Settings
+from kissgs.pipeline.search_time import CAPTURE_TIME, SearchTime, encode_seconds
+from kissgs.settings import Preset, Settings
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
@@ -18,15 +18,26 @@ NOT_TRAINED = (
     "containers smaller at equal quality, much smaller on photographs"
 )
 
+TOO_LITTLE_TIME = "there was too little time for training"
+
+TRAINING_TIME, TUNING_TIME = 3.5, 5.0
+"""Time from which training on photographs and fine-tuning on renderings of the scene pay, in units of an encoding
+without training."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Settings without anything open, the time for them, and a note of what the user may not expect."""
+
+    settings: Settings
+    time: SearchTime | None = None
+    note: str = ""
+
 
 def decided(settings: Settings, views: Views | None, *, keep_all: bool = False, torch: bool | None = None) -> Settings:
     """Return the settings with what they leave open decided, see :meth:`kissgs.Settings.decided`.
 
-    Args:
-        settings: settings as requested.
-        views: capture of the scene; None for no capture.
-        keep_all: whether all Gaussians stay unless the settings request otherwise.
-        torch: whether to decide as if torch were installed; None for whether it is.
+    ``keep_all`` says that all Gaussians stay unless the settings request otherwise, ``torch`` whether it is installed.
     """
     if keep_all and settings.compact.auto_count is None:
         settings = settings.model_copy(update={"compact": settings.compact.model_copy(update={"auto_count": False})})
@@ -34,27 +45,55 @@ def decided(settings: Settings, views: Views | None, *, keep_all: bool = False, 
     return settings.decided(photographs=photographs, torch=has_torch() if torch is None else torch)
 
 
-def work_plan(
-    settings: Settings, views: Views | None, count: int, deadline: Deadline | None, *, keep_all: bool, threads: int
-) -> TimePlan:
-    """Return what to do; its note says what the user may not expect, also where torch is missing.
+def choose(
+    requested: Settings, views: Views | None, count: int, deadline: Deadline | None, *, keep_all: bool, threads: int
+) -> Choice:
+    """Choose what to do with ``count`` Gaussians until ``deadline``; the note also says where torch is missing."""
+    chosen = {
+        torch: in_time(
+            requested,
+            decided(requested, views, keep_all=keep_all, torch=torch),
+            None if deadline is None else SearchTime(deadline, encode_seconds(requested.preset, count, threads)),
+            count=count,
+            captured=views is not None,
+            torch=torch,
+        )
+        for torch in {has_torch(), True}
+    }
+    found = chosen[has_torch()]
+    if found.settings == chosen[True].settings:
+        return found
+    return Choice(found.settings, found.time, "; ".join(filter(None, [found.note, NOT_TRAINED])))
 
-    Args:
-        settings: settings as requested.
-        views: capture of the scene; None for no capture.
-        count: number of Gaussians.
-        deadline: time until which the container shall be ready; None for no limit.
-        keep_all: see :func:`decided`.
-        threads: number of threads; 0 means one per processor.
+
+def in_time(
+    requested: Settings, settings: Settings, time: SearchTime | None, *, count: int, captured: bool, torch: bool
+) -> Choice:
+    """Return the ``settings`` that were decided as if there were time for everything, changed to fit into the time.
+
+    Training that was not requested is left out where there is too little time for it, and the preset where even a
+    plain encoding takes too long, unless a goal or a setting of the encoder is given. Without a goal and a capture,
+    time that is left goes to fine-tuning on renderings of the scene.
     """
-
-    def plan(torch: bool) -> TimePlan:
-        chosen, captured = decided(settings, views, keep_all=keep_all, torch=torch), views is not None
-        return time_plan(settings, chosen, count, deadline, captured=captured, torch=torch, threads=threads)
-
-    present, best = plan(has_torch()), plan(True)
-    missing = "" if present.settings == best.settings else NOT_TRAINED
-    return replace(present, note="; ".join(filter(None, [present.note, missing])))
+    if time is None:
+        return Choice(settings)
+    plain, left = time.encode_seconds, time.deadline.seconds
+    if left >= TRAINING_TIME * plain and count > 1:
+        tunes = requested.aims and not captured and settings.finetune.enabled is None
+        if tunes and torch and left >= TUNING_TIME * plain:
+            settings = settings.model_copy(update={"finetune": settings.finetune.model_copy(update={"enabled": True})})
+        return Choice(settings, time)
+    trained = settings.compact.auto_count and not requested.compact.auto_count
+    settings = requested.decided(photographs=False, torch=False)
+    note = TOO_LITTLE_TIME if trained and count > 1 else ""
+    if note and not settings.encode.has_goal:
+        note += ", so nothing limits the loss but the preset"
+    usual = Settings.from_preset(settings.preset, seed=settings.encode.seed).encode
+    takes = plain * (CAPTURE_TIME if captured and settings.encode.rate_distortion else 1.0)
+    if left >= takes or settings.preset == Preset.FAST or settings.encode != usual or settings.finetune.enabled:
+        return Choice(settings, time, note)
+    fast = Settings.from_preset(Preset.FAST, time_limit=settings.time_limit, seed=settings.encode.seed)
+    return Choice(fast, time, f"encoded with the preset fast: {settings.preset} would take about {takes:.0f} s")
 
 
 def has_torch() -> bool:

@@ -298,13 +298,13 @@ def test_a_target_size_is_met_if_fine_tuned_containers_are_too_large(monkeypatch
     def sizes(files, *, packed):
         return 900 + 900 * (b"finetune" in files[YAML_NAME]), {}
 
-    monkeypatch.setattr("kissgs.pipeline.rate_control.stored_sizes", sizes)
+    monkeypatch.setattr("kissgs.pipeline.search.stored_sizes", sizes)
     common = {"target_size": 1000, "sensitivity_views": 4, "sensitivity_view_size": 60}
     gentle = Settings.research("balanced", finetune={**SHORT, **GENTLE}, **common)
     found = kissgs.compress(cloud(60), settings=gentle)
     assert b"finetune" not in found.files[YAML_NAME]
     assert not found.report.finetuning.kept
-    assert "as it was without" in found.report.finetuning.note
+    assert "this one is not fine-tuned" in found.report.finetuning.note
 
 
 @pytest.mark.quick(0)

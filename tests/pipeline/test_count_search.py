@@ -121,55 +121,32 @@ def test_max_encodes_limits_the_trials():
     assert len(kissgs.compress(SCENE, settings=chosen).report.trials) <= 2
 
 
-@pytest.mark.parametrize("share", [0.45, 0.8])
 @pytest.mark.quick(0)
-def test_fewer_gaussians_for_a_size(share):
-    """Either all Gaussians do not fit, or fewer have a higher PSNR at that size in the evaluation views."""
+def test_fewer_gaussians_for_a_size_that_all_of_them_miss():
     plain = len(kissgs.compress(SCENE, settings=Settings.research("balanced", **FEW_VIEWS)).to_zip())
-    wanted = int(share * plain)
-    whole = Settings.research("balanced", target_size=wanted, **FEW_VIEWS)
-    found = kissgs.compress(SCENE, settings=settings(target_size=wanted), evaluate=True)
-    assert 0.9 * wanted <= len(found.to_zip()) <= wanted
-    counts = [trial.count for trial in found.report.compaction.trials]
-    assert {trial.count for trial in found.report.trials} <= {*counts, 600}
-    assert found.report.compaction.count in [*counts, 600]
-    if share == 0.45:  # all Gaussians do not fit
-        with pytest.raises(UnsupportedError, match="or for fewer Gaussians: compact with auto_count"):
-            kissgs.compress(SCENE, settings=whole)
-        return
-    all_of_them = kissgs.compress(SCENE, settings=whole, evaluate=True).report.evaluation
-    assert found.report.evaluation.mean.candidate.psnr >= all_of_them.mean.candidate.psnr - 1e-6
+    wanted = int(0.45 * plain)
+    with pytest.raises(UnsupportedError, match="or for fewer Gaussians: compact with auto_count"):
+        kissgs.compress(SCENE, settings=Settings.research("balanced", target_size=wanted, **FEW_VIEWS))
+    found = kissgs.compress(SCENE, settings=settings(target_size=wanted))
+    assert 0.85 * wanted <= len(found.to_zip()) <= wanted
+    assert found.report.compaction.count < 600
+    assert found.report.compaction.count in {trial.count for trial in found.report.trials}
+
+
+@pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.4}, {"psnr": 35.0}])
+@pytest.mark.quick(0)
+def test_without_training_all_gaussians_stay_for_a_quality(goal):
+    found = kissgs.compress(SCENE, settings=settings(**goal))
+    assert found.report.compacted == 0
+    assert "a smaller number would serve the goal less" in found.report.compaction.note
+    alone = kissgs.compress(SCENE, settings=Settings.research("balanced", **FEW_VIEWS, **goal))
+    assert [trial.bytes for trial in found.report.trials] == [trial.bytes for trial in alone.report.trials]
 
 
 def test_all_gaussians_stay_if_they_fit():
     found = kissgs.compress(SCENE, settings=settings(target_size="1MB"))
     assert found.report.compacted == 0
     assert "all of them fit into the target size" in found.report.compaction.note
-
-
-@pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.4}, {"psnr": 35.0}, {"max_ssim_drop": 0.02}])
-@pytest.mark.quick(0)
-def test_pruning_for_a_quality(goal):
-    """Without photographs nothing is trained, and pruning leaves the encoder half of the error."""
-    found = kissgs.compress(SCENE, settings=settings(**goal), evaluate=True)
-    made = [trial for trial in found.report.trials if trial.bytes == len(found.to_zip())]
-    met = {
-        "max_psnr_drop": lambda trial: trial.drop <= 0.4,
-        "psnr": lambda trial: trial.psnr >= 35,
-        "max_ssim_drop": lambda trial: trial.ssim_drop <= 0.02,
-    }
-    nearly = {
-        "max_psnr_drop": lambda evaluation: drop_of(evaluation) <= 0.8,
-        "psnr": lambda evaluation: evaluation.mean.candidate.psnr >= 33,
-        "max_ssim_drop": lambda evaluation: evaluation.mean.candidate.ssim >= 0.96,
-    }
-    (name,) = goal
-    assert any(map(met[name], made))
-    assert nearly[name](found.report.evaluation)  # from other cameras
-    tried = found.report.compaction.trials
-    assert tried
-    assert {(trial.ssim_decides, trial.ssim_drop is not None) for trial in tried} == {(name == "max_ssim_drop",) * 2}
-    assert [trial.count for trial in tried] == [round(600 * 0.8**n) for n in range(1, len(tried) + 1)]
 
 
 def test_a_count_is_reported_by_the_loss_that_decides():

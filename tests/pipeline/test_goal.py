@@ -7,8 +7,8 @@ import pytest
 
 from kissgs import Settings
 from kissgs.core.root_finding import find_root
-from kissgs.pipeline.goal import Goal, Trial
-from kissgs.pipeline.rate_control import LOG2_LAMBDA_RANGE
+from kissgs.pipeline.curves import LOG2_LAMBDA_RANGE
+from kissgs.pipeline.goal import Attempt, Goal
 
 
 def goal_of(**limits):
@@ -16,13 +16,13 @@ def goal_of(**limits):
 
 
 def test_infinity_and_nan_in_json():
-    trial = Trial(1, 1e-9, 10, psnr=math.inf, drop=-math.inf, worst=math.nan).as_dict()
+    trial = Attempt(1, 1e-9, 10, psnr=math.inf, drop=-math.inf, worst=math.nan).as_dict()
     assert (trial["psnr"], trial["drop"], trial["worst"], trial["bytes"]) == (None, None, "NaN", 10)
 
 
 def test_an_infinite_drop_meets_no_goal():
     goal = goal_of(max_psnr_drop=1.0)
-    assert goal.margin(Trial(1, 1e-9, 10, drop=math.inf)) == -math.inf
+    assert goal.margin(Attempt(1, 1e-9, 10, drop=math.inf)) == -math.inf
 
 
 @pytest.mark.parametrize(
@@ -31,13 +31,13 @@ def test_an_infinite_drop_meets_no_goal():
 )
 def test_of_two_drops_both_must_hold(drop, ssim_drop, met):
     goal = goal_of(max_psnr_drop=0.1, max_ssim_drop=0.003)
-    assert (goal.margin(Trial(1, 1e-9, 10, drop=drop, ssim_drop=ssim_drop)) >= 0) == met
+    assert (goal.margin(Attempt(1, 1e-9, 10, drop=drop, ssim_drop=ssim_drop)) >= 0) == met
 
 
 @pytest.mark.parametrize("drops", [(math.nan, 0.001), (0.05, math.nan), (math.nan, math.nan)])
 def test_a_failed_rendering_meets_no_drop(drops):
     goal = goal_of(max_psnr_drop=0.1, max_ssim_drop=0.003)
-    assert not goal.margin(Trial(1, 1e-9, 10, drop=drops[0], ssim_drop=drops[1])) >= 0
+    assert not goal.margin(Attempt(1, 1e-9, 10, drop=drops[0], ssim_drop=drops[1])) >= 0
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_a_failed_rendering_meets_no_drop(drops):
 def test_near_the_limit_that_decides_is_near_enough(drop, ssim_drop, near):
     """Near is 0.02 dB of a drop of PSNR, and 5 % of a drop of SSIM."""
     goal = goal_of(max_psnr_drop=0.1, max_ssim_drop=0.003)
-    trial = Trial(1, 1e-9, 10, drop=drop, ssim_drop=ssim_drop)
+    trial = Attempt(1, 1e-9, 10, drop=drop, ssim_drop=ssim_drop)
     assert goal.margin(trial) == pytest.approx(math.log2(min(0.1 / drop, 0.003 / ssim_drop)))
     assert (0 <= goal.margin(trial) <= goal.decisive(trial).near) == near
 
@@ -55,7 +55,7 @@ def test_near_the_limit_that_decides_is_near_enough(drop, ssim_drop, near):
 def model_trial(x, growth, ssim_growth):
     """Return a trial at lambda 2^x whose drops grow exponentially with x."""
     drop, ssim_drop = 0.45 * 2 ** (growth * (x + 34)), 0.0074 * 2 ** (ssim_growth * (x + 34))
-    return Trial(1, 2.0**x, 10, drop=drop, ssim_drop=ssim_drop)
+    return Attempt(1, 2.0**x, 10, drop=drop, ssim_drop=ssim_drop)
 
 
 def searched(goal, growth, ssim_growth, start):
@@ -129,11 +129,11 @@ def test_two_limits_take_few_more_encodings_than_the_tighter_one(growth, ssim_gr
 )
 def test_the_message_names_the_limits_that_are_missed(limits, found, message):
     """Losses are rounded up, so that the one that is named can be met."""
-    assert goal_of(**limits).failure_message([Trial(1, 1e-9, 10, **found)], suggest_compaction=False) == message
+    assert goal_of(**limits).failure_message([Attempt(1, 1e-9, 10, **found)], suggest_compaction=False) == message
 
 
 def test_the_loss_that_is_named_can_be_met():
-    trial = Trial(1, 1e-9, 10, drop=0.03, ssim_drop=0.0029999999)
+    trial = Attempt(1, 1e-9, 10, drop=0.03, ssim_drop=0.0029999999)
     message = goal_of(max_psnr_drop=0.001, max_ssim_drop=0.001).failure_message([trial], suggest_compaction=False)
     psnr, ssim = re.search("loses (.*) dB and (.*) of SSIM", message).groups()
     assert (psnr, ssim) == ("0.03", "0.003")
@@ -142,15 +142,15 @@ def test_the_loss_that_is_named_can_be_met():
 
 def test_nothing_lost_is_an_unknown_distance():
     goal = Goal.of(Settings.from_preset("balanced", max_ssim_drop=0.1).encode)
-    assert goal.margin(Trial(1, 1e-9, 10, ssim_drop=0.0)) == math.inf
+    assert goal.margin(Attempt(1, 1e-9, 10, ssim_drop=0.0)) == math.inf
 
 
 def test_a_trial_names_the_loss_of_ssim_where_it_is_a_goal():
-    trial = Trial(1, 1e-9, 812_000, psnr=41.2, drop=0.12, worst=35.1)
+    trial = Attempt(1, 1e-9, 812_000, psnr=41.2, drop=0.12, worst=35.1)
     assert trial.summary() == "812 kB at 41.20 dB, drop 0.120 dB, worst view 35.1 dB"
-    text = Trial(1, 1e-9, 812_000, psnr=41.2, drop=0.12, ssim_drop=0.00291, worst=35.1).summary()
+    text = Attempt(1, 1e-9, 812_000, psnr=41.2, drop=0.12, ssim_drop=0.00291, worst=35.1).summary()
     assert text == "812 kB at 41.20 dB, drop 0.120 dB, SSIM drop 0.00291, worst view 35.1 dB"
-    assert "SSIM drop 2.35e-05" in Trial(1, 1e-9, 812_000, ssim_drop=0.000023456).summary()
+    assert "SSIM drop 2.35e-05" in Attempt(1, 1e-9, 812_000, ssim_drop=0.000023456).summary()
 
 
 @pytest.mark.parametrize(

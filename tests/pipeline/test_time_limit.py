@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +13,8 @@ from kissgs import Settings, UnsupportedError
 from kissgs.compaction.budget import SearchEvaluation
 from kissgs.core.progress import Deadline
 from kissgs.pipeline import search_time as machine_speed
-from kissgs.pipeline.search_time import MEETING, SearchTime, encode_seconds, save_speed, time_plan
-from kissgs.pipeline.trained_search import TrainedScenes
+from kissgs.pipeline.search_time import MEETING, SearchTime, encode_seconds, save_speed
+from kissgs.pipeline.training_choice import in_time
 from kissgs.settings import Preset
 from kissgs.training.supervision import SupervisionViews
 
@@ -30,8 +29,8 @@ def no_saved_speed(monkeypatch, tmp_path):
 def plan_of(seconds, count=100_000, *, photographs=True, **changes):
     requested = Settings.research(changes.pop("preset", "balanced"), time_limit=seconds, **changes)
     decided = requested.decided(photographs=photographs or None, torch=True)
-    facts = {"captured": photographs, "torch": True, "threads": 2}
-    return time_plan(requested, decided, count, Deadline.after(seconds), **facts)
+    time = SearchTime(Deadline.after(seconds), encode_seconds(decided.preset, count, 2))
+    return in_time(requested, decided, time, count=count, captured=photographs, torch=True)
 
 
 def trains(plan):
@@ -99,28 +98,6 @@ def test_the_shares_of_a_search_fill_its_time():
     assert time.for_point(3, 2).seconds < time.for_container(2).seconds
 
 
-@pytest.mark.parametrize(("containers", "point"), [(1, 200), (2, 200), (3, 1000 / 7)])
-def test_a_point_has_half_of_the_time_of_a_container_and_a_quarter_before_the_last_one(containers, point):
-    """1,000 s for one point and so many containers, of which encoding takes no time."""
-    time = SearchTime(Deadline.after(1000), 0.0)
-    assert time.for_point(1, containers).seconds == pytest.approx(point, abs=1)
-
-
-@pytest.mark.parametrize(("goal", "expected"), [({"max_psnr_drop": 0.1}, 970), ({"target_size": 10_000}, 1000)])
-def test_fine_tuning_leaves_the_time_that_an_evaluation_took(goal, expected):
-    scenes = TrainedScenes(
-        encoding=SimpleNamespace(settings=Settings(encode=goal)),
-        compactor=SimpleNamespace(compare=SimpleNamespace(seconds=30.0)),
-        path=None,
-        pruned_only=0,
-        offset_db=0.0,
-        time=SearchTime(Deadline.after(1000), 10.0),
-        containers=1,
-    )
-    scenes._scenes[3] = scenes._tuner = SimpleNamespace()
-    assert scenes.scene(3, math.inf).deadline.seconds == pytest.approx(expected, abs=1)
-
-
 @pytest.mark.quick(0)
 def test_a_search_evaluates_in_at_most_16_held_out_photographs(tmp_path, monkeypatch):
     seen, compare = [], SearchEvaluation._compare
@@ -175,7 +152,7 @@ def test_scoring_takes_a_share_of_the_time():
 @pytest.mark.quick(0)
 def test_time_alone_trains_and_keeps_the_closest_container(tmp_path, monkeypatch):
     """The photographs are the scene's own renderings, so that nothing can be lost without missing the aim."""
-    monkeypatch.setattr("kissgs.pipeline.count_search.RECOVERABLE_DB", math.inf)
+    monkeypatch.setattr("kissgs.pipeline.search.RECOVERABLE_DB", math.inf)
     scene = cloud(200)
     views = photographs(scene, tmp_path, brightness=1.0)
     requested = with_photographs().model_copy(update={"time_limit": LONG})
@@ -196,7 +173,7 @@ def test_a_scene_that_training_does_not_recover_is_encoded_whole(tmp_path, monke
     """Photographs that are the scene's own renderings lose without limit; with much time, fewer Gaussians follow."""
     scene = cloud(200)
     views = photographs(scene, tmp_path, brightness=1.0)
-    monkeypatch.setattr("kissgs.pipeline.search_time.encode_seconds", lambda *found: LONG / units)
+    monkeypatch.setattr("kissgs.pipeline.training_choice.encode_seconds", lambda *found: LONG / units)
     requested = with_photographs().model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     counts = [trial.count for trial in found.report.trials]
@@ -205,7 +182,7 @@ def test_a_scene_that_training_does_not_recover_is_encoded_whole(tmp_path, monke
     (kept,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
     assert kept == min(trial.drop for trial in found.report.trials)
     if not fewer:
-        assert "training a smaller number did not recover" in found.report.compaction.note
+        assert "no smaller number of Gaussians that was tried" in found.report.compaction.note
         assert found.report.finetuning is None  # which would have to recover more
 
 
@@ -238,8 +215,8 @@ def test_ctrl_c_while_all_gaussians_are_encoded_keeps_them(tmp_path, monkeypatch
 def test_an_aim_is_sought_only_while_there_is_time(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path, brightness=1.0)
-    monkeypatch.setattr("kissgs.pipeline.search_time.encode_seconds", lambda *found: LONG / 12.0)
-    monkeypatch.setattr(SearchTime, "over_for_encoding", True)
+    monkeypatch.setattr("kissgs.pipeline.training_choice.encode_seconds", lambda *found: LONG / 12.0)
+    monkeypatch.setattr(SearchTime, "expected", lambda *given, **named: math.inf)
     requested = with_photographs().model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     assert [trial.count for trial in found.report.trials] == [200]
@@ -249,8 +226,8 @@ def test_an_aim_is_sought_only_while_there_is_time(tmp_path, monkeypatch):
 def test_a_goal_that_training_does_not_recover_is_met_by_the_encoder(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
-    monkeypatch.setattr("kissgs.pipeline.count_search.RECOVERABLE_DB", -math.inf)
-    monkeypatch.setattr("kissgs.pipeline.search_time.encode_seconds", lambda *found: LONG / 12.0)
+    monkeypatch.setattr("kissgs.pipeline.search.RECOVERABLE_DB", -math.inf)
+    monkeypatch.setattr("kissgs.pipeline.training_choice.encode_seconds", lambda *found: LONG / 12.0)
     requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     assert found.report.trials[0].count == 200
@@ -272,7 +249,7 @@ def test_much_time_makes_twice_the_usual_steps_on_renderings():
 def test_little_time_makes_one_container_with_few_steps(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
-    monkeypatch.setattr("kissgs.pipeline.search_time.encode_seconds", lambda *found: 1.5)
+    monkeypatch.setattr("kissgs.pipeline.training_choice.encode_seconds", lambda *found: 1.5)
     settings = with_photographs({"steps": 10_000}).model_copy(update={"time_limit": 9.0})
     found = kissgs.compress(scene, settings=settings, views=views)
     assert len(found.report.trials) == 1
@@ -295,7 +272,7 @@ class StopIn:
 
 
 def test_a_stopped_search_for_an_aim_keeps_the_closest_container(tmp_path, monkeypatch):
-    monkeypatch.setattr("kissgs.pipeline.count_search.RECOVERABLE_DB", math.inf)
+    monkeypatch.setattr("kissgs.pipeline.search.RECOVERABLE_DB", math.inf)
     scene, receiver = cloud(150), StopIn()
     views = photographs(scene, tmp_path, brightness=1.0)
     requested = with_photographs().model_copy(update={"time_limit": LONG})
@@ -318,7 +295,7 @@ def test_the_reported_settings_are_valid(tmp_path):
 def test_a_short_search_prunes_no_further_than_it_trains(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
-    monkeypatch.setattr("kissgs.pipeline.search_time.encode_seconds", lambda *found: 1e-3)
+    monkeypatch.setattr("kissgs.pipeline.training_choice.encode_seconds", lambda *found: 1e-3)
     monkeypatch.setattr(SearchTime, "plan", lambda self, photographs, aims: MEETING[0][1])
     requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)

@@ -1,40 +1,43 @@
 """Oracle: models of size and quality as functions of the number of Gaussians and of lambda, whose optimum is known."""
 
 import math
+from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from kissgs.pipeline.goal import Goal, Trial
+from kissgs.pipeline.curves import LOG2_LAMBDA_RANGE, LambdaCurve, NoFurtherError, along_path, first_point
+from kissgs.pipeline.goal import Attempt, Goal
+from kissgs.pipeline.search import NEAR_HALVINGS
 from kissgs.pipeline.search_time import AIMING, MEETING, SearchPlan
-from kissgs.pipeline.trained_search import first_position, search_positions
 from kissgs.settings import EncodeSettings
 
-PER_HALVING = 3.0
+PER_HALVING = math.log(2) / math.log(1.25)
 START = -33.0
 PLAN = SearchPlan(3)
 DOUBLING_DB = 3.0103
 
 
-def search(goal, figures, first=6, bounds=(1, 40), attempts=3):
-    """Return the trials of a search whose containers have ``figures(number, log2_lambda)``."""
-    trials, positions = [], []
+def search(goal, figures, first=6, last=40, attempts=3):
+    """Return the attempts of a search whose containers have ``figures(number, log2_lambda)``, and their points."""
+    made, points = [], []
 
-    def encode(position):
-        x = START if position.log2_lambda is None else position.log2_lambda
-        positions.append((position.number, x))
-        trials.append(Trial(count=1, rd_lambda=2.0**x, **figures(position.number, x)))
-        return SimpleNamespace(trials=trials, stopped=False)
+    def encode(number, log2_lambda):
+        x = START if log2_lambda is None else log2_lambda
+        points.append((number, x))
+        made.append(Attempt(count=1, rd_lambda=2.0**x, **figures(number, x)))
+        return made[-1]
 
-    search_positions(Goal.of(EncodeSettings(**goal)), encode, first, bounds, PER_HALVING, attempts)
-    return trials, positions
+    with suppress(NoFurtherError):
+        along_path(Goal.of(EncodeSettings(**goal)), encode, first, last, attempts, NEAR_HALVINGS)
+    return made, points
 
 
 def model(number, x, per_halving=0.3, per_doubling=0.1, at_start=0.1, power=1.0):
     """Return a drop that grows with fewer Gaussians and a larger lambda, and a size that falls."""
-    halvings = number / PER_HALVING - 2
+    halvings = (number - 6) / PER_HALVING
     drop = at_start + per_halving * abs(halvings) ** power * math.copysign(1, halvings) + per_doubling * (x - START)
     return {"bytes": round(200_000 * 2 ** (-halvings - 0.25 * (x - START))), "drop": drop}
 
@@ -73,7 +76,7 @@ def test_a_size_is_met_in_three_containers(target, per_gaussian, per_halving, pe
     """Sizes at equal lambda grow with powers of 0.5 (fox) to 0.7 (guitar) of the number of Gaussians."""
 
     def figures(number, x):
-        halvings = number / PER_HALVING - 2
+        halvings = (number - 6) / PER_HALVING
         return {"bytes": round(target * per_gaussian * 2 ** (-per_halving * halvings - per_doubling * (x - START)))}
 
     trials, _ = search({"target_size": target}, figures)
@@ -82,7 +85,7 @@ def test_a_size_is_met_in_three_containers(target, per_gaussian, per_halving, pe
 
 def fox(number, x):
     """Return figures like those of fox: losses grow the faster, the coarser and the fewer its Gaussians are already."""
-    halvings, doublings = number / PER_HALVING - 2, x - START
+    halvings, doublings = (number - 6) / PER_HALVING, x - START
     drop = 0.03 + 0.3 * halvings + 0.1 * doublings + 0.05 * (halvings + doublings / 2.5) ** 2
     return {"bytes": round(240_000 * 2 ** (-0.5 * halvings - 0.25 * doublings + 0.02 * doublings**2)), "drop": drop}
 
@@ -93,13 +96,13 @@ def smallest(drop):
     return min(figures["bytes"] for figures in grid if figures["drop"] <= drop)
 
 
-def first(plan=PLAN, number_for_size=0, **goal):
+def first(**goal):
     """Return the point of the first container, and its log2 of lambda beyond that of point 6 at the plan's quality.
 
     At equal quality, lambda grows by half a doubling from point to point.
     """
-    number, offset_db = first_position(Goal.of(EncodeSettings(**goal)), plan, 80_000, number_for_size, PER_HALVING)
-    return number, (number - 6) / 2 + (plan.offset_db - offset_db) / DOUBLING_DB
+    number, offset_db = first_point(Goal.of(EncodeSettings(**goal)), PLAN.number, PLAN.offset_db, may_step=True)
+    return number, (number - 6) / 2 + (PLAN.offset_db - offset_db) / DOUBLING_DB
 
 
 @pytest.mark.parametrize("drop", [0.1, 0.2, 0.3, 0.5, 0.8])
@@ -119,7 +122,8 @@ def test_three_containers_come_near_the_smallest_one_of_a_drop(drop, better):
 @pytest.mark.parametrize("size", [220_000, 160_000, 110_000])
 @pytest.mark.parametrize("larger", [0.8, 1.0, 1.3])
 def test_three_containers_come_near_the_smallest_loss_of_a_size(size, larger):
-    number, doublings = first(number_for_size=6 + round(PER_HALVING * math.log2(240_000 / size)), target_size=size)
+    number = 6 + round(PER_HALVING * math.log2(240_000 / size))
+    doublings = (number - 6) / 2
 
     def figures(number, x):
         found = fox(number, x + doublings)
@@ -156,17 +160,11 @@ def test_the_first_container_is_never_far_from_that_of_the_plan():
     assert first(max_psnr_drop=20.0)[0] == 10
 
 
-@pytest.mark.parametrize("plan", [plan for plans in (MEETING, AIMING) for _, plan in plans if plan.containers == 1])
+@pytest.mark.parametrize("plan", [plan for plans in (MEETING, AIMING) for _, plan in plans])
 @pytest.mark.parametrize("drop", [0.1, 0.5, 20.0])
 def test_a_single_container_keeps_its_reserve(plan, drop):
     goal = Goal.of(EncodeSettings(max_psnr_drop=drop))
-    assert first_position(goal, plan, 80_000, 0, PER_HALVING) == (plan.number, plan.offset_db)
-
-
-def test_a_small_scene_begins_as_the_plan_says():
-    goal = Goal.of(EncodeSettings(max_psnr_drop=0.8))
-    assert first_position(goal, PLAN, 9_999, 0, PER_HALVING) == (PLAN.number, PLAN.offset_db)
-    assert first_position(goal, PLAN, 10_000, 0, PER_HALVING)[0] > PLAN.number
+    assert first_point(goal, plan.number, plan.offset_db, may_step=False) == (plan.number, plan.offset_db)
 
 
 def test_a_container_above_the_size_that_a_loss_may_take_does_not_end_the_search():
@@ -192,24 +190,24 @@ def test_a_near_container_ends_the_search():
     assert positions == [(6, START)]
 
 
-@pytest.mark.parametrize(("left", "trials"), [(0.08, 1), (0.12, 2), (0.2, 2)])
-def test_a_container_ends_the_search_if_a_tenth_of_a_halving_or_less_is_left(left, trials):
-    """The aim is a loss of 0.19 dB, and a halving typically loses 0.32 dB."""
-    made, _ = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=0.19 - 0.32 * left))
+@pytest.mark.parametrize(("left", "trials"), [(0.12, 1), (0.14, 2), (0.2, 2)])
+def test_a_container_ends_the_search_if_an_eighth_of_a_halving_or_less_is_left(left, trials):
+    """A halving typically loses 0.32 dB."""
+    made, _ = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=0.2 - 0.32 * left))
     assert len(made) == trials
 
 
 def test_a_step_changes_number_and_lambda():
-    """1.06 halvings: 1.9 points, rounded to 2, and 0.99 doublings of lambda."""
+    """1.03 halvings: 1.9 points, rounded to 2, and 0.96 doublings of lambda."""
     _, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=-0.15))
-    assert positions[1] == (8, pytest.approx(START + 0.988, abs=0.001))
+    assert positions[1] == (8, pytest.approx(START + 0.962, abs=0.001))
 
 
 def test_the_limit_with_the_fewest_halvings_left_decides():
     """Both losses are below 0 at first; only SSIM then comes near its limit."""
 
     def figures(number, x):
-        halvings = number / PER_HALVING - 2 + 0.4 * (x - START)
+        halvings = (number - 6) / PER_HALVING + 0.4 * (x - START)
         return {"bytes": 9 - number, "drop": -0.5 + 0.01 * halvings, "ssim_drop": -0.001 + 0.01 * halvings}
 
     trials, positions = search({"max_psnr_drop": 0.2, "max_ssim_drop": 0.003}, figures)
@@ -221,7 +219,7 @@ def test_the_last_container_is_cautious_where_the_one_that_met_the_goal_is_far()
     """A drop that grows a little faster than expected, with a hundredth of a decibel of chance."""
 
     def figures(number, x):
-        halvings = number / PER_HALVING - 2 + 0.4 * (x - START)
+        halvings = (number - 6) / PER_HALVING + 0.4 * (x - START)
         chance = 0.012 * math.sin(40 * halvings)
         return {"bytes": round(200_000 * 2**-halvings), "drop": 0.058 + 0.36 * halvings + chance}
 
@@ -236,19 +234,45 @@ def test_lambda_stays_in_its_range():
     assert max(x for _, x in positions) <= -6
 
 
-def test_positions_without_effect_end_the_search():
-    trials, _ = search({"max_psnr_drop": 0.2}, lambda number, x: {"bytes": 9, "drop": -3.0}, attempts=9)
-    assert len(trials) == 2
-
-
-def test_bounds_are_kept_and_lambda_goes_beyond_them():
-    trials, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=1.0), bounds=(5, 7))
-    assert {number for number, _ in positions} == {6, 5}
-    assert positions[-1][1] < START - 1
-    assert trials[-1].drop < trials[0].drop
+def test_a_bound_is_kept_and_lambda_goes_beyond_it():
+    trials, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=-1.0), last=7)
+    assert {number for number, _ in positions} == {6, 7}
+    assert positions[-1][1] > START + 1
+    assert trials[-1].drop > trials[0].drop
 
 
 @pytest.mark.parametrize("figures", [{"bytes": 9, "drop": math.nan}, {"bytes": 9, "drop": math.inf}])
 def test_unknown_figures_end_the_search(figures):
     trials, _ = search({"max_psnr_drop": 0.2}, lambda number, x: figures)
     assert len(trials) == 1
+
+
+def lambda_search(target, entry_bytes=40, most=7):
+    """Return the attempts of a search for a size; the codebook has up to 4,000 entries and sides of multiples of 8."""
+    made = []
+
+    def encode(settings):
+        x = START if settings.rd_lambda is None else math.log2(settings.rd_lambda)
+        wanted = 4000 / settings.gaussians_per_codebook_entry * 2 ** (-0.3 * max(x - START, -3))
+        side = min(8 * math.ceil(math.sqrt(wanted) / 8), math.isqrt(settings.sh_codebook_size))
+        size = round(60_000 * 2 ** (-0.2 * max(x - START, -12))) + entry_bytes * side**2
+        container = SimpleNamespace(encoded=SimpleNamespace(codebook_side=side))
+        made.append(Attempt(1, 2.0**x, size, container=container))
+        return made[-1]
+
+    settings = EncodeSettings(target_size=target)
+    LambdaCurve(Goal.of(settings), encode, settings, most, sh_degree=3).search()
+    return made
+
+
+@pytest.mark.parametrize("target", [62_000, 84_000, 90_000, 99_000, 110_000, 140_000, 200_000])
+def test_a_size_is_met_by_lambda_also_between_two_sides_of_the_codebook(target):
+    made = lambda_search(target)
+    assert max(attempt.bytes for attempt in made if attempt.bytes <= target) > 0.95 * target
+    assert len(made) <= 8
+
+
+def test_the_finest_container_with_the_largest_codebook_is_tried_second_for_a_size_far_above():
+    made = lambda_search(10**7)
+    assert [math.log2(attempt.rd_lambda) for attempt in made] == [START, LOG2_LAMBDA_RANGE[0]]
+    assert made[1].made.encoded.codebook_side > made[0].made.encoded.codebook_side

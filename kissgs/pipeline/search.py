@@ -1,0 +1,623 @@
+"""``Search``: makes containers with fewer Gaussians and other values of lambda, until one meets a goal closely."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kissgs.compaction.budget import Compactor, SearchEvaluation, unchanged
+from kissgs.compaction.result import Compacted, CountTrial
+from kissgs.core.errors import StopSearch, UnsupportedError
+from kissgs.core.progress import SearchNote, as_stage, ignore_stop_search
+from kissgs.core.splats import MAX_GAUSSIANS, Splats
+from kissgs.evaluation.results import ESTIMATED_DROP, drop_of
+from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline.curves import (
+    KEEP,
+    LOG2_LAMBDA_RANGE,
+    SMALL_SCENE,
+    LambdaCurve,
+    NoFurtherError,
+    along_path,
+    at_lambda,
+    codebook_limited,
+    count_at,
+    first_point,
+    last_number,
+)
+from kissgs.pipeline.encoding import Measured, Work, encode, make_tuner, measure
+from kissgs.pipeline.goal import Attempt, Container, Goal
+from kissgs.pipeline.scene_files import read_scene
+from kissgs.pipeline.search_time import SearchPlan
+from kissgs.pipeline.training_choice import has_photographs
+from kissgs.settings import EncodeSettings
+from kissgs.sogxt.container import stored_sizes
+
+if TYPE_CHECKING:
+    from kissgs.compaction.popspa import PathPoint, TrainingPath
+    from kissgs.evaluation.results import Evaluation
+    from kissgs.finetuning.result import FinetuneReport
+    from kissgs.finetuning.tune import Tuner
+
+MAX_OFFSET_DB = 30.0
+"""Largest value of the setting ``quality_offset_db``."""
+
+TUNED_CONTAINERS, ENCODES = 3, 6
+"""Largest number of containers of all Gaussians that are fine-tuned, and of those without training before others that
+are trained."""
+
+COMPLETING = {"steps": 1.2, "lr": 2.5, "codebook_lr": 2.0}
+"""Factors on settings of fine-tuning that completes the training of the path too.
+
+A refinement of the scene before its encoding would take more steps for the same quality.
+"""
+
+PRUNABLE_POINTS, PRUNABLE_DROP = 3, 1.0
+"""Last point that is pruned without training where there are photographs, half of the Gaussians, unless one before it
+loses more than so many decibels."""
+
+RENDERED_POINTS = 5
+"""Last point that is pruned without training where renderings of the scene are the targets, from which training along
+the path departs."""
+
+RECOVERABLE_DB = 1.5
+"""Loss of PSNR at the end of a short training path, decibels beyond the one that is allowed, from which fine-tuning
+is not expected to recover (docs/method/research-log.md, "Large scenes in a limited time")."""
+
+BYTES_PER_GAUSSIAN, BYTES_OF_SH, OVERHEAD_BYTES = 8.6, 4.0, 4000
+"""Bytes of a trained container per Gaussian that are expected at first, those of view-dependent colour in addition, and
+those that are no images."""
+
+SIZE_BY_COUNT = 0.6
+"""Exponent of the number of Gaussians to which the size of a container grows at equal lambda."""
+
+NEAR_HALVINGS, NEAR_IN_TIME = 0.13, 0.06
+"""Room, halvings, below which a container that meets the goal ends the search: another one would save some 4 % of its
+bytes, or 1 %, which is worth a time that the user has given."""
+
+UNKNOWN_DROP = 1e6
+"""Larger than any finite drop of PSNR, decibels."""
+
+NOT_FINETUNED = "no fine-tuned container meets the goal better: this one is not fine-tuned"
+
+BEYOND_PHOTOGRAPHS = (
+    "trained for what the photographs show: beyond them it changes more (--evaluate measures how much; --compact 100% "
+    "--finetune 0 keeps it)"
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """All Gaussians, or those at a point of the path, ready to be encoded with any lambda."""
+
+    measured: Measured
+    settings: EncodeSettings
+    compacted: Compacted | None = None  # None for all Gaussians
+    trained: bool = False  # by fine-tuning that completes its training
+
+    def __len__(self) -> int:
+        return len(self.measured.splats)
+
+
+@dataclass(slots=True, eq=False)
+class Search:
+    """A search for the container that serves the goal of the settings best.
+
+    Attributes:
+        work: what all encodings share.
+        aims: whether the goal is no more than an aim: if no container meets it in time, the closest one is kept.
+        goal: the goal.
+        compare: compares a decoded container with the original scene.
+        plan: number of trained containers, and the first of them.
+        compactor: compactor of the scene if fewer Gaussians may serve the goal; None to keep all of them.
+        path: its training path.
+        attempts: all attempts, in order, without their containers.
+        tried: scenes that were evaluated before any encoding.
+        best: the attempt that serves the goal best; None if none meets it.
+        closest: of those that miss it, the one with the least distance to it.
+        stopped: whether the search was stopped from outside (:class:`kissgs.StopSearch`).
+    """
+
+    work: Work
+    aims: bool = False
+    compactor: Compactor | None = field(init=False, default=None)
+    goal: Goal = field(init=False)
+    compare: SearchEvaluation = field(init=False)
+    plan: SearchPlan = field(init=False)
+    path: TrainingPath | None = field(init=False, default=None)
+    attempts: list[Attempt] = field(init=False, default_factory=list)
+    tried: list[CountTrial] = field(init=False, default_factory=list)
+    best: Attempt | None = field(init=False, default=None)
+    closest: Attempt | None = field(init=False, default=None)
+    stopped: bool = field(init=False, default=False)
+    _pruned: list[Attempt] = field(init=False, default_factory=list)  # losses at points 1, 2 and so on
+    _whole: Scene | None = field(init=False, default=None)
+    _whole_searched: bool = field(init=False, default=False)
+    _trained: dict[int, Scene] = field(init=False, default_factory=dict)
+    _tuner: Tuner | None = field(init=False, default=None)
+    _finetuning: FinetuneReport | None = field(init=False, default=None)  # of the latest attempt that has one
+    _best_scene: Scene | None = field(init=False, default=None)
+    _best_loss: float | None = field(init=False, default=None)
+    _longest: float = field(init=False, default=0.0)  # attempt without training, seconds
+
+    def __post_init__(self) -> None:
+        work, compact = self.work, self.work.settings.compact
+        self.goal = Goal.of(self.encode_settings)
+        if not compact.auto_count or len(work.splats) < 2:
+            self.plan = SearchPlan(TUNED_CONTAINERS)
+            self.compare = SearchEvaluation(work.original, work.views, work.threads)
+            return
+        self.compactor = Compactor.of(
+            work.splats, compact, work.views, threads=work.threads, device=work.device, progress=work.progress
+        )
+        self.plan = SearchPlan(compact.max_compactions)
+        if work.time is not None and self.trains:
+            in_time = work.time.plan(photographs=self.photographs, aims=self.aims)
+            self.plan = replace(in_time, containers=min(self.plan.containers, in_time.containers))
+        if work.time is not None and self.photographs:
+            most = work.time.scoring_views(max(self.first[0], 1))
+            self.compactor = replace(self.compactor, supervision=self.compactor.supervision.with_scoring(most))
+        self.compare = self.compactor.compare
+        self.path = self.compactor.path(keep_states=not self.tunes)
+
+    @property
+    def encode_settings(self) -> EncodeSettings:
+        """Settings of the encoder, with the goal."""
+        return self.work.settings.encode
+
+    @property
+    def tunes(self) -> bool:
+        """Whether the settings ask for fine-tuning."""
+        return bool(self.work.settings.finetune.enabled)
+
+    @property
+    def photographs(self) -> bool:
+        """Whether to train on photographs; never for a PSNR to the scene's own renderings, which then falls."""
+        trains = self.compactor is not None and self.compactor.settings.trains
+        return trains and self.encode_settings.psnr is None and has_photographs(self.work.views)
+
+    @property
+    def trains(self) -> bool:
+        """Whether fewer Gaussians are trained, on renderings only through the decoder."""
+        bare = self.work.views is None and self.encode_settings.psnr is None
+        return self.photographs or (bare and self.tunes)
+
+    @property
+    def target_size(self) -> int:
+        """The size that is the goal, bytes; 0 if none is."""
+        return int(self.goal.limits[0].value) if self.goal.by_size else 0
+
+    @property
+    def number_for_size(self) -> int:
+        """Number of the point whose container is expected to have that size; 0: all Gaussians fit, or no size."""
+        splats = self.work.splats
+        if not self.target_size:
+            return 0
+        expected = (BYTES_PER_GAUSSIAN + BYTES_OF_SH * (splats.sh_degree > 0)) * len(splats)
+        share = max((self.target_size - OVERHEAD_BYTES) / expected, 1 / len(splats))
+        return max(0, round(math.log(share) / math.log(KEEP)))
+
+    @property
+    def first(self) -> tuple[int, float]:
+        """Point of the first trained container, and decibels added to ``quality_offset_db`` there."""
+        if self.goal.by_size:
+            return self.number_for_size, self.plan.offset_db
+        may_step = self.plan.containers > 1 and len(self.work.splats) >= SMALL_SCENE
+        number, offset_db = first_point(self.goal, self.plan.number, self.plan.offset_db, may_step=may_step)
+        return min(number, last_number(len(self.work.splats))), offset_db
+
+    @property
+    def whole(self) -> Scene:
+        """The scene with all its Gaussians, whose sensitivity is measured once."""
+        if self._whole is None:
+            settings = self.encode_settings
+            self._whole = Scene(measure(self.work, self.work.splats, settings), settings)
+        return self._whole
+
+    def run(self) -> Attempt:
+        """Search, and return the best attempt.
+
+        Raises:
+            StopSearch: the search was stopped before any container met the goal.
+            UnsupportedError: no container meets the goal.
+        """
+        try:
+            if self.path is None:
+                self._search_all_gaussians()
+            elif self.photographs:
+                self._search_with_photographs(self.path)
+            else:
+                self._search_without_photographs(self.path)
+        except StopSearch:
+            self.stopped = True
+            found = self.best or (self.closest if self.aims else None)
+            if found is None and self.path is not None:
+                self._encode_latest(self.path)
+                found = self.best or (self.closest if self.aims else None)
+            if found is None:
+                raise
+        finally:
+            self.work.progress.note = ""
+        if self.best is None and self.aims:
+            self.best = self.closest
+        if self.best is None or self.best.bytes > (self.goal.most_bytes or math.inf):
+            raise UnsupportedError(self._failure())
+        return self.best
+
+    # The searches: all Gaussians, fewer of them trained on photographs, and fewer without photographs.
+
+    def _search_all_gaussians(self, *, tunes: bool = True, most: int | None = None) -> None:
+        """Search for the lambda of all Gaussians, then for that of fine-tuned containers if the settings say so."""
+        if not self._whole_searched:
+            self._along_lambda(self.whole, most=most or self.encode_settings.max_encodes)
+            self._whole_searched = True
+        if tunes:
+            self._fine_tune()
+
+    def _fine_tune(self) -> None:
+        """Fine-tune containers of the scene of the best one, or of all Gaussians."""
+        whole = len(self.work.splats)
+        start = self.best or next(attempt for attempt in reversed(self.attempts) if attempt.count == whole)
+        if not self.tunes or start.trained or start.rd_lambda is None:
+            return
+        scene = self._best_scene or self.whole
+        if self.best is not None:  # with its codebook
+            scene = replace(scene, settings=self.best.made.settings)
+        most = min(TUNED_CONTAINERS, self.encode_settings.max_encodes)
+        self._along_lambda(scene, start.rd_lambda, tuner=make_tuner(self.work), most=most)
+
+    def _search_with_photographs(self, path: TrainingPath) -> None:
+        """Train along the path, and encode where a container should meet the goal."""
+        limited, (first, _) = self.work.time, self.first
+        if self.goal.by_size and (self.target_size <= OVERHEAD_BYTES or first == 0):
+            self._search_all_gaussians()
+            return
+        if limited is None:
+            self._prune_while(path, is_prunable, PRUNABLE_POINTS)
+        else:  # what each point loses is not worth the time to measure it
+            self._prune_to(path, min(first - 1, PRUNABLE_POINTS))
+        if limited is not None and not self._recovers(path):
+            self._search_all_gaussians(tunes=False)
+            left = limited.plan(photographs=True, aims=self.aims).containers
+            self.plan = replace(self.plan, containers=min(self.plan.containers, left))
+        if not self._whole_searched or self.plan.containers > 1:
+            self._along_path(path, first)
+        if self.best is None and not self.aims:
+            self._search_all_gaussians()
+
+    def _recovers(self, path: TrainingPath) -> bool:
+        """Train up to the first point, and return whether fine-tuning can be expected to recover what is still lost.
+
+        The larger and the more detailed a scene is, the less is recovered in a time.
+        """
+        allowed = self.encode_settings.max_psnr_drop
+        if allowed is None:  # PSNR does not tell what becomes of other goals
+            return True
+        point = self._train_to(path, self.first[0])
+        return (self._try_unencoded(point.splats).drop or 0.0) <= RECOVERABLE_DB + allowed
+
+    def _search_without_photographs(self, path: TrainingPath) -> None:
+        """Encode all Gaussians, then as few of them, trained on renderings, as pruning alone serves the goal with.
+
+        Only a size that all of them miss takes fewer without training, which loses more than it saves. A scene whose
+        Gaussians are all needed keeps them.
+        """
+        trains, most = self.trains and self.plan.containers > 0, self.encode_settings.max_encodes
+        self._search_all_gaussians(tunes=False, most=min(ENCODES, most) if trains else most)
+        whole, fits = self.best, self.goal.by_size and self.attempts[0].bytes <= self.target_size
+        if whole is None and self.target_size > OVERHEAD_BYTES:
+            self._along_path(path, self.number_for_size)
+        elif whole is not None and trains and not fits:
+            allowed = self._loss(whole.made) if self.goal.by_size else math.inf
+
+            def serves(scene: Attempt) -> bool:
+                return (scene.drop or 0.0) <= allowed if self.goal.by_size else self.goal.margin(scene) >= 0
+
+            self._prune_while(path, serves, min(RENDERED_POINTS, self.number_for_size or RENDERED_POINTS))
+            number = max((n for n, scene in enumerate(self._pruned, 1) if serves(scene)), default=0)
+            if number:
+                scene = self._scene_at(path, number)
+                rd_lambda = self._lambda_for_size(number) if self.goal.by_size else whole.rd_lambda
+                self._along_lambda(scene, rd_lambda, tuner=self._tuner, most=self.plan.containers)
+        self._fine_tune()
+
+    def _lambda_for_size(self, number: int) -> float:
+        """Return the lambda at which a point should have the target size, by containers of all Gaussians."""
+        wanted = self.target_size / KEEP ** (SIZE_BY_COUNT * number)
+        made = sorted((attempt.bytes, attempt.rd_lambda) for attempt in self.attempts if attempt.rd_lambda is not None)
+        sizes, lambdas = np.log2([size for size, _ in made]), np.log2([rd_lambda for _, rd_lambda in made])
+        return float(2.0 ** np.interp(math.log2(wanted), sizes, lambdas))
+
+    def _encode_latest(self, path: TrainingPath) -> None:
+        """Encode the latest point of the path without further training, or all Gaussians, where a search was stopped.
+
+        A trained point that leaves less than half of the error to the encoder is left out, as most do that are still
+        to be fine-tuned.
+        """
+        work, latest, self.stopped = self.work, path.points[-1], False
+        self.work = replace(work, progress=SearchNote(ignore_stop_search(work.progress)))
+        serves = self.goal.by_size
+        if not serves and latest.trained:
+            evaluation = self.compare(latest.splats, as_stage("evaluate", self.work.progress))
+            serves = self.goal.margin(self.goal.measured(Attempt(len(latest), None, 0), evaluation)) >= 1.0  # half
+        if serves:
+            self._along_lambda(self._untrained(path, latest), most=self.encode_settings.max_encodes)
+        if self.best is None and not self.goal.by_size:
+            self._search_all_gaussians(tunes=False)
+        self.stopped = True
+
+    # Points of the path.
+
+    def _prune_to(self, path: TrainingPath, number: int) -> None:
+        while len(path.points) <= number:
+            path.prune(count_at(len(path.points), len(path.whole)))
+
+    def _prune_while(self, path: TrainingPath, useful: Callable[[Attempt], bool], most: int) -> None:
+        """Prune and evaluate point after point up to number ``most``, or to the first that is not ``useful``."""
+        while len(path.points) <= most and len(path.points[-1]) > 1:
+            if self.stopped:
+                raise StopSearch
+            self._prune_to(path, len(path.points))
+            self._pruned.append(self._try_unencoded(path.points[-1].splats))
+            if not useful(self._pruned[-1]):
+                break
+
+    def _try_unencoded(self, splats: Splats) -> Attempt:
+        """Return the figures of a scene that is not encoded, and record them for the report."""
+        evaluation = self.compare(splats, as_stage("evaluate", self.work.progress))
+        found = self.goal.measured(Attempt(len(splats), None, 0), evaluation)
+        ssim_decides = self.goal.decisive(found).setting == "max_ssim_drop"
+        self.tried.append(CountTrial(len(splats), drop_of(evaluation), found.ssim_drop, ssim_decides))
+        return found
+
+    def _train_to(self, path: TrainingPath, number: int) -> PathPoint:
+        """Prune and train up to a point of the path, and return it."""
+        pruned_only = RENDERED_POINTS if self.trains and not self.photographs else 0
+        while len(path.points) <= number:
+            trains = len(path.points) > pruned_only
+            if trains and not path.points[-1].trained:
+                self._train(path, number)
+            self._prune_to(path, len(path.points))
+            if trains:
+                self._train(path, number)
+        return path.points[number]
+
+    def _train(self, path: TrainingPath, number: int) -> None:
+        """Train the last point of the path, on the way to point ``number``."""
+        limited, points = self.work.time, number + 2 - len(path.points)
+        path.train(None if limited is None else limited.for_point(points, self._containers_left))
+
+    def _untrained(self, path: TrainingPath, point: PathPoint) -> Scene:
+        """Return a point as a scene whose levels are not trained."""
+        if point is path.whole:
+            return self.whole
+        compacted, settings = path.compacted(point, refine=False), self.encode_settings
+        return Scene(measure(self.work, compacted.splats, settings), settings, compacted)
+
+    def _scene_at(self, path: TrainingPath, number: int) -> Scene:
+        """Return the scene at a point of the path, trained, and with a tuner if the settings ask for fine-tuning."""
+        if number not in self._trained:
+            limited, deadline, point = self.work.time, None, self._train_to(path, number)
+            if limited is not None:
+                deadline = limited.for_container(self._containers_left)
+                deadline = deadline.earlier(limited.encode_seconds + self._evaluation_seconds)
+            compacted = path.compacted(point, refine=not self.tunes, deadline=deadline)
+            changes: dict[str, float] = {"color_refit_iterations": 0} if self.tunes else {}  # training replaces it
+            if self.photographs:
+                offset_db = self.encode_settings.quality_offset_db + self.first[1]
+                changes["quality_offset_db"] = min(offset_db, MAX_OFFSET_DB)
+            settings = self.encode_settings.model_copy(update=changes)
+            if self.tunes and self._tuner is None:
+                self._tuner = self._completing_tuner(path)
+            scene = Scene(measure(self.work, compacted.splats, settings), settings, compacted, trained=self.tunes)
+            self._trained[number] = scene
+        if self._tuner is not None and self.work.time is not None:
+            share = self.work.time.for_container(self._containers_left)
+            self._tuner.deadline = share.earlier(self._evaluation_seconds)
+        return self._trained[number]
+
+    def _completing_tuner(self, path: TrainingPath) -> Tuner:
+        """Return what fine-tunes containers of the path, and so completes its training."""
+        finetune, compactor = self.work.settings.finetune, path.task
+        changes = {name: factor * getattr(finetune, name) for name, factor in COMPLETING.items()}
+        changes["steps"] = max(1, round(changes["steps"]))
+        prepared = (compactor.supervision, path.targets) if compactor.settings.trains else None
+        tuner = make_tuner(self.work, finetune.model_copy(update=changes), prepared)
+        if self.work.time is None:
+            return tuner
+        seconds = self.compare.seconds if compactor.supervision.captured else 0.0
+        tuner.ending_seconds = self.work.time.ending_seconds + seconds  # it evaluates in the same images of a capture
+        return tuner
+
+    @property
+    def _containers_left(self) -> int:
+        """Trained containers that are still to be made, the next one included."""
+        made = sum(attempt.count < len(self.work.splats) for attempt in self.attempts)
+        return max(self.plan.containers - made, 1)
+
+    @property
+    def _evaluation_seconds(self) -> float:
+        """Expected time to evaluate a container: that of the latest evaluation, none where sizes are searched."""
+        return 0.0 if self.goal.by_size else self.compare.seconds
+
+    # Attempts.
+
+    def _along_lambda(
+        self, scene: Scene, rd_lambda: float | None = None, *, tuner: Tuner | None = None, most: int
+    ) -> None:
+        """Make up to ``most`` containers of a scene, the first one at ``rd_lambda`` or as its settings say."""
+        another = self.best is not None and self._best_scene is not scene and not self.goal.by_size
+        limit = self.best.bytes if another and self.best is not None else math.inf
+
+        def encode_at(settings: EncodeSettings) -> Attempt:
+            attempt = self._attempt(scene, settings, tuner)
+            if self.goal.margin(attempt) < 0 and attempt.bytes >= limit:
+                raise NoFurtherError
+            return attempt
+
+        tuned, degree = tuner is not None, self.work.splats.sh_degree
+        with suppress(NoFurtherError):
+            LambdaCurve(self.goal, encode_at, scene.settings, most, tuned=tuned, sh_degree=degree).search(rd_lambda)
+
+    def _along_path(self, path: TrainingPath, first: int) -> None:
+        """Make trained containers of points of the path, the first one at point ``first``."""
+
+        def encode_at(number: int, log2_lambda: float | None) -> Attempt:
+            self.work.progress.note = "; last: ".join(
+                [f"{count_at(number, len(path.whole)):,} Gaussians", *(each.summary() for each in self.attempts[-1:])]
+            )
+            scene = self._scene_at(path, number)
+            settings = scene.settings if log2_lambda is None else at_lambda(scene.settings, log2_lambda)
+            return self._attempt(scene, settings, self._tuner)
+
+        near = NEAR_HALVINGS if self.work.time is None and self.goal.most_bytes is None else NEAR_IN_TIME
+        if self.plan.containers == 0:  # there is no time for training
+            self._prune_to(path, max(first, 1))
+        with suppress(NoFurtherError):
+            along_path(self.goal, encode_at, first, last_number(len(path.whole)), self.plan.containers, near)
+        if self.goal.by_size and self.best is None and len(path.points) > 1:  # lambda alone makes it small enough
+            self._along_lambda(self._untrained(path, path.points[-1]), most=self.encode_settings.max_encodes)
+
+    def _attempt(self, scene: Scene, settings: EncodeSettings, tuner: Tuner | None) -> Attempt:
+        """Make a container, evaluate it, and keep it if it serves the goal best so far.
+
+        Raises:
+            NoFurtherError: there is no time for another one.
+            StopSearch: the search was stopped.
+        """
+        if self.stopped:
+            raise StopSearch
+        self._check_time(trained=tuner is not None)
+        began = time.perf_counter()
+        made = encode(self.work, scene.measured, settings, tuner, completes=scene.trained)
+        made = replace(made, compacted=scene.compacted)
+        size = stored_sizes(made.encoded.files, packed=self.work.packed)[0]
+        attempt = Attempt(len(scene), made.encoded.rd_lambda, size, container=made)
+        if not self.goal.by_size:
+            attempt = self.goal.measured(attempt, self._evaluate(made))
+        if tuner is None:
+            self._longest = max(self._longest, time.perf_counter() - began)
+        self._finetuning = made.finetuning or self._finetuning
+        self._keep(attempt, scene)
+        return attempt
+
+    def _check_time(self, *, trained: bool) -> None:
+        """Refuse another attempt that would not be finished in time, if there is one that can be returned."""
+        limited = self.work.time
+        if limited is None:
+            return
+        met = self.best is not None and self.best.bytes <= (self.goal.most_bytes or math.inf)
+        enough = met or (bool(self.attempts) and (trained or self.aims))
+        if enough and limited.deadline.seconds < limited.expected(self._longest, trained=trained):
+            raise NoFurtherError
+
+    def _keep(self, attempt: Attempt, scene: Scene) -> None:
+        self.attempts.append(replace(attempt, container=None))
+        self.work.progress.note = f"try {len(self.attempts) + 1}, last: {attempt.summary()}"
+        if self.goal.margin(attempt) < 0:
+            if self.closest is None or self.goal.margin(attempt) > self.goal.margin(self.closest):
+                self.closest = attempt
+        elif self._is_better(attempt, scene):
+            self.best, self._best_scene = attempt, scene
+
+    def _is_better(self, attempt: Attempt, scene: Scene) -> bool:
+        """Whether an attempt that meets the goal has fewer bytes than the best one, or loses less at a given size."""
+        if self.best is None:
+            return True
+        if not self.goal.by_size:
+            return attempt.bytes < self.best.bytes
+        if scene is self._best_scene and not attempt.trained:
+            return attempt.bytes > self.best.bytes
+        if self._best_loss is None:
+            self._best_loss = self._loss(self.best.made)
+        loss = self._loss(attempt.made)
+        if loss >= self._best_loss:
+            return False
+        self._best_loss = loss
+        return True
+
+    def _evaluate(self, made: Container) -> Evaluation:
+        """Compare a container with the original, also where the search is stopped meanwhile: the container exists."""
+        try:
+            self.work.progress("evaluate", 0.0)
+        except StopSearch:
+            self.stopped = True
+        most = ReadOptions(max_gaussians=max(len(self.work.original), MAX_GAUSSIANS))
+        return self.compare(read_scene(made.encoded.files, most, threads=self.work.threads))
+
+    def _loss(self, made: Container) -> float:
+        """Return the drop of PSNR of a container, decibels; infinite if a rendering failed.
+
+        If the photographs equal the scene's renderings, every drop is infinite. It is then a large number minus PSNR.
+        """
+        evaluation = self._evaluate(made)
+        drop, psnr = drop_of(evaluation), evaluation.mean.candidate.psnr
+        if math.isnan(drop) or math.isnan(psnr):
+            return math.inf
+        return drop if math.isfinite(drop) else UNKNOWN_DROP - min(psnr, 1e3)
+
+    # The report.
+
+    def compacted(self, best: Attempt) -> Compacted | None:
+        """Return the scene of the best container with the report of its compaction; None without compaction."""
+        if self.compactor is None:
+            return None
+        found = best.made.compacted or unchanged(self.work.splats, self._reason_to_keep_all())
+        trained = found.report.target_source == "photos" or best.trained
+        beyond = BEYOND_PHOTOGRAPHS if trained and best.made.compacted and self.photographs else ""
+        estimated = "" if self.encode_settings.max_psnr_drop is not None or not self.tried else self.compactor.note
+        note = "; ".join(filter(None, [found.report.note, beyond, estimated]))
+        return replace(found, report=replace(found.report, trials=tuple(self.tried), note=note))
+
+    def finetuning(self, best: Attempt) -> FinetuneReport | None:
+        """Return the report of the fine-tuning, which says so if it was in vain."""
+        if self._finetuning is None or best.trained:
+            return best.made.finetuning
+        return replace(self._finetuning, kept=False, note=NOT_FINETUNED)
+
+    def note(self, best: Attempt) -> str:
+        """Return a note: losses are estimates, or the finest container of the scene is below the target size."""
+        if self.encode_settings.max_psnr_drop is not None and best.against == "renderings":
+            return ESTIMATED_DROP
+        room, target = self.goal.margin(best), self.target_size
+        finest = best.rd_lambda == 2.0 ** LOG2_LAMBDA_RANGE[0]
+        limited = codebook_limited(best.made.settings, self.work.splats.sh_degree)
+        if not target or not finest or limited or room <= self.goal.limits[0].near:
+            return ""
+        return f"target_size {target:,} bytes is above the finest container of this scene: {best.bytes:,} bytes"
+
+    def _failure(self) -> str:
+        """Return why no container meets the goal."""
+        if self.best is not None:
+            names = " and ".join(["target_size", *(limit.setting for limit in self.goal.limits)])
+            verb = "were not met before the search was stopped" if self.stopped else "cannot be met together"
+            return (
+                f"{names} {verb}: the smallest container found with that quality has {self.best.bytes:,} bytes; allow "
+                f"at least that{'' if self.work.time is None else ', or more time'}"
+            )
+        suggest = self.path is None and len(self.work.splats) > 1 and self.target_size > OVERHEAD_BYTES
+        message = self.goal.failure_message(self.attempts, suggest_compaction=suggest)
+        coarse = "" if self.closest is None else self.closest.made.encoded.coarse
+        return "; ".join(filter(None, [message, coarse]))
+
+    def _reason_to_keep_all(self) -> str:
+        if self.tried or any(attempt.count < len(self.work.splats) for attempt in self.attempts):
+            return "and no smaller number of Gaussians that was tried serves the goal better"
+        if self.goal.by_size and (not self.attempts or self.attempts[0].bytes <= self.target_size):
+            return "and all of them fit into the target size"
+        if self.stopped:
+            return "and the search was stopped before a smaller number was tried"
+        if self.plan.containers == 0:
+            return "and there was too little time to train a smaller number"
+        return "and a smaller number would serve the goal less"
+
+
+def is_prunable(scene: Attempt) -> bool:
+    """Whether a scene may be pruned further without training."""
+    return (scene.drop or 0.0) <= PRUNABLE_DROP  # false where a rendering failed
