@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     from kissgs.finetuning.result import FinetuneReport
     from kissgs.io.ply import PlyInfo, read_ply_info
     from kissgs.io.scene_format import ReadOptions
-    from kissgs.pipeline.pipeline import Compressed, compact, compress
-    from kissgs.pipeline.report import Report
+    from kissgs.pipeline.pipeline import Compressed, Report, compact, compress
     from kissgs.pipeline.scene_files import SceneInfo, decompress, load, read_scene_info, recognise, save
     from kissgs.rendering.camera import Camera
     from kissgs.rendering.rasterizer import render
@@ -72,7 +71,7 @@ _HOMES = {
     "Remote": "client",
     "RemoteError": "core.errors",
     "RunnerError": "core.errors",
-    "Report": "pipeline.report",
+    "Report": "pipeline.pipeline",
     "SceneInfo": "pipeline.scene_files",
     "Settings": "settings",
     "Splats": "core.splats",

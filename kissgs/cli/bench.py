@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from kissgs.evaluation.html import ReportScene
     from kissgs.evaluation.results import Evaluation
     from kissgs.formats import ContainerName
-    from kissgs.pipeline.report import Report
+    from kissgs.pipeline.pipeline import Report
     from kissgs.settings import Settings
 
 
@@ -94,8 +94,8 @@ def warmup() -> None:
 
 def _measure_speed() -> None:
     """Encode a synthetic scene twice, the first time to load what is needed, and save the time of the second."""
+    from kissgs.pipeline.limited_time import save_speed
     from kissgs.pipeline.pipeline import compress
-    from kissgs.pipeline.search_time import save_speed
     from kissgs.settings import Preset, Settings
     from kissgs.synthetic import sample_scene
 

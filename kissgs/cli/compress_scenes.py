@@ -29,8 +29,8 @@ from kissgs.core.progress import Progress, load_kernels, silent
 from kissgs.formats import ContainerName
 from kissgs.io.files import move_into_place, open_scene_file, reason_of
 from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline.limited_time import decided
 from kissgs.pipeline.pipeline import Compressed, compress
-from kissgs.pipeline.training_choice import decided
 from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of
 from kissgs.settings import Settings
 from kissgs.sogxt.container import check_destination

@@ -19,7 +19,7 @@ from kissgs.formats import FORMATS
 if TYPE_CHECKING:
     from kissgs.compaction.result import CompactionReport
     from kissgs.finetuning.result import FinetuneReport
-    from kissgs.pipeline.report import Report
+    from kissgs.pipeline.pipeline import Report
     from kissgs.pipeline.scene_files import Info
     from kissgs.streaming.compress import StreamedReport
 

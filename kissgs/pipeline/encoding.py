@@ -1,25 +1,26 @@
-"""One encoding of a scene: measure sensitivity, plan, fine-tune, write."""
+"""Sensitivity in a file, a cache for later encodings of a scene with equal cameras."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+import zipfile
+from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
-from kissgs.core.errors import UnsupportedError
+from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.core.progress import Progress, SearchNote, as_stage, load_kernels
 from kissgs.core.resources import blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
 from kissgs.formats import ContainerName
-from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
+from kissgs.io.files import atomic_file, reason_of, refuse_existing
 from kissgs.pipeline.containers import DECODERS, MODELS, write_files
 from kissgs.pipeline.goal import Container
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
@@ -30,9 +31,41 @@ from kissgs.settings import EncodeSettings, FinetuneSettings, Settings
 
 if TYPE_CHECKING:
     from kissgs.finetuning.tune import Tuner
-    from kissgs.pipeline.search_time import SearchTime
+    from kissgs.pipeline.limited_time import SearchTime
     from kissgs.rendering.sensitivity import WeightedCameras
     from kissgs.training.supervision import SupervisionViews, TrainingTargets
+
+
+def read_sensitivity(path: Path, key: str) -> Sensitivity | None:
+    """Read what :func:`write_sensitivity` has written with ``key``; None if the file is missing or has another key.
+
+    Any other file is refused, because it would be replaced.
+    """
+    refuse_existing(path, overwrite=True)  # before the measurement, whose result is written there
+    try:
+        if not path.exists():
+            return None
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
+            if str(kept["key"]) != key:
+                return None
+            arrays = {field.name: kept[field.name] for field in fields(Sensitivity)}
+    except OSError as error:
+        raise OutputError(f"cannot read {path}: {reason_of(error)}") from error
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise OutputError(
+            f"{path} is not a sensitivity file of kissgs; move it away, delete it or choose another path"
+        ) from error
+    return Sensitivity(**{**arrays, "view_uncertainty": float(arrays["view_uncertainty"])})
+
+
+def write_sensitivity(path: Path, sensitivity: Sensitivity, key: str) -> None:
+    """Write sensitivity and ``key`` to an ``.npz``, atomically; an existing file is replaced."""
+    arrays: dict[str, Any] = {field.name: getattr(sensitivity, field.name) for field in fields(Sensitivity)}
+    with atomic_file(path, overwrite=True) as file:
+        np.savez(file, key=np.asarray(key), **arrays)
+
+
+# One encoding of a scene: measure sensitivity, plan, fine-tune, write.
 
 VIEW_UNCERTAINTY = {True: 0.1, False: 0.55}
 """Default of the setting ``view_uncertainty``: True with the cameras of a capture, False with virtual cameras only."""

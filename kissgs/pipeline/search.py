@@ -33,9 +33,8 @@ from kissgs.pipeline.curves import (
 )
 from kissgs.pipeline.encoding import Measured, Work, encode, make_tuner, measure
 from kissgs.pipeline.goal import Attempt, Container, Goal
+from kissgs.pipeline.limited_time import SearchPlan, has_photographs
 from kissgs.pipeline.scene_files import read_scene
-from kissgs.pipeline.search_time import SearchPlan
-from kissgs.pipeline.training_choice import has_photographs
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import stored_sizes
 

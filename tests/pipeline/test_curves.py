@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from kissgs.pipeline.curves import LOG2_LAMBDA_RANGE, LambdaCurve, NoFurtherError, along_path, first_point
 from kissgs.pipeline.goal import Attempt, Goal
+from kissgs.pipeline.limited_time import AIMING, MEETING, SearchPlan
 from kissgs.pipeline.search import NEAR_HALVINGS
-from kissgs.pipeline.search_time import AIMING, MEETING, SearchPlan
 from kissgs.settings import EncodeSettings
 
 PER_HALVING = math.log(2) / math.log(1.25)

@@ -11,7 +11,7 @@ from helpers.training_scenes import around, cloud
 import kissgs
 from kissgs import Settings
 from kissgs.compaction.popspa import TrainingPath
-from kissgs.pipeline.search_time import SearchTime
+from kissgs.pipeline.limited_time import SearchTime
 from kissgs.rendering.sensitivity import WeightedCameras
 
 
@@ -131,7 +131,7 @@ def test_towards_a_goal_of_ssim_training_gives_it_more_weight(goal, given, weigh
 
 
 def test_without_torch_the_report_says_what_is_missing(tmp_path, monkeypatch):
-    monkeypatch.setattr("kissgs.pipeline.training_choice.find_spec", lambda name: None)
+    monkeypatch.setattr("kissgs.pipeline.limited_time.find_spec", lambda name: None)
     scene = cloud(100)
     views = photographs(scene, tmp_path)
     found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=0.5), views=views)

@@ -7,7 +7,7 @@ from helpers.captured_scene import cameras
 import kissgs
 from kissgs import OutputError, Settings
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
+from kissgs.pipeline.encoding import read_sensitivity, write_sensitivity
 
 SCENE = kissgs.sample_scene(300, sh_degree=1, seed=2)
 GLANCE = {"sensitivity_views": 4, "sensitivity_view_size": 48}
