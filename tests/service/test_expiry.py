@@ -7,6 +7,7 @@ import pytest
 from helpers.data_folders import add_a_job, opened
 from helpers.running import wait_until
 from helpers.service import SMALL, problem
+from helpers.thread_runner import ThreadRunner
 
 import kissgs
 from service.core.models import State
@@ -28,6 +29,7 @@ def test_expiry(start):
 
 def test_clock_jumps(tmp_path, monkeypatch):
     """A jump of the clock by a year neither expires jobs early nor makes durations negative."""
+    monkeypatch.setattr(kissgs.runners, "LocalRunner", ThreadRunner)
     context = opened(tmp_path / "data")
     job_id = add_a_job(context, SMALL)
     real = time.time
