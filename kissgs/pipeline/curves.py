@@ -217,7 +217,7 @@ def along_path(
             attempt = encode(first, None)
             begin = math.nan if attempt.rd_lambda is None else math.log2(attempt.rd_lambda)
         else:
-            points = round((1 - LAMBDA_SHARE) * halvings * POINTS_PER_HALVING)
+            points = math.trunc((1 - LAMBDA_SHARE) * halvings * POINTS_PER_HALVING)  # another point brings chance
             number = min(max(first + points, 1), last)
             rest = halvings - (number - first) / POINTS_PER_HALVING
             x = begin + DOUBLINGS_PER_HALVING * rest
