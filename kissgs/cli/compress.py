@@ -187,6 +187,7 @@ def compress(
             "one that uses its processors. Needs the extra ray; docs/guide/many-machines.md.",
         ),
     ] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
     common: SceneOptions,
 ) -> None:
@@ -216,7 +217,7 @@ def compress(
         views=None if training.views is None else training.views.absolute(),
         force_views=training.force_views,
         checkpoint=training.checkpoint,
-        force=encoding.force,
+        force=force,
         threads=common.threads,
         device=device,
         quiet=common.quiet or as_json,

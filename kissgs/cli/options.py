@@ -186,7 +186,6 @@ class EncodingOptions:
         bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
     ] = False
     origin: OriginOption = None
-    force: ForceOption = False
 
     def settings(self, *, time: str | None = None, seed: int | None = None) -> Settings:
         """Return the settings that these options stand for."""

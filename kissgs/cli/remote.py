@@ -45,6 +45,7 @@ def compress(
     server: ServerOption = DEFAULT_SERVER,
     *,
     encoding: EncodingOptions,
+    force: ForceOption = False,
     as_json: ServiceJsonOption = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
@@ -65,7 +66,7 @@ def compress(
                     container=kind,
                     evaluate=encoding.evaluate,
                     origin=origin_of(encoding.origin),
-                    overwrite=encoding.force,
+                    overwrite=force,
                     progress=_announcing(progress, server, quiet),
                 )
             if not (quiet or as_json):

@@ -58,8 +58,8 @@ class SearchEvaluation:
     seconds: float = field(init=False, default=0.0)  # that the latest comparison took
     _poses: Views | None = field(init=False, default=None)
     _drawn: Views | None = field(init=False, default=None)
-    _images: dict[str, Rendering] = field(init=False, default_factory=dict)
-    _drawn_images: dict[str, Rendering] = field(init=False, default_factory=dict)
+    _images: dict[int, Rendering] = field(init=False, default_factory=dict)
+    _drawn_images: dict[int, Rendering] = field(init=False, default_factory=dict)
 
     def __call__(self, candidate: Splats, progress: Progress = silent) -> Evaluation:
         """Evaluate a candidate; reports the stages "cameras", "kernels" and "evaluate"."""
@@ -82,7 +82,7 @@ class SearchEvaluation:
         return replace(found, surroundings=self._compare(candidate, self._drawn, self._drawn_images, progress))
 
     def _compare(
-        self, candidate: Splats, views: Views, images: dict[str, Rendering] | None, progress: Progress
+        self, candidate: Splats, views: Views, images: dict[int, Rendering] | None, progress: Progress
     ) -> Evaluation:
         return compare_images(
             self.original, candidate, views, threads=self.threads, reference_images=images, progress=progress

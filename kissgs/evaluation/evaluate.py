@@ -282,12 +282,12 @@ def compare_images(
     *,
     device: Device = "cpu",
     threads: int = 0,
-    reference_images: dict[str, Rendering] | None = None,
+    reference_images: dict[int, Rendering] | None = None,
     progress: Progress = silent,
 ) -> Evaluation:
     """Compare two scenes from these views alone: the test views, or the training views if there are none.
 
-    ``reference_images`` are the reference's renderings by view name, read and filled, for comparisons of many
+    ``reference_images`` are the reference's renderings by number of the view, read and filled, for comparisons of many
     candidates with one reference.
     """
     reference, candidate = clean(reference)[0], clean(candidate)[0]
@@ -309,7 +309,7 @@ def _compare_views(
     measure: Measure,
     device: Device,
     threads: int,
-    reference_images: dict[str, Rendering] | None = None,
+    reference_images: dict[int, Rendering] | None = None,
     *,
     progress: Progress,
 ) -> Evaluation:
@@ -320,11 +320,11 @@ def _compare_views(
     for done, view in enumerate(chosen):
         progress("evaluate", done / len(chosen))
         background = background_of(view, views.background)
-        image = (reference_images or {}).get(view.name)
+        image = (reference_images or {}).get(done)
         if image is None:
             image = render_clamped(reference, view.camera, background, device, threads)
         if reference_images is not None:
-            reference_images[view.name] = image
+            reference_images[done] = image
         other = render_clamped(candidate, view.camera, background, device, threads)
         blank = blank and bool((image == np.clip(background, 0, 1)).all())
         comparison = _compare(image, other, view.load_photo() if photographed else None, measure)

@@ -277,7 +277,7 @@ def as_json(value: float) -> float | str | None:
     return "NaN" if math.isnan(value) else value
 
 
-# PSNR of an evaluation, and its loss of PSNR and of SSIM, as goals of rate control and compaction define them.
+# PSNR of an evaluation, and its loss of PSNR and of SSIM, as goals define them.
 
 ASSUMED_PSNR = 30.0
 """PSNR, decibels, that renderings are assumed to have to photographs if there are none: about that of good captures."""

@@ -274,7 +274,7 @@ def _primitive(
     if len(attributes) > _MAX_ATTRIBUTES:
         raise document.invalid(f"a primitive has {len(attributes):,} attributes")
     compressions = document.child(splatting, "extensions")
-    unread = [str(name) for name in document.child(primitive, "extensions") if name in _COMPRESSIONS]
+    unread = []
     for name in compressions:
         if name in SPZ_EXTENSIONS:
             view = document.whole(document.child(compressions, name), "bufferView", -1)
@@ -282,7 +282,8 @@ def _primitive(
             if "POSITION" in attributes and document.count(attributes["POSITION"]) != header.count:
                 raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
             return _Primitive(attributes, matrix, header.count, header.sh_degree, view, header.antialiased)
-        unread.insert(0, str(name))
+        unread.append(str(name))
+    unread += [str(name) for name in document.child(primitive, "extensions") if name in _COMPRESSIONS]
     _refuse_compressions(document, unread)
     if "POSITION" not in attributes:
         raise document.invalid("a primitive has no POSITION")

@@ -1,1 +1,1 @@
-"""The composition of all stages: compact, compress and decompress, rate control, reports."""
+"""The composition of all stages: compact, compress and decompress, searches for goals, reports."""

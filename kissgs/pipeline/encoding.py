@@ -1,4 +1,4 @@
-"""Sensitivity in a file, a cache for later encodings of a scene with equal cameras."""
+"""One encoding of a scene: measure sensitivity or read it from a file, plan, fine-tune, write."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ is not expected to recover (docs/method/research-log.md, "Large scenes in a limi
 
 BYTES_PER_GAUSSIAN, BYTES_OF_SH, OVERHEAD_BYTES = 8.6, 4.0, 4000
 """Bytes of a trained container per Gaussian that are expected at first, those of view-dependent colour in addition, and
-those that are no images."""
+those that are no images before the first container shows how many these are."""
 
 SIZE_BY_COUNT = 0.6
 """Exponent of the number of Gaussians to which the size of a container grows at equal lambda."""
@@ -143,6 +143,7 @@ class Search:
     _finetuning: FinetuneReport | None = field(init=False, default=None)  # of the latest attempt that has one
     _best_scene: Scene | None = field(init=False, default=None)
     _best_loss: float | None = field(init=False, default=None)
+    _overhead: int = field(init=False, default=OVERHEAD_BYTES)  # of the latest container
     _longest: float = field(init=False, default=0.0)  # attempt without training, seconds
 
     def __post_init__(self) -> None:
@@ -199,7 +200,7 @@ class Search:
         if not self.target_size:
             return 0
         expected = (BYTES_PER_GAUSSIAN + BYTES_OF_SH * (splats.sh_degree > 0)) * len(splats)
-        share = max((self.target_size - OVERHEAD_BYTES) / expected, 1 / len(splats))
+        share = max((self.target_size - self._overhead) / expected, 1 / len(splats))
         return max(0, round(math.log(share) / math.log(KEEP)))
 
     @property
@@ -302,17 +303,17 @@ class Search:
         return (self._try_unencoded(point.splats).drop or 0.0) <= RECOVERABLE_DB + allowed
 
     def _search_without_photographs(self, path: TrainingPath) -> None:
-        """Encode all Gaussians, then as few of them, trained on renderings, as pruning alone serves the goal with.
+        """Encode all Gaussians, then as few of them as pruning alone serves the goal with, trained if settings say so.
 
-        Only a size that all of them miss takes fewer without training, which loses more than it saves. A scene whose
+        For a size, pruning without training loses more than it saves, unless all Gaussians miss it. A scene whose
         Gaussians are all needed keeps them.
         """
         trains, most = self.trains and self.plan.containers > 0, self.encode_settings.max_encodes
         self._search_all_gaussians(tunes=False, most=min(ENCODES, most) if trains else most)
         whole, fits = self.best, self.goal.by_size and self.attempts[0].bytes <= self.target_size
-        if whole is None and self.target_size > OVERHEAD_BYTES:
+        if whole is None and self.target_size > self._overhead:
             self._along_path(path, self.number_for_size)
-        elif whole is not None and trains and not fits:
+        elif whole is not None and not fits and (trains or not (self.trains or self.goal.by_size)):
             allowed = self._loss(whole.made) if self.goal.by_size else math.inf
 
             def serves(scene: Attempt) -> bool:
@@ -321,7 +322,7 @@ class Search:
             self._prune_while(path, serves, min(RENDERED_POINTS, self.number_for_size or RENDERED_POINTS))
             number = max((n for n, scene in enumerate(self._pruned, 1) if serves(scene)), default=0)
             if number:
-                scene = self._scene_at(path, number)
+                scene = self._scene_at(path, number) if trains else self._untrained(path, path.points[number])
                 rd_lambda = self._lambda_for_size(number) if self.goal.by_size else whole.rd_lambda
                 self._along_lambda(scene, rd_lambda, tuner=self._tuner, most=self.plan.containers)
         self._fine_tune()
@@ -497,6 +498,8 @@ class Search:
         made = encode(self.work, scene.measured, settings, tuner, completes=scene.trained)
         made = replace(made, compacted=scene.compacted)
         size = stored_sizes(made.encoded.files, packed=self.work.packed)[0]
+        images = (len(data) for name, data in made.encoded.files.items() if name.endswith(".webp"))
+        self._overhead = size - sum(images)
         attempt = Attempt(len(scene), made.encoded.rd_lambda, size, container=made)
         if not self.goal.by_size:
             attempt = self.goal.measured(attempt, self._evaluate(made))
@@ -600,7 +603,7 @@ class Search:
                 f"{names} {verb}: the smallest container found with that quality has {self.best.bytes:,} bytes; allow "
                 f"at least that{'' if self.work.time is None else ', or more time'}"
             )
-        suggest = self.path is None and len(self.work.splats) > 1 and self.target_size > OVERHEAD_BYTES
+        suggest = self.path is None and len(self.work.splats) > 1 and self.target_size > self._overhead
         message = self.goal.failure_message(self.attempts, suggest_compaction=suggest)
         coarse = "" if self.closest is None else self.closest.made.encoded.coarse
         return "; ".join(filter(None, [message, coarse]))

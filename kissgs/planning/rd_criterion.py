@@ -194,7 +194,7 @@ class RdCriterion:
             cost, channels = getattr(costs, name), 3 if name == "rotation" else 1  # an error about each of three axes
             means = ((channels * cost[classes == c]).mean() for c in range(int(classes.max()) + 1))
             steps[name] = [step(float(mean), rd_lambda) for mean in means]
-            least[name] = float(cost.min())
+            least[name] = float(cost.min(initial=np.inf))
         return cls(rd_lambda, classes, steps, least, costs if keep else None)
 
     def take(self, order: Int[np.ndarray, " M"]) -> RdCriterion:

@@ -49,6 +49,14 @@ def test_the_views_and_their_renderings_are_made_once(monkeypatch):
     assert len(rendered) == len(first.views) + len(first.surroundings.views)  # the candidate alone
 
 
+def test_held_out_views_may_have_equal_names():
+    scene = cloud(50)
+    views = Views(around(3), tuple(replace(view, name="x") for view in around(3)), black(), "")
+    compare = SearchEvaluation(scene, views, 1)
+    for candidate in (scene, scene):
+        assert compare(candidate).mean.candidate_vs_reference.psnr == float("inf")
+
+
 def test_a_capture_compares_in_its_held_out_views():
     scene = cloud(50)
     views = Views(around(3), around(2), black(), "")

@@ -476,7 +476,7 @@ def project_backward(
     gradients: Gaussians,
     v_colors: np.ndarray,
 ) -> None:
-    """Compute the gradients of the footprints ``changed[first:last]`` from those of :func:`blend_backward`.
+    """Compute the gradients of the footprints ``changed[first:last]`` from those of ``blending.blend_backward``.
 
     Writes their Gaussians, ``indices``; the gradients by these, all but those by SH; and, ``(R, 3)``, those by the
     colours before they are clamped.
@@ -512,7 +512,7 @@ def project_backward(
 
 @compiled(void(FRAME, SLOTS, int64, int64, float32[:, ::1], float32[:, ::1]))
 def add_colors(frame: Frame, slots: Slots, first: int, last: int, v_slots: np.ndarray, v_colors: np.ndarray) -> None:
-    """Add the gradients by ``sh0``, given those of :func:`blend_colors_backward`, of ``slots.rows[first:last]``.
+    """Add the gradients by ``sh0``, given those of ``blending.blend_colors_backward``, of ``slots.rows[first:last]``.
 
     Colours that are clamped to 0 have no gradient.
     """
