@@ -166,8 +166,8 @@ HALF_ERROR_DB = 10 * math.log10(2)
 """Increase of PSNR, decibels, by half of the squared error, which is that by half of lambda."""
 
 MAX_STEP, CAUTION = 2.0, (0.15, 0.1)
-"""Largest step, halvings, and the share of the distance to a container that met the goal by which the last one stays
-nearer to it, up to so many halvings: missing the goal would lose all of that distance."""
+"""Largest step, as log2 of the number of Gaussians. Share of the distance to a container that met the goal by which the
+last one stays nearer to it, and the largest such distance: missing the goal would lose all of it."""
 
 SMALL_SCENE = 10_000
 """Number of Gaussians below which a search begins as for a loss of 0.1 dB, whatever the goal allows."""
@@ -190,7 +190,7 @@ def first_point(goal: Goal, number: int, offset_db: float, *, may_step: bool) ->
     ``may_step``. With fewer Gaussians, lambda at equal quality is larger by about :data:`LAMBDA_SHARE` of the step
     already, so the decibels only make up for the rounding to whole points.
     """
-    step = min(goal.allowed_halvings, MAX_STEP if may_step else 0.0)
+    step = min(goal.allowed_log2, MAX_STEP if may_step else 0.0)
     points = round((1 - LAMBDA_SHARE) * step * POINTS_PER_HALVING)
     rest = (1 - LAMBDA_SHARE) * step - points / POINTS_PER_HALVING
     return number + points, offset_db - HALF_ERROR_DB * DOUBLINGS_PER_HALVING * rest
@@ -207,22 +207,23 @@ def along_path(
         first: number of the first point.
         last: largest number of a point.
         most: largest number of containers.
-        near: room, halvings, below which a container that meets the goal ends the search.
+        near: room, log2 of the number of Gaussians, below which a container that meets the goal ends the search.
     """
     first, begin = min(max(first, 1), last), math.nan
 
-    def margin(halvings: float) -> float:
+    def margin(step: float) -> float:
         nonlocal begin
-        if halvings == 0:
+        if step == 0:
             attempt = encode(first, None)
             begin = math.nan if attempt.rd_lambda is None else math.log2(attempt.rd_lambda)
         else:
-            points = math.trunc((1 - LAMBDA_SHARE) * halvings * POINTS_PER_HALVING)  # another point brings chance
+            # Whole points only: training at another number of Gaussians changes the loss by some chance.
+            points = math.trunc((1 - LAMBDA_SHARE) * step * POINTS_PER_HALVING)
             number = min(max(first + points, 1), last)
-            rest = halvings - (number - first) / POINTS_PER_HALVING
+            rest = step - (number - first) / POINTS_PER_HALVING
             x = begin + DOUBLINGS_PER_HALVING * rest
             attempt = encode(number, min(max(x, LOG2_LAMBDA_RANGE[0]), LOG2_LAMBDA_RANGE[1]))
-        room = goal.halvings(attempt)
+        room = goal.log2_room(attempt)
         if not math.isfinite(begin + room):
             raise NoFurtherError
         return room

@@ -154,8 +154,8 @@ class Limit:
         factor = TRAINED_SIZE_NEAR if self.setting == "target_size" else TRAINED_NEAR
         return max(min(factor * self.near, MOST_NEAR), self.near) if trained else self.near
 
-    def halvings(self, attempt: Attempt) -> float:
-        """Return the room in halvings of the number of Gaussians, which is linear in a loss; NaN where unknown."""
+    def log2_room(self, attempt: Attempt) -> float:
+        """Return the room as log2 of the number of Gaussians, in which a loss is linear; NaN where unknown."""
         found = self.figure(attempt)
         if found is None:
             return math.nan
@@ -214,13 +214,13 @@ class Goal:
         """Return the room to the limit that decides (:meth:`Limit.room`): at least 0 where all are met."""
         return self.decisive(attempt).room(attempt)
 
-    def halvings(self, attempt: Attempt) -> float:
-        """Return the room to the limit that decides in halvings of the number of Gaussians (:meth:`Limit.halvings`)."""
-        return min(limit.halvings(attempt) for limit in self.limits)
+    def log2_room(self, attempt: Attempt) -> float:
+        """Return the room to the limit that decides as log2 of the number of Gaussians (:meth:`Limit.log2_room`)."""
+        return min(limit.log2_room(attempt) for limit in self.limits)
 
     @property
-    def allowed_halvings(self) -> float:
-        """Halvings of a quarter of the Gaussians that the limits on losses typically allow.
+    def allowed_log2(self) -> float:
+        """How often the limits on losses typically allow to halve a quarter of the Gaussians, a fraction.
 
         Below 0 if more than a quarter are needed; 0 if the goal limits no loss.
         """

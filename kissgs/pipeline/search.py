@@ -76,9 +76,9 @@ those that are no images before the first container shows how many these are."""
 SIZE_BY_COUNT = 0.6
 """Exponent of the number of Gaussians to which the size of a container grows at equal lambda."""
 
-NEAR_HALVINGS, NEAR_IN_TIME = 0.13, 0.06
-"""Room, halvings, below which a container that meets the goal ends the search: another one would save some 4 % of its
-bytes, or 1 %, which is worth a time that the user has given."""
+NEAR_LOG2, NEAR_IN_TIME = 0.13, 0.06
+"""Room, as log2 of the number of Gaussians, below which a container that meets the goal ends the search: another one
+would save some 4 % of its bytes, or 1 %, which is worth a time that the user has given."""
 
 UNKNOWN_DROP = 1e6
 """Larger than any finite drop of PSNR, decibels."""
@@ -476,7 +476,7 @@ class Search:
             settings = scene.settings if log2_lambda is None else at_lambda(scene.settings, log2_lambda)
             return self._attempt(scene, settings, self._tuner)
 
-        near = NEAR_HALVINGS if self.work.time is None and self.goal.most_bytes is None else NEAR_IN_TIME
+        near = NEAR_LOG2 if self.work.time is None and self.goal.most_bytes is None else NEAR_IN_TIME
         if self.plan.containers == 0:  # there is no time for training
             self._prune_to(path, max(first, 1))
         with suppress(NoFurtherError):

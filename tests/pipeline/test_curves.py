@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from kissgs.pipeline.curves import LOG2_LAMBDA_RANGE, LambdaCurve, NoFurtherError, along_path, first_point
 from kissgs.pipeline.goal import Attempt, Goal
 from kissgs.pipeline.limited_time import AIMING, MEETING, SearchPlan
-from kissgs.pipeline.search import NEAR_HALVINGS
+from kissgs.pipeline.search import NEAR_LOG2
 from kissgs.settings import EncodeSettings
 
 PER_HALVING = math.log(2) / math.log(1.25)
@@ -31,15 +31,15 @@ def search(goal, figures, first=6, last=40, attempts=3):
         return made[-1]
 
     with suppress(NoFurtherError):
-        along_path(Goal.of(EncodeSettings(**goal)), encode, first, last, attempts, NEAR_HALVINGS)
+        along_path(Goal.of(EncodeSettings(**goal)), encode, first, last, attempts, NEAR_LOG2)
     return made, points
 
 
 def model(number, x, per_halving=0.3, per_doubling=0.1, at_start=0.1, power=1.0):
     """Return a drop that grows with fewer Gaussians and a larger lambda, and a size that falls."""
-    halvings = (number - 6) / PER_HALVING
-    drop = at_start + per_halving * abs(halvings) ** power * math.copysign(1, halvings) + per_doubling * (x - START)
-    return {"bytes": round(200_000 * 2 ** (-halvings - 0.25 * (x - START))), "drop": drop}
+    step = (number - 6) / PER_HALVING
+    drop = at_start + per_halving * abs(step) ** power * math.copysign(1, step) + per_doubling * (x - START)
+    return {"bytes": round(200_000 * 2 ** (-step - 0.25 * (x - START))), "drop": drop}
 
 
 @example(0.3125, 0.125, 0.109375, 1.0)
@@ -76,8 +76,8 @@ def test_a_size_is_met_in_three_containers(target, per_gaussian, per_halving, pe
     """Sizes at equal lambda grow with powers of 0.5 (fox) to 0.7 (guitar) of the number of Gaussians."""
 
     def figures(number, x):
-        halvings = (number - 6) / PER_HALVING
-        return {"bytes": round(target * per_gaussian * 2 ** (-per_halving * halvings - per_doubling * (x - START)))}
+        step = (number - 6) / PER_HALVING
+        return {"bytes": round(target * per_gaussian * 2 ** (-per_halving * step - per_doubling * (x - START)))}
 
     trials, _ = search({"target_size": target}, figures)
     assert any(0.85 * target <= trial.bytes <= target for trial in trials)
@@ -85,9 +85,9 @@ def test_a_size_is_met_in_three_containers(target, per_gaussian, per_halving, pe
 
 def fox(number, x):
     """Return figures like those of fox: losses grow the faster, the coarser and the fewer its Gaussians are already."""
-    halvings, doublings = (number - 6) / PER_HALVING, x - START
-    drop = 0.03 + 0.3 * halvings + 0.1 * doublings + 0.05 * (halvings + doublings / 2.5) ** 2
-    return {"bytes": round(240_000 * 2 ** (-0.5 * halvings - 0.25 * doublings + 0.02 * doublings**2)), "drop": drop}
+    step, doublings = (number - 6) / PER_HALVING, x - START
+    drop = 0.03 + 0.3 * step + 0.1 * doublings + 0.05 * (step + doublings / 2.5) ** 2
+    return {"bytes": round(240_000 * 2 ** (-0.5 * step - 0.25 * doublings + 0.02 * doublings**2)), "drop": drop}
 
 
 def smallest(drop):
@@ -198,17 +198,17 @@ def test_a_container_ends_the_search_if_an_eighth_of_a_halving_or_less_is_left(l
 
 
 def test_a_step_changes_number_and_lambda():
-    """1.03 halvings: of 1.9 points the whole one, and 1.77 doublings of lambda."""
+    """A step of 1.03: of 1.9 points the whole one, and 1.77 doublings of lambda."""
     _, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=-0.15))
     assert positions[1] == (7, pytest.approx(START + 1.767, abs=0.001))
 
 
-def test_the_limit_with_the_fewest_halvings_left_decides():
+def test_the_limit_with_the_least_room_decides():
     """Both losses are below 0 at first; only SSIM then comes near its limit."""
 
     def figures(number, x):
-        halvings = (number - 6) / PER_HALVING + 0.4 * (x - START)
-        return {"bytes": 9 - number, "drop": -0.5 + 0.01 * halvings, "ssim_drop": -0.001 + 0.01 * halvings}
+        step = (number - 6) / PER_HALVING + 0.4 * (x - START)
+        return {"bytes": 9 - number, "drop": -0.5 + 0.01 * step, "ssim_drop": -0.001 + 0.01 * step}
 
     trials, positions = search({"max_psnr_drop": 0.2, "max_ssim_drop": 0.003}, figures)
     assert trials[-1].ssim_drop <= 0.003
@@ -219,9 +219,9 @@ def test_the_last_container_is_cautious_where_the_one_that_met_the_goal_is_far()
     """A drop that grows a little faster than expected, with a hundredth of a decibel of chance."""
 
     def figures(number, x):
-        halvings = (number - 6) / PER_HALVING + 0.4 * (x - START)
-        chance = 0.012 * math.sin(40 * halvings)
-        return {"bytes": round(200_000 * 2**-halvings), "drop": 0.058 + 0.36 * halvings + chance}
+        step = (number - 6) / PER_HALVING + 0.4 * (x - START)
+        chance = 0.012 * math.sin(40 * step)
+        return {"bytes": round(200_000 * 2**-step), "drop": 0.058 + 0.36 * step + chance}
 
     trials, _ = search({"max_psnr_drop": 0.3}, figures)
     assert len(trials) == 3
