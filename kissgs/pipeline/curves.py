@@ -218,7 +218,7 @@ def along_path(
             attempt = encode(first, None)
             begin = math.nan if attempt.rd_lambda is None else math.log2(attempt.rd_lambda)
         else:
-            # Less than a point changes lambda alone: training another number of Gaussians changes the loss by some chance.
+            # Less than a point changes lambda alone: another training changes the loss by some chance.
             points = (1 - LAMBDA_SHARE) * step * POINTS_PER_HALVING
             number = min(max(first + round(points) * (abs(points) >= 1), 1), last)
             rest = step - (number - first) / POINTS_PER_HALVING
