@@ -64,9 +64,9 @@ IN_WORKER = """(job) => new Promise((resolve, reject) => {
 })"""
 
 
-@pytest.fixture
-def do(browser, site):
-    """Return a function that performs a job in a page or a worker."""
+@pytest.fixture(scope="module")
+def page_and_errors(browser, site):
+    """A page, and the errors of its scripts."""
     site.files["/page.html"] = PAGE
     context = browser.new_context()
     context.add_init_script(SPY)
@@ -74,6 +74,15 @@ def do(browser, site):
     page.set_default_timeout(20_000)
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
+    yield page, errors
+    context.close()
+
+
+@pytest.fixture
+def do(page_and_errors, site):
+    """Return a function that loads the page anew and performs a job in it or in a worker."""
+    page, errors = page_and_errors
+    errors.clear()
 
     def run(job, within=IN_PAGE, at="/page.html", before=None):
         page.goto(site.url + at)
@@ -82,7 +91,6 @@ def do(browser, site):
         return json.loads(page.evaluate(f"(job) => Promise.race([({within})(job), {LATE}])", job))
 
     yield run
-    context.close()
     assert errors == []
 
 
@@ -175,6 +183,7 @@ def test_images_of_a_coarse_rendering_are_requested_first(do, site):
 
 
 @pytest.mark.parametrize("wait", [0, 0.5], ids=["at once", "later"])
+@pytest.mark.quick(1)
 def test_workers_that_cannot_be_loaded(do, site, large, wait):
     """The page's own thread decodes if a bundler omitted the file or a policy forbids it, also after a delay."""
     site.files["/web_decoder/worker.js"] = None
