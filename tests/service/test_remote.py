@@ -240,7 +240,7 @@ def test_the_command_says_once_that_the_service_refuses_and_why(scene, words):
             code, detail, status = answers.pop(0)
             body = json.dumps({"code": code, "detail": detail}).encode()
             self.send_response(status)
-            self.send_header("Retry-After", "0.1")
+            self.send_header("Retry-After", "1")
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
             self.wfile.write(body)

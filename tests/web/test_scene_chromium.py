@@ -64,9 +64,9 @@ IN_WORKER = """(job) => new Promise((resolve, reject) => {
 })"""
 
 
-@pytest.fixture(scope="module")
-def page_and_errors(browser, site):
-    """A page, and the errors of its scripts."""
+@pytest.fixture
+def do(browser, site):
+    """Return a function that performs a job in a page or a worker."""
     site.files["/page.html"] = PAGE
     context = browser.new_context()
     context.add_init_script(SPY)
@@ -74,15 +74,6 @@ def page_and_errors(browser, site):
     page.set_default_timeout(20_000)
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
-    yield page, errors
-    context.close()
-
-
-@pytest.fixture
-def do(page_and_errors, site):
-    """Return a function that loads the page anew and performs a job in it or in a worker."""
-    page, errors = page_and_errors
-    errors.clear()
 
     def run(job, within=IN_PAGE, at="/page.html", before=None):
         page.goto(site.url + at)
@@ -91,6 +82,7 @@ def do(page_and_errors, site):
         return json.loads(page.evaluate(f"(job) => Promise.race([({within})(job), {LATE}])", job))
 
     yield run
+    context.close()
     assert errors == []
 
 
