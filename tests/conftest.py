@@ -69,9 +69,12 @@ def shared_data() -> Path:
     return folder
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """Return one worker more than there are processors, because a quarter of the time of tests is waiting."""
-    return (os.cpu_count() or 1) + 1
+    from kissgs.core.resources import processors  # after the hook
+
+    return processors() + 1
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
