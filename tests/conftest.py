@@ -69,6 +69,14 @@ def shared_data() -> Path:
     return folder
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Return one worker more than there are processors, because a quarter of the time of tests is waiting."""
+    from kissgs.core.resources import processors  # after the hook
+
+    return processors() + 1
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option of continuous integration."""
     parser.addoption("--sixth", metavar="COMMIT", help="run a sixth of the exhaustive tests, chosen by the commit")
