@@ -52,8 +52,15 @@ install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "h
 
 
 WITH_FEWER_CAMERAS = ("io", "sog", "sogxt", "extremes", "finetuning")
-SMALLER_UNLESS_EXHAUSTIVE = ("pipeline",)
-AS_USERS_HAVE_IT = ("test_promises", "test_nothing_is_lost", "test_cameras", "test_overlooked")
+SMALLER_UNLESS_EXHAUSTIVE = ("compaction", "evaluation", "pipeline", "planning", "streaming")
+AS_USERS_HAVE_IT = (
+    "test_promises",
+    "test_nothing_is_lost",
+    "test_cameras",
+    "test_overlooked",
+    "test_html",
+    "test_capture_fit",
+)
 
 
 @pytest.fixture(autouse=True)
