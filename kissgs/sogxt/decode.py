@@ -22,6 +22,7 @@ from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
 from kissgs.formats import LEVELS_NAME
 from kissgs.io.containers import Source, ZipSource, open_source, stored_size
 from kissgs.io.conventions import ROWS, steps
+from kissgs.io.files import refuse_more_than
 from kissgs.io.images import decode_plane
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions, SceneSource, titled
 from kissgs.io.streamed import Container, StreamedFormat
@@ -112,19 +113,14 @@ class _Planes:
 
     def __init__(self, files: Source, layout: Layout, max_gaussians: int) -> None:
         self.files, self.layout, self.max_gaussians = files, layout, max_gaussians
-        # Padding is less than half of any grid that follows the size rule, except for the smallest.
-        self.refuse_more_than(2 * max_gaussians + 128, layout.grid_side**2, "cells")
-        self.refuse_more_than(max_gaussians, layout.count or 0, "Gaussians")
+        if layout.grid_side**2 > 2 * max_gaussians + 128:  # padding is less than half of any grid but the smallest
+            raise UnsupportedError(
+                f"the container has {layout.grid_side**2:,} cells, too many for a limit of {max_gaussians:,} "
+                "Gaussians: raise it (--max-gaussians) if you trust the file"
+            )
+        refuse_more_than(max_gaussians, layout.count or 0, "the container")
         self.coefficients = SH_REST_COUNTS[layout.sh_degree]
         self.plain: dict[str, tuple[UInt8[np.ndarray, "cells C"], _Lookup]] = {}
-
-    def refuse_more_than(self, limit: int, found: int, what: str) -> None:
-        """Raise UnsupportedError if ``found`` is above ``limit``."""
-        if found > limit:
-            raise UnsupportedError(
-                f"the container has {found} {what}; with a limit of {self.max_gaussians} Gaussians, at most {limit} "
-                "are read: raise the limit (--max-gaussians) if you trust the container"
-            )
 
     def load(self, pool: Workers) -> None:
         """Decode all images in parallel, the slowest first."""
@@ -197,7 +193,7 @@ class _Planes:
         declared = self.layout.count
         if declared not in (None, count):
             raise InvalidContainerError(f"active_mask.webp marks {count} Gaussians; the metadata declares {declared}")
-        self.refuse_more_than(self.max_gaussians, count, "Gaussians")
+        refuse_more_than(self.max_gaussians, count, "the container")
         # No cell indices are needed if all padding is at the end.
         cells = None if mask[:count].all() else np.flatnonzero(mask)
         splats = empty_splats(count, self.coefficients) if out is None else out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import shutil
 from collections.abc import Iterator
@@ -95,10 +96,6 @@ def claimed(work: Path, mine: dict[str, Any]) -> Iterator[None]:
 
 def _locked(lock: BinaryIO) -> bool:
     """Lock a file until it is closed, or the process ends; return False if another process has locked it."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return True
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
