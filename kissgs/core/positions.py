@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,11 +41,14 @@ CONTAINER_LEVELS = (1 << 16) - 1
 
 ORIGIN = '--origin auto (in Python origin="auto")'
 
-STREAMED_REMEDY = f"compressing into FOLDER/lod-meta.json with {ORIGIN} gives the scene's parts fine steps"
+STREAMED_REMEDY = "no origin helps here, but compressing into FOLDER/lod-meta.json does, whose parts have fine steps"
 """Remedy for coarse positions where no origin helps: streamed SOG."""
 
 LEAST, MOST_CUTS = 32, 12
 """Number of Gaussians in a chunk, and of cuts one after another, up to which chunks are cut for finer positions."""
+
+TRIED = 1 << 16
+"""Largest number of Gaussians with which cuts are tried before they are named as a remedy."""
 
 
 def coarse_share(errors: Float[np.ndarray, " N"], scales: Float32[np.ndarray, "N 3"]) -> float:
@@ -61,11 +64,12 @@ def coarse_note(
     scales: Float32[np.ndarray, "N 3"],
     low: Float32[np.ndarray, " 3"],
     high: Float32[np.ndarray, " 3"],
+    count: int,
 ) -> str:
     """Return a sentence with the remedy if a container's finest steps are too coarse for a scene, else an empty string.
 
     The planner's own steps may be coarser for small Gaussians, where it chooses so: that is no loss by distance. The
-    ends ``low`` and ``high`` are signed logarithms.
+    ends ``low`` and ``high`` are signed logarithms; ``count`` is that of the scene, of which the rows are a sample.
     """
     wide = means.astype(np.float64)
     extents, sizes = high.astype(np.float64) - low, visible_sizes(scales)
@@ -75,8 +79,22 @@ def coarse_note(
         return ""
     step = float(np.median(container_steps(wide, extents).max(axis=1)[chances > 0]))
     near = wide - np.rint(np.median(wide, axis=0))
-    moved = coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3))
-    remedy = f"{ORIGIN} moves the scene there" if moved.mean() <= COARSE_SHARE else STREAMED_REMEDY
+
+    def coarse_in_parts(positions: Float64[np.ndarray, "N 3"]) -> float:
+        rows = np.column_stack([positions, sizes]).astype(np.float32)[:: 1 + len(sizes) // TRIED]
+        return coarse_in_chunks(rows, cuts_without_coarse(rows, Cuts.of(rows[:, :3], 0), count))
+
+    remedies: dict[str, Callable[[], float]] = {
+        f"{ORIGIN} moves the scene there": lambda: float(
+            coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean()
+        ),
+        STREAMED_REMEDY: lambda: coarse_in_parts(wide),
+        f"compressing into FOLDER/lod-meta.json with {ORIGIN} gives its parts fine steps": lambda: coarse_in_parts(
+            near
+        ),
+    }
+    helpful = (name for name, coarse in remedies.items() if coarse() <= COARSE_SHARE)
+    remedy = next(helpful, f"compress objects so far apart into files of their own, with {ORIGIN}")
     return (
         f"positions have steps of about {step:.2g}, too coarse for {share:.0%} of the Gaussians, because a container "
         f"has fine steps only near the origin: {remedy}"

@@ -325,7 +325,7 @@ def _coarse(splats: Splats, plan: EncodingPlan) -> str:
     """Return the sentence about coarse positions, by at most :data:`SAMPLED` Gaussians."""
     order, means = plan.grid.cells[plan.grid.mask], plan.fields["means"]
     some = order[:: 1 + len(order) // SAMPLED]
-    return coarse_note(splats.means[some], splats.scales[some], means.low, means.high)
+    return coarse_note(splats.means[some], splats.scales[some], means.low, means.high, len(order))
 
 
 def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndarray, " K"]:
