@@ -149,7 +149,7 @@ def test_ray_is_not_installed(monkeypatch):
 
 
 def test_a_node_with_another_version(ray_cluster):
-    from kissgs.runners.ray_driver import run_on_node
+    from kissgs.runners.ray_node import run_on_node
 
     (event,) = run_on_node(asdict(item("count", numbers=1)), "0.0.0", None)
     assert (event["outcome"]["kind"], event["outcome"]["code"]) == ("error", "node-unusable")

@@ -329,12 +329,9 @@ def test_what_is_no_folder_of_its_own_is_not_replaced(scene, tmp_path, monkeypat
         compress_streamed(scene, folder / "lod-meta.json", settings=FAST)
 
 
-@pytest.mark.parametrize(
-    ("stage", "then", "reason"),
-    [("partition", "begins anew", errno.EDQUOT), ("images", "goes on where it was", errno.ENOSPC)],
-)
+@pytest.mark.parametrize(("stage", "reason"), [("partition", errno.EDQUOT), ("images", errno.ENOSPC)])
 @pytest.mark.quick(1)
-def test_a_disk_that_fills_up_does_not_end_the_work_for_good(scene, target, tmp_path, monkeypatch, stage, then, reason):
+def test_a_disk_that_fills_up_does_not_end_the_work_for_good(scene, target, tmp_path, monkeypatch, stage, reason):
     with monkeypatch.context() as patch:
 
         def fill(now, fraction, note=""):
@@ -344,8 +341,7 @@ def test_a_disk_that_fills_up_does_not_end_the_work_for_good(scene, target, tmp_
         def full(descriptor):
             raise OSError(reason, os.strerror(reason))
 
-        said = f"^cannot write .*: {os.strerror(reason).lower()}; once there is room, the same command {then}$"
-        with pytest.raises(OutputError, match=said):
+        with pytest.raises(OutputError, match=f"^cannot write .*: {os.strerror(reason).lower()}$"):
             compress_streamed(scene, target, settings=FAST, progress=fill)
     assert target.parent.with_name(f"{target.parent.name}.partial").exists() == (stage == "images")
     compress_streamed(scene, target, settings=FAST)
