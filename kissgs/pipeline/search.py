@@ -286,25 +286,26 @@ class Search:
             self._search_all_gaussians(tunes=False)
             left = limited.plan(photographs=True, aims=self.aims).containers
             self.plan = replace(self.plan, containers=min(self.plan.containers, left))
+        last = last_number(len(path.whole))
         if limited is None and not self.goal.by_size:
-            first = self._last_that_serves(path, first)
+            failing = self._first_that_fails(path, first)
+            if failing > first:
+                first = last = failing - 1
         if not self._whole_searched or self.plan.containers > 1:
-            self._along_path(path, first)
+            self._along_path(path, first, last)
         if self.best is None and not self.aims:
             self._search_all_gaussians()
 
-    def _last_that_serves(self, path: TrainingPath, first: int) -> int:
-        """Train along the path from point ``first`` on while the goal is met before encoding; return the last such.
+    def _first_that_fails(self, path: TrainingPath, number: int) -> int:
+        """Train along the path from point ``number`` on, up to the first that misses the goal before any encoding.
 
         Photographs may show more than the scene does: training then makes it better than it was, and a container of
-        the first point would use up little of what may be lost.
+        point ``number`` would use up little of what may be lost.
         """
-        number, last = first, last_number(len(path.whole))
-        while self.goal.margin(self._try_unencoded(self._train_to(path, number).splats)) >= 0:
-            if number == last:
-                return last
+        last = last_number(len(path.whole))
+        while number < last and self.goal.margin(self._try_unencoded(self._train_to(path, number).splats)) >= 0:
             number += 1
-        return max(number - 1, first)
+        return number
 
     def _recovers(self, path: TrainingPath) -> bool:
         """Train up to the first point, and return whether fine-tuning can be expected to recover what is still lost.
@@ -327,7 +328,7 @@ class Search:
         self._search_all_gaussians(tunes=False, most=min(ENCODES, most) if trains else most)
         whole, fits = self.best, self.goal.by_size and self.attempts[0].bytes <= self.target_size
         if whole is None and self.target_size > self._overhead:
-            self._along_path(path, self.number_for_size)
+            self._along_path(path, self.number_for_size, last_number(len(path.whole)))
         elif whole is not None and not fits and (trains or not (self.trains or self.goal.by_size)):
             allowed = self._loss(whole.made) if self.goal.by_size else math.inf
 
@@ -480,8 +481,8 @@ class Search:
         with suppress(NoFurtherError):
             LambdaCurve(self.goal, encode_at, scene.settings, most, tuned=tuned, sh_degree=degree).search(rd_lambda)
 
-    def _along_path(self, path: TrainingPath, first: int) -> None:
-        """Make trained containers of points of the path, the first one at point ``first``."""
+    def _along_path(self, path: TrainingPath, first: int, last: int) -> None:
+        """Make trained containers of points of the path up to ``last``, the first one at point ``first``."""
 
         def encode_at(number: int, log2_lambda: float | None) -> Attempt:
             self.work.progress.note = "; last: ".join(
@@ -495,7 +496,7 @@ class Search:
         if self.plan.containers == 0:  # there is no time for training
             self._prune_to(path, max(first, 1))
         with suppress(NoFurtherError):
-            along_path(self.goal, encode_at, first, last_number(len(path.whole)), self.plan.containers, near)
+            along_path(self.goal, encode_at, first, last, self.plan.containers, near)
         if self.goal.by_size and self.best is None and len(path.points) > 1:  # lambda alone makes it small enough
             self._along_lambda(self._untrained(path, path.points[-1]), most=self.encode_settings.max_encodes)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.photographed import FEW_VIEWS, photographs, with_photographs
+from helpers.photographed import FEW_VIEWS, QUICK, photographs, with_photographs
 from helpers.training_scenes import around, cloud
 
 import kissgs
@@ -61,6 +61,18 @@ def test_the_same_request_gives_the_same_bytes(tmp_path):
     assert kissgs.compress(scene, settings=again, views=views, threads=2).files == found.files
     kept = [trial for trial in found.report.trials if trial.bytes == len(found.to_zip())]
     assert any(trial.drop <= 1 and trial.ssim_drop <= 0.05 for trial in kept)
+
+
+def test_training_goes_on_while_the_scene_meets_the_goal(tmp_path):
+    """Photographs that are darker than the scene: training gains more than three quarters of the Gaussians lose."""
+    scene = cloud(300)
+    quick = {"compact": {**QUICK, "max_compactions": 1}, "finetune": {"steps": 20, "view_size": 40}}
+    settings = Settings.research("balanced", **quick, **FEW_VIEWS, max_psnr_drop=0.1)
+    found = kissgs.compress(scene, settings=settings, views=photographs(scene, tmp_path))
+    *_, met, missed = found.report.compaction.trials
+    assert met.drop <= 0.1 < missed.drop
+    assert [trial.count for trial in found.report.trials] == [met.count]
+    assert met.count < 300 / 4
 
 
 @pytest.mark.quick(0)
