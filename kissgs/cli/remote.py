@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kissgs.cli.files import for_each_input, print_json, progress_bar, show
-from kissgs.cli.options import EncodingOptions, FilesArgument, ForceOption, origin_of, with_option_groups
+from kissgs.cli.files import Result, for_each_input, print_json, progress_bar, show
+from kissgs.cli.options import EncodingOptions, FilesArgument, ForceOption, with_option_groups
 from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.formats import ENDINGS, ending_of, named_container
 
@@ -57,7 +57,7 @@ def compress(
     kind, settings = named_container(encoding.container, output), encoding.settings()
     with _service(server) as remote:
 
-        def work(scene: str, target: Path) -> dict[str, Any]:
+        def work(scene: str, target: Path) -> Result:
             with progress_bar(quiet or as_json) as progress:
                 status = remote.compress(
                     scene,
@@ -65,15 +65,13 @@ def compress(
                     settings=settings,
                     container=kind,
                     evaluate=encoding.evaluate,
-                    origin=origin_of(encoding.origin),
+                    origin=encoding.origin,
                     overwrite=force,
                     progress=_announcing(progress, server, quiet),
                 )
-            if not (quiet or as_json):
-                show(status_table(status, str(target)))
-            return status
+            return Result(status, status_table(status, str(target)))
 
-        for_each_input(scenes, output, ending_of(kind), as_json, work)
+        for_each_input(scenes, output, ending_of(kind), work, as_json=as_json, quiet=quiet)
 
 
 @app.command(name="list")
