@@ -131,7 +131,7 @@ def page_files() -> dict[str, Path]:
     """Return the files of the page by their paths from it, such as ``vendor/three/build/three.module.min.js``."""
     folder = ROOT / "web_decoder"
     if not (folder / PAGE).is_file():
-        raise UnsupportedError(f"{folder / PAGE}, the preview page, is missing; install kissgs again")
+        raise UnsupportedError(f"there is no preview page: {folder / PAGE} is missing; install kissgs again")
     if not (folder / "vendor" / "versions.json").is_file():
         raise UnsupportedError(
             "Spark and three.js, which draw the scene, are not installed; add --fetch-viewer to download them once"

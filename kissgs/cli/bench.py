@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from kissgs.cli.files import progress_bar, show, write_output
-from kissgs.cli.options import ForceOption, ViewsOption, chosen, open_views
+from kissgs.cli.options import ForceOption, ViewsOption, chosen, open_views, output_option
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def bench(
     views: ViewsOption = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE.csv", help="Write the table as CSV, and beside it a plot as PNG."),
+        output_option("Write the table as CSV, and beside it a plot as PNG.", metavar="FILE.csv"),
     ] = None,
     force: ForceOption = False,
 ) -> None:

@@ -21,6 +21,7 @@ from kissgs.cli.options import (
     TrainingOptions,
     chosen,
     count_of,
+    output_option,
     share_of,
     with_option_groups,
 )
@@ -77,9 +78,7 @@ def compact(
     scenes: ScenesArgument,
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output", "-o", metavar="PATH", help="Output NAME.ply, a folder, or '-' for standard output. Required."
-        ),
+        output_option("Output NAME.ply, a folder, or '-' for standard output. Required."),
     ] = None,
     *,
     compaction: CompactionOptions,
@@ -142,12 +141,9 @@ def compress(
     scenes: ScenesArgument,
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="PATH",
-            help="Output NAME.zip, NAME.sog, FOLDER/lod-meta.json or NAME.sogxt/ for levels of detail, a folder, or "
-            "'-' for standard output. Default: next to the scene.",
+        output_option(
+            "Output NAME.zip, NAME.sog, FOLDER/lod-meta.json or NAME.sogxt/ for levels of detail, a folder, or "
+            "'-' for standard output. Default: next to the scene."
         ),
     ] = None,
     *,

@@ -16,6 +16,7 @@ from kissgs.cli.options import (
     OriginOption,
     SceneOptions,
     ScenesArgument,
+    output_option,
     with_option_groups,
 )
 from kissgs.core.errors import InvalidContainerError, OutputError
@@ -50,12 +51,7 @@ def decompress(
     containers: ScenesArgument,
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="PATH",
-            help="Output NAME.ply, a folder, or '-' for standard output. Default: next to the container.",
-        ),
+        output_option("Output NAME.ply, a folder, or '-' for standard output. Default: next to the container."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,

@@ -23,7 +23,7 @@ from rich.text import Text
 from kissgs.core.errors import InvalidSceneError, KissgsError, OutputError, UnsupportedError
 from kissgs.core.progress import Progress as Receiver
 from kissgs.core.progress import silent
-from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, SCENE_ENDINGS, named_manifest, names_folder
+from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, named_manifest, names_folder
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -187,7 +187,8 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
             raise OutputError(f"{len(inputs)} inputs cannot all become {output}; {remedy}")
         return [output]
     if output is not None and not names_folder(str(output) + "/" * is_named_folder):
-        _refuse_file_name(output, suffix)
+        file = f"in {suffix} if it is a file, or " if suffix else ""
+        raise OutputError(f"there is no folder {output!s:.100}; end it {file}in a slash to make a folder")
     if output is not None and "-" in inputs:
         raise OutputError(f"-o {output} is a folder, but standard input has no name; give -o NAME{suffix}")
     targets = []
@@ -209,22 +210,6 @@ def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:
     read, written = (Path(name).suffix.lower() for name in inputs)
     if written != read and written in {suffix, *(ENDINGS if suffix in ENDINGS else ())} - {""}:
         raise OutputError(f"{inputs[1]:.100} does not exist; if it is the output, name it with -o {inputs[1]:.100}")
-
-
-def _refuse_file_name(folder: Path, suffix: str) -> None:
-    """Raise OutputError if the name of a folder to be made is that of a scene's file, which somebody expects there."""
-    ending = folder.suffix.lower()
-    if not ending:
-        file = f", or in {suffix}" if suffix else ""
-        raise OutputError(f"there is no folder {folder!s:.100}; end it in a slash to make it{file}")
-    if not suffix:
-        raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; end it in a slash")
-    if ending in (*ENDINGS, *SCENE_ENDINGS):
-        raise OutputError(
-            f"{folder!s:.100} has the ending of another format than {suffix}, which this command writes; use kissgs "
-            + ("compress" if ending in ENDINGS else "convert")
-        )
-    raise OutputError(f"{folder!s:.100} has an unknown ending; end it in {suffix}, or if it is a folder, in a slash")
 
 
 def _ends_with(path: Path, suffix: str) -> bool:

@@ -89,6 +89,12 @@ def budget_of(text: str) -> Values:
 
 # Single arguments and options.
 
+
+def output_option(help: str, *, metavar: str = "PATH") -> Any:  # noqa: ANN401  as typer.Option
+    """Declare ``--output``, of which each command says something else."""
+    return typer.Option("--output", "-o", metavar=metavar, help=help)
+
+
 ScenesArgument = Annotated[
     list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
 ]

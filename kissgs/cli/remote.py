@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kissgs.cli.files import Result, for_each_input, print_json, progress_bar, show
-from kissgs.cli.options import EncodingOptions, FilesArgument, ForceOption, with_option_groups
+from kissgs.cli.options import EncodingOptions, FilesArgument, ForceOption, output_option, with_option_groups
 from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.formats import ENDINGS, ending_of, named_container
 
@@ -38,9 +38,7 @@ def compress(
     scenes: FilesArgument,
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output", "-o", metavar="PATH", help="Output NAME.zip, NAME.sog or a folder. Default: next to the scene."
-        ),
+        output_option("Output NAME.zip, NAME.sog or a folder. Default: next to the scene."),
     ] = None,
     server: ServerOption = DEFAULT_SERVER,
     *,
@@ -94,7 +92,7 @@ def list_jobs(
 def get(
     job: JobArgument,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Output NAME.zip or NAME.sog. Default: the name of the scene.")
+        Path | None, output_option("Output NAME.zip or NAME.sog. Default: the name of the scene.")
     ] = None,
     server: ServerOption = DEFAULT_SERVER,
     force: ForceOption = False,

@@ -16,7 +16,7 @@ import typer
 
 from kissgs.cli.files import Result, check_input, for_each_input, progress_bar, say_notes, show, source, write_output
 from kissgs.cli.interrupts import Interrupted
-from kissgs.cli.options import CaptureOptions, ForceOption, SceneOptions, with_option_groups
+from kissgs.cli.options import CaptureOptions, ForceOption, SceneOptions, output_option, with_option_groups
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.formats import names_folder
 
@@ -34,11 +34,9 @@ def view(
     ],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
+        output_option(
+            "Write one HTML file with viewer and scene, which opens from disk without a network, and exit.",
             metavar="PAGE.html",
-            help="Write one HTML file with viewer and scene, which opens from disk without a network, and exit.",
         ),
     ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the server; 0 for a free one.")] = 0,
@@ -256,12 +254,9 @@ def render(
     file: Annotated[str, typer.Argument(metavar="FILE", help="Scene to render, of any format that kissgs reads.")],
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="PATH",
-            help="Output NAME.png, NAME.webp, a folder, or '-' for a PNG on standard output. Default: a .png next "
-            "to the scene.",
+        output_option(
+            "Output NAME.png, NAME.webp, a folder, or '-' for a PNG on standard output. Default: a .png next "
+            "to the scene."
         ),
     ] = None,
     *,
