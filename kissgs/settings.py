@@ -589,6 +589,7 @@ class Settings(StageSettings):
 def _validated(
     preset: Preset | str,
     marks: Mapping[str, bool],
+    /,
     *,
     compact: Any = None,  # noqa: ANN401
     finetune: Any = None,  # noqa: ANN401

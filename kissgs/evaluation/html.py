@@ -207,16 +207,16 @@ def html_report(
         photo = view.load_photo() if group.against == "photos" else None
         sections.append(_section(anchor, compared, renderings, photo, full))
     progress("html", 1.0)
-    summary, note = (
-        f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}",
-        evaluation.note,
-    )
     images = "Their images are" if len(shown) == len(evaluation.views) else f"Images of the worst {len(shown)} are"
+    summary = f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}. {images} below, the "
+    summary += "worst first."
+    if evaluation.note:
+        summary += f" {evaluation.note[0].upper()}{evaluation.note[1:]}."
     return Template(files("kissgs.evaluation").joinpath("report.html").read_text(encoding="utf-8")).substitute(
         title=escape(f"{candidate.name} compared with {reference.name}"),
         reference=escape(reference.name),
         candidate=escape(candidate.name),
-        summary=escape(f"{summary}. {images} below, the worst first.{note and f' {note[0].upper()}{note[1:]}.'}"),
+        summary=escape(summary),
         cards="\n".join(
             f'<div class="card"><dt>{name}</dt><dd>{value}</dd><dd class="remark">{remark}</dd></div>'
             for name, value, remark in _cards(evaluation, reference.bytes, candidate.bytes)
