@@ -21,6 +21,7 @@ from kissgs.cli.options import (
     TrainingOptions,
     chosen,
     count_of,
+    open_views,
     output_option,
     share_of,
     with_option_groups,
@@ -104,7 +105,7 @@ def compact(
     training.refuse_without_training(settings)
     if output is None:
         raise UnsupportedError("missing -o: by default the output would overwrite the input")
-    capture = training.open()
+    capture = open_views(training.views)
 
     def work(scene: str, target: Path) -> Result:
         piped = str(target) == "-"
@@ -190,7 +191,7 @@ def compress(
     renders = (
         encoding.evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
     )
-    capture = training.open()
+    capture = open_views(training.views)
     training.refuse_without_training(decided(settings, capture))
     if capture is not None and not renders and not common.quiet:
         sys.stderr.write(

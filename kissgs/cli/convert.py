@@ -26,12 +26,7 @@ from kissgs.formats import ENDINGS, OUTPUT_FORMATS, SCENE_ENDINGS, WRITTEN, alte
 
 
 @with_option_groups
-def info(
-    files: FilesArgument,
-    as_json: JsonOption = False,
-    *,
-    common: SceneOptions,
-) -> None:
+def info(files: FilesArgument, as_json: JsonOption = False, *, common: SceneOptions) -> None:
     """Describe scenes of any format and containers: Gaussians, SH degree, bytes per file, value ranges."""
     from kissgs.cli.tables import info_table
     from kissgs.pipeline.scene_files import describe

@@ -294,10 +294,6 @@ class TrainingOptions:
         ),
     ] = "cpu"
 
-    def open(self) -> Views | None:
-        """Load the capture; None if there is none."""
-        return open_views(self.views)
-
     def refuse_without_training(self, settings: Settings) -> None:
         """Raise UnsupportedError if ``--checkpoint`` or ``--device`` is given where nothing could train."""
         trains = settings.finetune.enabled or (settings.compact.enabled and settings.compact.trains) or settings.aims

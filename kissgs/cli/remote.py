@@ -73,10 +73,7 @@ def compress(
 
 
 @app.command(name="list")
-def list_jobs(
-    server: ServerOption = DEFAULT_SERVER,
-    as_json: ServiceJsonOption = False,
-) -> None:
+def list_jobs(server: ServerOption = DEFAULT_SERVER, as_json: ServiceJsonOption = False) -> None:
     """List the latest jobs on a server."""
     with _service(server) as remote:
         jobs = remote.jobs()
@@ -115,10 +112,7 @@ def get(
 
 
 @app.command()
-def cancel(
-    job: JobArgument,
-    server: ServerOption = DEFAULT_SERVER,
-) -> None:
+def cancel(job: JobArgument, server: ServerOption = DEFAULT_SERVER) -> None:
     """Cancel a job."""
     with _service(server) as remote:
         show(f"{job} {remote.cancel(job)['state']}")
