@@ -36,9 +36,6 @@ FIRST_RETRY_SECONDS = 8.0
 WAIT = "wait for server"
 """Stage in which a request is repeated after a while."""
 
-_ERRORS: dict[str, type[KissgsError]] = {kind.code: kind for kind in (InvalidSceneError, UnsupportedError)}
-"""Errors by problem type, for problems of the scene or the settings that the library itself would raise."""
-
 T = TypeVar("T")
 
 
@@ -122,18 +119,14 @@ class Remote:
         try:
             status = self.follow(status["id"], progress)
             self.download(status, target, overwrite=overwrite, progress=progress)
-        except KissgsError as error:
-            if isinstance(error, Cancelled):
-                self._cancel_quietly(status["id"])
-            raise _with_file_name(error, source) from error
-        except BaseException:
-            self._cancel_quietly(status["id"])
+        except BaseException as error:
+            if not isinstance(error, KissgsError) or isinstance(error, Cancelled):
+                with contextlib.suppress(KissgsError):  # the original error matters more
+                    self.cancel(status["id"])
+            if isinstance(error, KissgsError):
+                raise _with_file_name(error, source) from error
             raise
         return status
-
-    def _cancel_quietly(self, job: str) -> None:
-        with contextlib.suppress(KissgsError):  # the original error matters more
-            self.cancel(job)
 
     def submit(
         self,
@@ -162,24 +155,15 @@ class Remote:
             KissgsError: see :meth:`compress`.
         """
         path = Path(source)
-        options = {
-            **_given(settings or Settings()),
-            "format": container,
-            "evaluate": evaluate,
-            **({} if origin is None else {"origin": origin}),
-        }
-        size = _size(path)
-        headers = {
-            "Content-Type": "application/octet-stream",
-            "Content-Length": str(size),
-            "Idempotency-Key": uuid.uuid4().hex,
-        }
+        options = {**_given(settings or Settings()), "format": container, "evaluate": evaluate}
+        options |= {} if origin is None else {"origin": origin}
+        params, size = {"options": json.dumps(options), "name": path.name}, _size(path)
+        headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
+        headers["Idempotency-Key"] = uuid.uuid4().hex
 
         def send() -> dict[str, Any]:
             body = _blocks(path, size, progress)
-            params = {"options": json.dumps(options), "name": path.name}
-            response = self._http.post("/v1/jobs", params=params, headers=headers, content=body)
-            return _checked(response).json()
+            return _checked(self._http.post("/v1/jobs", params=params, headers=headers, content=body)).json()
 
         try:
             return self._with_retries(send, progress)
@@ -201,8 +185,6 @@ class Remote:
             nonlocal last
             headers = {"Last-Event-ID": last} if last else {}
             with self._http.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as response:
-                if response.is_error:
-                    response.read()
                 for number, event, data in _events(_checked(response)):
                     last = number
                     if event == "progress":
@@ -220,7 +202,7 @@ class Remote:
         if status["state"] == "succeeded":
             return status
         problem = status.get("problem", {"code": "cancelled", "detail": f"the job was {status['state']} on the server"})
-        raise _error(problem)
+        raise _error(problem["code"], problem["detail"])
 
     def download(
         self, status: dict[str, Any], destination: Path, *, overwrite: bool = False, progress: Progress = silent
@@ -233,8 +215,6 @@ class Remote:
 
         def fetch() -> None:
             with self._http.stream("GET", status["links"]["result"]) as response:
-                if response.is_error:
-                    response.read()
                 _checked(response)
                 size, digest, done = int(response.headers["Content-Length"]), hashlib.sha256(), 0
                 with atomic_file(destination, overwrite=overwrite) as file:
@@ -255,7 +235,7 @@ class Remote:
         Raises:
             RemoteError: the service cannot be reached, or there is no such job.
         """
-        return self._once(lambda: _checked(self._http.get(f"/v1/jobs/{job}", params={"wait": wait})).json())
+        return self._json("GET", f"/v1/jobs/{job}", wait=wait)
 
     def cancel(self, job: str) -> dict[str, Any]:
         """Cancel a job, and return its status.
@@ -263,7 +243,7 @@ class Remote:
         Raises:
             RemoteError: the service cannot be reached, or there is no such job.
         """
-        return self._once(lambda: _checked(self._http.post(f"/v1/jobs/{job}/cancel")).json())
+        return self._json("POST", f"/v1/jobs/{job}/cancel")
 
     def jobs(self, limit: int = 20) -> list[dict[str, Any]]:
         """Return the status of the ``limit`` latest jobs, newest first.
@@ -271,7 +251,10 @@ class Remote:
         Raises:
             RemoteError: the service cannot be reached.
         """
-        return self._once(lambda: _checked(self._http.get("/v1/jobs", params={"limit": limit})).json()["jobs"])
+        return self._json("GET", "/v1/jobs", limit=limit)["jobs"]
+
+    def _json(self, method: str, path: str, **params: float) -> Any:  # noqa: ANN401
+        return self._once(lambda: _checked(self._http.request(method, path, params=params)).json())
 
     def _once(self, request: Callable[[], T]) -> T:
         import httpx
@@ -376,10 +359,11 @@ def _with_file_name(error: KissgsError, source: str | PathLike[str]) -> KissgsEr
 def _checked(response: httpx.Response) -> httpx.Response:
     if not response.is_error:
         return response
+    response.read()
     try:
         problem = response.json()
         hint = "; set KISSGS_KEY (in Python key)" if problem["code"] == "unauthorized" else ""
-        error = _error({"code": problem["code"], "detail": problem["detail"] + hint})
+        error = _error(problem["code"], problem["detail"] + hint)
     except (ValueError, KeyError, TypeError):
         error = RemoteError(
             f"{response.url.host} answered with status {response.status_code}; check that it is a kissgs service"
@@ -390,6 +374,7 @@ def _checked(response: httpx.Response) -> httpx.Response:
     raise error
 
 
-def _error(problem: dict[str, str]) -> KissgsError:
-    kind = _ERRORS.get(problem["code"], RemoteError)
-    return kind(problem["detail"])
+def _error(code: str, detail: str) -> KissgsError:
+    """Return the error of a problem of the scene or the settings that the library itself would raise, or another."""
+    kinds: dict[str, type[KissgsError]] = {kind.code: kind for kind in (InvalidSceneError, UnsupportedError)}
+    return kinds.get(code, RemoteError)(detail)

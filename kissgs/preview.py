@@ -74,13 +74,8 @@ def streamed_folder(source: Path) -> StreamedFolder:
     inside = {name: path for name in names if (path := _file_inside(root, name)) is not None}
     others = [name for name in names if name not in inside]
     unusable = tuple(name for name in others if os.path.lexists(root / name))
-    return StreamedFolder(
-        name=os.fsencode(root.name).decode(errors="replace") or "scene",
-        manifest=kind.manifest,
-        files=inside,
-        missing=tuple(name for name in others if name not in unusable),
-        unusable=unusable,
-    )
+    missing = tuple(name for name in others if name not in unusable)
+    return StreamedFolder(_stem(root), kind.manifest, inside, missing, unusable)
 
 
 def _file_inside(root: Path, name: str) -> Path | None:
@@ -119,7 +114,7 @@ def fitting_level(source: Path | bytes, max_gaussians: int | None = None) -> tup
     return next(fitting, tree.levels - 1), tree.levels
 
 
-# Files of the preview page: where they are, which belong to it, and its content security policy.
+# Files of the preview page.
 
 _PACKAGE = Path(__file__).parent
 
@@ -136,9 +131,7 @@ def page_files() -> dict[str, Path]:
     """Return the files of the page by their paths from it, such as ``vendor/three/build/three.module.min.js``."""
     folder = ROOT / "web_decoder"
     if not (folder / PAGE).is_file():
-        raise UnsupportedError(
-            f"this installation has no preview page: {folder / PAGE} is missing; install kissgs again"
-        )
+        raise UnsupportedError(f"there is no preview page: {folder / PAGE} is missing; install kissgs again")
     if not (folder / "vendor" / "versions.json").is_file():
         raise UnsupportedError(
             "Spark and three.js, which draw the scene, are not installed; add --fetch-viewer to download them once"
@@ -217,17 +210,18 @@ def _as_container(source: Path | bytes, reading: ReadOptions) -> PageScene | Non
     if kind is None or reading.antialiased is not None:
         return None
     root = scene_root(source) if isinstance(source, Path) else source
-    name = f"{_stem(source)}{ending_of(kind)}"
     if isinstance(root, bytes):
-        return PageScene(name, root, converted=False)
-    if not root.is_dir():
+        data = root
+    elif root.is_dir():
+        with open_source(root) as files:
+            names = sorted(name for name in files.names() if name.endswith(_FILE_ENDINGS))
+            data = zip_bytes({name: files.read(name, _MAX_FILE_BYTES) for name in names})
+    else:
         try:
-            return PageScene(name, root.read_bytes(), converted=False)
+            data = root.read_bytes()
         except OSError as error:
             raise InvalidSceneError(f"cannot read {root!s:.100}: {reason_of(error)}") from error
-    with open_source(root) as files:
-        names = sorted(name for name in files.names() if name.endswith(_FILE_ENDINGS))
-        return PageScene(name, zip_bytes({name: files.read(name, _MAX_FILE_BYTES) for name in names}), converted=False)
+    return PageScene(f"{_stem(source)}{ending_of(kind)}", data, converted=False)
 
 
 def _stem(source: Path | bytes) -> str:
@@ -238,13 +232,9 @@ def _stem(source: Path | bytes) -> str:
     return os.fsencode(root.name if root.is_dir() else root.stem).decode(errors="replace") or "scene"
 
 
-# The preview page and a scene in one HTML file, which works from disk and without a network.
-#
-# Modules cannot be imported from ``file:``. They are therefore embedded as text, in an order in which each comes after
-# those that it imports; ``web_decoder/standalone.js`` makes a blob of each, and their imports name the blobs'
-# addresses.
-
-_START, _PROGRAM, _STYLE = "standalone.js", "preview.js", "preview.css"
+# The preview page and a scene in one HTML file. Modules cannot be imported from ``file:``. They are therefore embedded
+# as text, in an order in which each comes after those that it imports; ``web_decoder/standalone.js`` makes a blob of
+# each, and their imports name the blobs' addresses.
 
 _COMMENT = re.compile(r"/\*\*.*?\*/", re.DOTALL)
 """Comments with types and examples, whose imports are none; minified files have no others than licences."""
@@ -262,10 +252,9 @@ def standalone_page(scene: PageScene) -> bytes:
     """Return the page with a container inside: UTF-8, equal bytes for equal input."""
     files = page_files()
     page = _text(files[PAGE])
-    style, start = _text(files[_STYLE]), _text(files[_START])
-    modules = _Modules(files, json.loads(import_map(page))["imports"])
-    modules.add(_PROGRAM)
-    packed = gzip.compress(json.dumps(modules.linked, ensure_ascii=False).encode(), compresslevel=9, mtime=0)
+    style, start = _text(files["preview.css"]), _text(files["standalone.js"])
+    modules = _linked_modules(files, json.loads(import_map(page))["imports"], "preview.js")
+    packed = gzip.compress(json.dumps(modules, ensure_ascii=False).encode(), compresslevel=9, mtime=0)
     title = html.escape(scene.name)
     policy = _STANDALONE_POLICY.format(script=hash_source(start), style=hash_source(style))
     meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}" />\n    '
@@ -286,41 +275,37 @@ def standalone_page(scene: PageScene) -> bytes:
     return page.encode()
 
 
-class _Modules:
-    """Modules of the page in the order of their imports; ``linked`` holds names and texts."""
+def _linked_modules(files: dict[str, Path], imports: dict[str, str], program: str) -> list[tuple[str, str]]:
+    """Return the names and texts of a module and of all that it imports, each after those that it imports itself."""
+    begun, linked = set[str](), dict[str, str]()
 
-    def __init__(self, files: dict[str, Path], imports: dict[str, str]) -> None:
-        self._files = files
-        self._imports = imports
-        self._begun: set[str] = set()
-        self.linked: list[tuple[str, str]] = []
-
-    def add(self, name: str) -> None:
-        """Add a module after all modules that it imports."""
-        if name in self._begun:
-            assert any(name == known for known, _ in self.linked), f"{name} imports itself"  # noqa: S101
-            return
-        self._begun.add(name)
-        text = _text(self._files[name])
-        if not name.endswith(".min.js"):
-            text = _COMMENT.sub("", text)
-            text = _WORKER.sub(lambda match: self._link(name, match[1]) or match[0], text)
-        text = _IMPORT.sub(lambda match: match[1] + (self._link(name, match[3]) or match[0][len(match[1]) :]), text)
-        self.linked.append((name, text))
-
-    def _link(self, name: str, specifier: str) -> str | None:
+    def address(specifier: str, importer: str) -> str | None:
         """Return what a module's text imports instead of ``specifier``; None if that is no file of the page."""
-        target = self._resolve(name, specifier)
-        if target not in self._files:
+        target = posixpath.join(posixpath.dirname(importer), specifier)
+        for known, place in imports.items():
+            if specifier == known or (known.endswith("/") and specifier.startswith(known)):
+                target = place + specifier[len(known) :]
+                break
+        target = posixpath.normpath(target)
+        if target not in files:
             return None
-        self.add(target)
+        add(target)
         return f'"module:{target}"'
 
-    def _resolve(self, name: str, specifier: str) -> str:
-        for known, address in self._imports.items():
-            if specifier == known or (known.endswith("/") and specifier.startswith(known)):
-                return posixpath.normpath(address + specifier[len(known) :])
-        return posixpath.normpath(posixpath.join(posixpath.dirname(name), specifier))
+    def add(name: str) -> None:
+        if name in begun:
+            assert name in linked, f"{name} imports itself"  # noqa: S101
+            return
+        begun.add(name)
+        text = _text(files[name])
+        if not name.endswith(".min.js"):
+            text = _COMMENT.sub("", text)
+            text = _WORKER.sub(lambda match: address(match[1], name) or match[0], text)
+        text = _IMPORT.sub(lambda match: match[1] + (address(match[3], name) or match[0][len(match[1]) :]), text)
+        linked[name] = text
+
+    add(program)
+    return list(linked.items())
 
 
 def _text(path: Path) -> str:
@@ -340,7 +325,7 @@ def _licences(files: dict[str, Path]) -> str:
     return "<!--\n" + "\n\n".join(texts).replace("--", "- -") + "\n-->"
 
 
-# A server of the preview page and one scene, for browsers on this machine.
+# A server of the preview page and one scene.
 
 HOST = "127.0.0.1"
 SLOWEST_SECONDS = 60
@@ -415,7 +400,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(body=False)
 
     def _answer(self, *, body: bool) -> None:
-        status, content, media_type = self._find()
+        status, content, media_type = self._find(unquote(urlsplit(self.path).path))
         self.send_response(status)
         for name, value in _HEADERS.items():
             self.send_header(name, value)
@@ -427,19 +412,16 @@ class _Handler(BaseHTTPRequestHandler):
         if body:
             self.wfile.write(content)
 
-    def _find(self) -> tuple[HTTPStatus, bytes, str]:
-        """Return the status, the content and its media type for the path of this request."""
-        path = unquote(urlsplit(self.path).path)
+    def _find(self, path: str) -> tuple[HTTPStatus, bytes, str]:
+        """Return the status, the content and its media type."""
         if self.headers.get("Host") not in self.server.hosts:
             return HTTPStatus.FORBIDDEN, b"this server answers requests to this machine only\n", _TYPES[""]
-        found = self.server.contents.get(path)
-        if found is None:
+        try:
+            found = self.server.contents[path]
+            content = found if isinstance(found, bytes) else found.read_bytes()
+        except (KeyError, OSError):  # a file of a streamed scene may have been removed meanwhile
             return HTTPStatus.NOT_FOUND, b"there is no such file\n", _TYPES[""]
         suffix = ".html" if path == "/" else Path(path).suffix
-        try:
-            content = found if isinstance(found, bytes) else found.read_bytes()
-        except OSError:  # a file of a streamed scene that has been removed meanwhile
-            return HTTPStatus.NOT_FOUND, b"there is no such file\n", _TYPES[""]
         return HTTPStatus.OK, content, _TYPES.get(suffix, "application/octet-stream")
 
     def version_string(self) -> str:

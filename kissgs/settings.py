@@ -42,6 +42,11 @@ def of_preset(default: object, meaning: str) -> Any:  # noqa: ANN401  as Field
     return Field(default, description=meaning, json_schema_extra=dict(_OF_PRESET))
 
 
+def setting(default: object, meaning: str) -> Any:  # noqa: ANN401  as Field
+    """Declare a setting that users may change."""
+    return Field(default, description=meaning)
+
+
 class StageSettings(BaseModel):
     """Base class of the groups of settings, and of all of them together."""
 
@@ -56,10 +61,9 @@ class StageSettings(BaseModel):
     def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         """Leave out what belongs to the preset; answers of the service contain it, so that other names are open."""
         reference = handler(core_schema)
-        schema = handler.resolve_ref_schema(reference)
-        names = set(cls.public())
-        if not names.issuperset(cls.model_fields):
-            schema["properties"] = {name: found for name, found in schema["properties"].items() if name in names}
+        schema, names = handler.resolve_ref_schema(reference), cls.public()
+        if len(names) < len(cls.model_fields):
+            schema["properties"] = {name: schema["properties"][name] for name in names}
             del schema["additionalProperties"]
         return reference
 
@@ -96,25 +100,23 @@ BUDGETS = ("count", "ratio", "max_psnr_drop", "auto_count")
 class CompactSettings(TrainingViewSettings):
     """Settings of compaction: the number of Gaussians to keep, the pruning schedule and the training."""
 
-    count: Annotated[int, Field(ge=1)] | None = Field(
-        None, description="Number of Gaussians to keep, if there are more."
+    count: Annotated[int, Field(ge=1)] | None = setting(None, "Number of Gaussians to keep, if there are more.")
+    ratio: Annotated[float, Field(gt=0, le=1)] | None = setting(None, "Share of the Gaussians to keep.")
+    max_psnr_drop: Annotated[float, Field(gt=0, le=20)] | None = setting(
+        None, "Keep as few Gaussians as lose at most this PSNR, decibels, measured as for that of encode."
     )
-    ratio: Annotated[float, Field(gt=0, le=1)] | None = Field(None, description="Share of the Gaussians to keep.")
-    max_psnr_drop: Annotated[float, Field(gt=0, le=20)] | None = Field(
-        None, description="Keep as few Gaussians as lose at most this PSNR, decibels, measured as for that of encode."
-    )
-    auto_count: bool | None = Field(
+    auto_count: bool | None = setting(
         None,
-        description="Choose the number of Gaussians that serves the goal of encode best. auto: with a goal other than "
-        "psnr, held-out photographs or fine-tuning without a capture, and torch, unless another budget is given.",
+        "Choose the number of Gaussians that serves the goal of encode best. auto: with a goal other than psnr, "
+        "held-out photographs or fine-tuning without a capture, and torch, unless another budget is given.",
     )
-    method: Literal["prune", "merge"] = Field(
+    method: Literal["prune", "merge"] = setting(
         "prune",
-        description="prune: remove the Gaussians that images miss least, and train the rest. merge: replace neighbours "
+        "prune: remove the Gaussians that images miss least, and train the rest. merge: replace neighbours "
         "by one Gaussian with their mean, covariance, colour and opacity; no images, no cameras, no training.",
     )
-    max_compactions: Annotated[int, Field(ge=1, le=20)] = Field(
-        3, description="With auto_count: largest number of containers that are made of trained scenes."
+    max_compactions: Annotated[int, Field(ge=1, le=20)] = setting(
+        3, "With auto_count: largest number of containers that are made of trained scenes."
     )
     min_keep_per_scoring: Annotated[float, Field(ge=0, le=0.99)] = of_preset(
         0.8, "Smallest share that pruning by one scoring may leave; deeper pruning scores again. 0: score once."
@@ -165,14 +167,14 @@ class CompactSettings(TrainingViewSettings):
 Step = Annotated[float, Field(ge=1e-4, le=10)]
 Bits = Annotated[float, Field(ge=0, le=200)]
 
-SIZE = re.compile(r"(\d+|\d{1,3}(?:,\d{3})+|\d*\.\d+)\s*([kmgt]i?)?b?", re.IGNORECASE)
+_SIZE = re.compile(r"(\d+|\d{1,3}(?:,\d{3})+|\d*\.\d+)\s*([kmgt]i?)?b?", re.IGNORECASE)
 
 
 def _normalize_size(size: object) -> object:
     """Rewrite a size for pydantic; refuse "3,5MB" and unknown units, which pydantic would misread."""
     if not isinstance(size, str):
         return size
-    found = SIZE.fullmatch(size.strip())
+    found = _SIZE.fullmatch(size.strip())
     if found is None or ("." in found[1] and not found[2]):
         raise PydanticCustomError("size", "Write 800kB, 2.5MB or 2,500,000")
     return found[1].replace(",", "") + (f"{found[2]}B" if found[2] else "")
@@ -180,39 +182,47 @@ def _normalize_size(size: object) -> object:
 
 Size = Annotated[ByteSize, BeforeValidator(_normalize_size)]
 
+GOALS = ("psnr", "target_size", "max_psnr_drop", "max_ssim_drop")
+
+UNIFORM_ONLY = (
+    *("shared_step_size", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),
+    "sh_weight_power",
+)
+"""Values of uniform planning; with rate_distortion, lambda and sensitivity decide instead."""
+
 
 class EncodeSettings(StageSettings):
     """Settings of the encoder. A decoder needs none of them."""
 
     rate_distortion: bool = of_preset(True, "Choose by squared image error plus lambda times bits, not uniform steps.")
-    quality_offset_db: Annotated[float, Field(ge=-30, le=30)] = Field(
-        0.0, description="PSNR to aim at, decibels above that of preset paper or fast, whichever is better here."
+    quality_offset_db: Annotated[float, Field(ge=-30, le=30)] = setting(
+        0.0, "PSNR to aim at, decibels above that of preset paper or fast, whichever is better here."
     )
-    rd_lambda: Annotated[float, Field(gt=0, lt=1)] | None = Field(
-        None, description="Lambda, squared image error per bit; auto: from quality_offset_db."
+    rd_lambda: Annotated[float, Field(gt=0, lt=1)] | None = setting(
+        None, "Lambda, squared image error per bit; auto: from quality_offset_db."
     )
-    psnr: Annotated[float, Field(gt=0, le=200)] | None = Field(
+    psnr: Annotated[float, Field(gt=0, le=200)] | None = setting(
         None,
-        description="Search for the smallest container with at least this PSNR to renderings of the scene, decibels; a "
+        "Search for the smallest container with at least this PSNR to renderings of the scene, decibels; a "
         "view counts for at most 60.",
     )
-    target_size: Annotated[Size, Field(ge=1)] | None = Field(
+    target_size: Annotated[Size, Field(ge=1)] | None = setting(
         None,
-        description="Search for the best container of at most this size, bytes, such as 800kB or 2.5MB; with a limit "
+        "Search for the best container of at most this size, bytes, such as 800kB or 2.5MB; with a limit "
         "of quality, for the smallest container of that quality, which then must not be larger.",
     )
-    max_psnr_drop: Annotated[float, Field(gt=0, le=20)] | None = Field(
+    max_psnr_drop: Annotated[float, Field(gt=0, le=20)] | None = setting(
         None,
-        description="Search for the smallest container that loses at most this PSNR to held-out photographs, decibels; "
+        "Search for the smallest container that loses at most this PSNR to held-out photographs, decibels; "
         "without a capture at poses from which they might have been taken, as if the scene had 30 dB to them.",
     )
-    max_ssim_drop: Annotated[float, Field(gt=0, le=1)] | None = Field(
+    max_ssim_drop: Annotated[float, Field(gt=0, le=1)] | None = setting(
         None,
-        description="Search for the smallest container that loses at most this SSIM to held-out photographs; without a "
+        "Search for the smallest container that loses at most this SSIM to held-out photographs; without a "
         "capture to renderings of the scene, at poses from which they might have been taken.",
     )
-    max_encodes: Annotated[int, Field(ge=1, le=100)] = Field(
-        10, description="With a goal: largest number of containers made of one scene, beside fine-tuned ones."
+    max_encodes: Annotated[int, Field(ge=1, le=100)] = setting(
+        10, "With a goal: largest number of containers made of one scene, beside fine-tuned ones."
     )
     prune_threshold_bits: Bits = of_preset(18.0, "Prune what is worth fewer bits, times 1 - view_uncertainty.")
     step_classes: Annotated[int, Field(ge=1, le=32)] = of_preset(3, "Classes of sensitivity, each with its own steps.")
@@ -272,9 +282,9 @@ class EncodeSettings(StageSettings):
     high_effort_pixels: Annotated[int, Field(ge=0, le=MAX_GRID_SIDE**2)] = of_preset(
         30_000, "Images of up to so many pixels get at least quality 100 and method 5, if it pays for their attribute."
     )
-    seed: Seed = Field(
+    seed: Seed = setting(
         0,
-        description="Seed of all random choices, those of training included. Equal input, settings, seed and kind of "
+        "Seed of all random choices, those of training included. Equal input, settings, seed and kind of "
         "processor give equal bytes.",
     )
 
@@ -284,18 +294,14 @@ class EncodeSettings(StageSettings):
         return any(getattr(self, name) is not None for name in GOALS)
 
     @model_validator(mode="after")
-    def _no_uniform_settings(self) -> Self:
-        defaults = {name: type(self).model_fields[name].default for name in UNIFORM_ONLY}
-        unused = [name for name, default in defaults.items() if self.rate_distortion and getattr(self, name) != default]
-        if unused:
+    def _consistent(self) -> Self:
+        fields = type(self).model_fields
+        unused = [name for name in UNIFORM_ONLY if getattr(self, name) != fields[name].default]
+        if self.rate_distortion and unused:
             raise ValueError(
                 f"{unused[0]} has no effect with rate_distortion: set quality_offset_db or rd_lambda instead, or "
                 "rate_distortion=false with it"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _one_goal(self) -> Self:
         goals = [name for name in ("rd_lambda", *GOALS) if getattr(self, name) is not None]
         if len(goals) > 1 and goals[0] == "rd_lambda":
             raise ValueError(f"{goals[0]} and {goals[1]} cannot both be met; give one")
@@ -304,31 +310,19 @@ class EncodeSettings(StageSettings):
         return self
 
 
-GOALS = ("psnr", "target_size", "max_psnr_drop", "max_ssim_drop")
-
-UNIFORM_ONLY = (
-    *("shared_step_size", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),
-    "sh_weight_power",
-)
-"""Settings of uniform planning; with rate_distortion, lambda and sensitivity decide instead."""
-
-
 # ``FinetuneSettings``: training of the quantised levels through the decoder.
 
 
 class FinetuneSettings(TrainingViewSettings):
     """Settings of fine-tuning: training of the levels, so that the decoded scene renders closer to the targets."""
 
-    enabled: bool | None = Field(
+    enabled: bool | None = setting(
         None,
-        description="Fine-tune, against photographs if there are any, else renderings. auto: with a goal other than "
+        "Fine-tune, against photographs if there are any, else renderings. auto: with a goal other than "
         "psnr and held-out photographs or no capture, where torch is installed.",
     )
-    steps: int = Field(
-        1000,
-        ge=1,
-        le=1_000_000,
-        description="Number of training steps; a fifth more where auto_count of compact leaves training to complete.",
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = setting(
+        1000, "Number of training steps; a fifth more where auto_count of compact leaves training to complete."
     )
     batch: Annotated[int, Field(ge=1, le=64)] = of_preset(1, "Images per training step.")
     prune_threshold_bits: Annotated[float, Field(ge=0, le=200)] = of_preset(
@@ -346,24 +340,22 @@ class FinetuneSettings(TrainingViewSettings):
 
 # ``Duration``: a time in seconds, which may be written with a unit.
 
-UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
-
-DURATION = re.compile(r"(\d+|\d*\.\d+)\s*([a-z]*)", re.IGNORECASE)
+_UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 
 
 def _in_seconds(duration: object) -> object:
     if not isinstance(duration, str):
         return duration
-    found = DURATION.fullmatch(duration.strip())
-    if found is None or found[2].lower() not in UNITS:
+    found = re.fullmatch(r"(\d+|\d*\.\d+)\s*([a-z]*)", duration.strip(), re.IGNORECASE)
+    if found is None or found[2].lower() not in _UNITS:
         raise PydanticCustomError("duration", "Write 30s, 2min, 1h or a number of seconds")
-    return float(found[1]) * UNITS[found[2].lower()]
+    return float(found[1]) * _UNITS[found[2].lower()]
 
 
-Duration = Annotated[float, BeforeValidator(_in_seconds)]
+Duration = Annotated[float, Field(gt=0, le=1e6), BeforeValidator(_in_seconds)]
 
 
-# Presets: named trade-offs between speed, size and quality, as differences from the defaults.
+# Presets, as differences from the defaults.
 
 
 class Preset(StrEnum):
@@ -375,89 +367,81 @@ class Preset(StrEnum):
     PAPER = "paper"
 
 
-ENCODE: dict[Preset, dict[str, Any]] = {
+PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
     Preset.FAST: {
-        "rate_distortion": False,
-        "order": "hilbert",
-        "sh_kmeans_iterations": 1,
-        "sh_neighbors": 32,
-        "codebook_order": "axes",
-        "codebook_max_effort": False,
-        "high_effort_pixels": 0,
-        "webp_quality": 50,
-        "webp_method": 2,
+        "compact": {"sparsify_steps": 0, "refine_steps": 0},
+        "encode": {
+            "rate_distortion": False,
+            "order": "hilbert",
+            "sh_kmeans_iterations": 1,
+            "sh_neighbors": 32,
+            "codebook_order": "axes",
+            "codebook_max_effort": False,
+            "high_effort_pixels": 0,
+            "webp_quality": 50,
+            "webp_method": 2,
+        },
+        "finetune": {"steps": 200},
     },
-    Preset.BALANCED: {},
+    Preset.BALANCED: {"compact": {}, "encode": {}, "finetune": {}},
     Preset.SMALL: {
-        "quality_offset_db": -0.4,
-        "color_refit_iterations": 4,
-        "sh_kmeans_iterations": 8,
-        "sh_neighbors": 128,
-        "plas_radius_decay": 0.9,
-        "webp_method": 6,
-        "high_effort_pixels": 100_000,
+        "compact": {"sparsify_steps": 5000, "refine_steps": 5000},
+        "encode": {
+            "quality_offset_db": -0.4,
+            "color_refit_iterations": 4,
+            "sh_kmeans_iterations": 8,
+            "sh_neighbors": 128,
+            "plas_radius_decay": 0.9,
+            "webp_method": 6,
+            "high_effort_pixels": 100_000,
+        },
+        "finetune": {"steps": 2000},
     },
     Preset.PAPER: {
-        "rate_distortion": False,
-        "order": "plas",
-        "rotation_form": "pras",
-        "shared_step_size": False,
-        "means_bits": 16,
-        "gaussians_per_codebook_entry": 8,
-        "sh_weight_power": 0,
-        "sh_tolerance": 0,
-        "sh_kmeans_iterations": 8,
-        "sh_neighbors": 128,
-        "codebook_order": "plas",
-        "plas_radius_decay": 0.95,
-        "prune_invisible": False,
-        "webp_quality": 75,
-        "webp_method": 4,
-        "codebook_max_effort": False,
-        "high_effort_pixels": 0,
+        "compact": {
+            "min_keep_per_scoring": 0.0,
+            "sparsify_steps": 5000,
+            "prune_rounds": 1,
+            "admm_rho": 5e-4,
+            "refine_steps": 5000,
+            "erank_weight": 0.01,
+            "min_scale_weight": 1.0,
+            "synthetic_view_share": 0.0,
+            "ssim_weight": 0.2,
+            "mse_weight": 0.0,
+            "means_lr_scale": 0.01,
+            "lr_scale": 1.0,
+            "final_lr_scale": 1.0,
+            "synthetic_lr_scale": 1.0,
+            "final_means_lr_scale": 0.00215,
+        },
+        "encode": {
+            "rate_distortion": False,
+            "order": "plas",
+            "rotation_form": "pras",
+            "shared_step_size": False,
+            "means_bits": 16,
+            "gaussians_per_codebook_entry": 8,
+            "sh_weight_power": 0,
+            "sh_tolerance": 0,
+            "sh_kmeans_iterations": 8,
+            "sh_neighbors": 128,
+            "codebook_order": "plas",
+            "plas_radius_decay": 0.95,
+            "prune_invisible": False,
+            "codebook_max_effort": False,
+            "high_effort_pixels": 0,
+        },
+        "finetune": {
+            "steps": 4000,
+            "batch": 8,
+            "ssim_weight": 0.2,
+            "mse_weight": 0.0,
+            "rate_weight": 0.0,
+            "tv_weight": 1.0,
+            "synthetic_view_share": 0.0,
+        },
     },
-}
-
-COMPACT: dict[Preset, dict[str, Any]] = {
-    Preset.FAST: {"sparsify_steps": 0, "refine_steps": 0},
-    Preset.BALANCED: {},
-    Preset.SMALL: {"sparsify_steps": 5000, "refine_steps": 5000},
-    Preset.PAPER: {
-        "min_keep_per_scoring": 0.0,
-        "sparsify_steps": 5000,
-        "prune_rounds": 1,
-        "admm_rho": 5e-4,
-        "refine_steps": 5000,
-        "erank_weight": 0.01,
-        "min_scale_weight": 1.0,
-        "synthetic_view_share": 0.0,
-        "ssim_weight": 0.2,
-        "mse_weight": 0.0,
-        "means_lr_scale": 0.01,
-        "lr_scale": 1.0,
-        "final_lr_scale": 1.0,
-        "synthetic_lr_scale": 1.0,
-        "final_means_lr_scale": 0.00215,
-    },
-}
-
-FINETUNE: dict[Preset, dict[str, Any]] = {
-    Preset.FAST: {"steps": 200},
-    Preset.BALANCED: {},
-    Preset.SMALL: {"steps": 2000},
-    Preset.PAPER: {
-        "steps": 4000,
-        "batch": 8,
-        "ssim_weight": 0.2,
-        "mse_weight": 0.0,
-        "rate_weight": 0.0,
-        "tv_weight": 1.0,
-        "synthetic_view_share": 0.0,
-    },
-}
-
-PRESETS = {
-    preset: {"compact": COMPACT[preset], "encode": ENCODE[preset], "finetune": FINETUNE[preset]} for preset in Preset
 }
 """Differences from the defaults, by preset and group."""
 
@@ -477,12 +461,10 @@ AIMED_DROP = 0.1
 class Settings(StageSettings):
     """All settings of a compression: one group per stage."""
 
-    preset: Preset = Field(Preset.BALANCED, description="Preset that settings which are not given come from.")
-    time_limit: Duration | None = Field(
+    preset: Preset = setting(Preset.BALANCED, "Preset that settings which are not given come from.")
+    time_limit: Duration | None = setting(
         None,
-        gt=0,
-        le=1e6,
-        description="Seconds that a compression may take, or 30s, 2min, 1h. A goal comes first: then time bounds the "
+        "Seconds that a compression may take, or 30s, 2min, 1h. A goal comes first: then time bounds the "
         "search. Without a goal: with photographs and torch, the smallest container found that loses at most 0.1 dB; "
         "else the preset, or fast if that takes too long. Equal bytes need equally fast machines.",
     )
@@ -541,15 +523,15 @@ class Settings(StageSettings):
 
     @model_validator(mode="after")
     def _a_goal_to_go_by(self) -> Self:
-        if self.compact.auto_count and self.compact.method == "merge":
-            raise ValueError("auto_count prunes; give count or ratio with method merge")
         compact = self.compact
+        if compact.auto_count and compact.method == "merge":
+            raise ValueError("auto_count prunes; give count or ratio with method merge")
         if self.time_limit is not None and (compact.count or compact.max_psnr_drop or (compact.ratio or 1.0) < 1):
             raise ValueError(
                 "time_limit does not apply to compaction by a given budget: leave out count, ratio and max_psnr_drop "
                 "of compact, or the time limit"
             )
-        if self.compact.auto_count and not (self.encode.has_goal or self.aims):
+        if compact.auto_count and not (self.encode.has_goal or self.aims):
             raise ValueError(
                 "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop, psnr or a time limit, or the "
                 "number of Gaussians to keep"
@@ -562,14 +544,13 @@ class Settings(StageSettings):
         if not isinstance(given, dict) or given.get("preset", Preset.BALANCED) not in list(Preset):
             return given  # validation reports the error
         groups = {name: _given_values(given.get(name, {})) for name in GROUPS}
-        chosen = PRESETS[Preset(given.get("preset", Preset.BALANCED))]
         shared = _shared_by_trainings(groups["encode"])
-        for name, values in groups.items():
-            if isinstance(values, dict):
-                preset = chosen[name] if name == "encode" else {**shared, **chosen[name]}
+        for name, of_preset in PRESETS[Preset(given.get("preset", Preset.BALANCED))].items():
+            if isinstance(groups[name], dict):
+                defaults = of_preset if name == "encode" else {**shared, **of_preset}
                 if not given.get("for_research"):
-                    _refuse_values_of_preset(name, values, preset)
-                groups[name] = {**preset, **values}
+                    _refuse_values_of_preset(name, groups[name], defaults)
+                groups[name] = {**defaults, **groups[name]}
         return {**given, **groups}
 
     @classmethod
@@ -594,7 +575,7 @@ class Settings(StageSettings):
         Raises:
             UnsupportedError: an unknown preset or setting, or a value out of range.
         """
-        return _validated(preset, {"compact": compact, "finetune": finetune, "time_limit": time_limit, **encode})
+        return _validated(preset, {}, compact=compact, finetune=finetune, time_limit=time_limit, **encode)
 
     @classmethod
     def research(cls, preset: Preset | str = Preset.BALANCED, **changes: Any) -> Settings:  # noqa: ANN401
@@ -602,18 +583,25 @@ class Settings(StageSettings):
 
         docs/reference/research.md lists them. They may change with any version.
         """
-        return _validated(preset, changes, for_research=True)
+        return _validated(preset, {"for_research": True}, **changes)
 
 
-def _validated(preset: Preset | str, changes: dict[str, Any], **marks: bool) -> Settings:
+def _validated(
+    preset: Preset | str,
+    marks: Mapping[str, bool],
+    /,
+    *,
+    compact: Any = None,  # noqa: ANN401
+    finetune: Any = None,  # noqa: ANN401
+    time_limit: float | str | None = None,
+    **encode: Any,  # noqa: ANN401
+) -> Settings:
     """Validate settings; an error becomes one sentence."""
     if preset not in list(Preset):
         raise UnsupportedError(f"there is no preset {preset!r}; choose one of {', '.join(Preset)}")
-    others = {name: changes.pop(name, None) for name in ("compact", "finetune", "time_limit")}
-    compact, finetune = others["compact"] or {}, others["finetune"] or {}
-    given = {**others, **marks, "preset": preset, "compact": compact, "finetune": finetune, "encode": changes}
+    groups = {"compact": compact or {}, "finetune": finetune or {}, "encode": encode}
     try:
-        return Settings.model_validate(given)
+        return Settings.model_validate({"preset": preset, "time_limit": time_limit, **groups, **marks})
     except ValidationError as error:
         problem = error.errors()[0]
         if problem["type"] == "value_error":
@@ -629,31 +617,26 @@ def _validated(preset: Preset | str, changes: dict[str, Any], **marks: bool) -> 
 def _given_values(group: Any) -> Any:  # noqa: ANN401
     """Return the values that are given for a group; validation reports what is no group."""
     if isinstance(group, BaseModel):
-        return group.model_dump(include=group.model_fields_set)
+        return group.model_dump(exclude_unset=True)
     return dict(group) if isinstance(group, Mapping) else group
 
 
 def _shared_by_trainings(encode: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return values of compaction and fine-tuning that settings of the encoder decide: the seed and the loss."""
-    if not isinstance(encode, dict):
-        return {}
     shared = dict[str, Any]()
-    with contextlib.suppress(ValidationError):  # reported once, for the encoder
-        shared["seed"] = _SEED.validate_python(encode.get("seed", 0))
-    if encode.get("max_ssim_drop") is not None:
-        shared["ssim_weight"] = SSIM_GOAL_WEIGHT
+    if isinstance(encode, dict):
+        with contextlib.suppress(ValidationError):  # reported once, for the encoder
+            shared["seed"] = TypeAdapter(Seed).validate_python(encode.get("seed", 0))
+        if encode.get("max_ssim_drop") is not None:
+            shared["ssim_weight"] = SSIM_GOAL_WEIGHT
     return shared
 
 
-_SEED = TypeAdapter(Seed)
-
-
-def _refuse_values_of_preset(group: str, values: Mapping[str, Any], preset: Mapping[str, Any]) -> None:
+def _refuse_values_of_preset(group: str, values: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
     """Raise ValueError for a value that belongs to the preset and differs from it; settings as JSON repeat them."""
-    model = GROUPS[group]
-    fields, public = model.model_fields, model.public()
+    fields, public = GROUPS[group].model_fields, GROUPS[group].public()
     for name, value in values.items():
-        if name in fields and name not in public and value != preset.get(name, fields[name].default):
+        if name in fields and name not in public and value != defaults.get(name, fields[name].default):
             raise ValueError(
                 f"{name} of {group} belongs to the preset; choose another preset, or change it for research "
                 "(Settings.research, docs/reference/research.md)"

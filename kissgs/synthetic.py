@@ -1,4 +1,7 @@
-"""Procedural sample scene with the appearance and statistics of a trained 3DGS reconstruction."""
+"""Procedural sample scene with the appearance and statistics of a trained 3DGS reconstruction.
+
+Axes as in COLMAP, y pointing down: the ground is y = 0, the camera looks along +z.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,6 @@ from kissgs.core.splats import (
 )
 
 # Surfaces of the sample scene: shapes, which map the unit square to a surface, and paint, solid textures.
-#
-# Axes as in COLMAP, y pointing down: the ground is y = 0, the camera looks along +z.
 
 UV = Float32[np.ndarray, "M 2"]
 Rows = Float32[np.ndarray, "M 3"]
@@ -41,17 +42,12 @@ def f32(values: Sequence[Any] | np.ndarray) -> Float32[np.ndarray, "..."]:
 class Surface:
     """Surface to be covered with Gaussians."""
 
-    share: float
-    """Share of all Gaussians."""
+    share: float  # of all Gaussians
     shape: Callable[[UV], Patch]
-    paint: Callable[[Rows], Rows]
-    """Map points to RGB in 0..1."""
-    specular: float = 0.0
-    """Brightness of the reflection of a light of strength 1."""
-    shadowed: bool = False
-    """Whether the objects cast shadows on the surface."""
-    luminous: bool = False
-    """Whether the surface shows its paint without lighting."""
+    paint: Callable[[Rows], Rows]  # RGB of points, 0 to 1
+    specular: float = 0.0  # brightness of the reflection of a light of strength 1
+    shadowed: bool = False  # by the objects
+    luminous: bool = False  # shows its paint without lighting
 
 
 # --- Shapes ---------------------------------------------------------------------------------------
@@ -192,8 +188,6 @@ SURFACES = (
 SHADOW_CASTERS = (ball, knot, block)
 
 
-# Procedural sample scene with the appearance and statistics of a trained 3DGS reconstruction.
-#
 # Surfaces are covered with flat Gaussians, densest where the texture has detail and where most cameras of a capture
 # would look. Light and shadow are baked into the constant colour, specular reflections into the higher SH bands.
 
@@ -219,8 +213,7 @@ def sample_scene(count: int = 60_000, *, sh_degree: int = 3, seed: int = 0) -> S
     if sh_degree not in range(len(SH_REST_COUNTS)):
         raise UnsupportedError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
     rng = np.random.Generator(np.random.PCG64(seed))
-    scene = empty_splats(count, SH_REST_COUNTS[sh_degree])
-    rows = rng.permutation(count)
+    rows, scene = rng.permutation(count), empty_splats(count, SH_REST_COUNTS[sh_degree])
     start = 0
     for part in _parts(count, sh_degree, rng):
         for name in ATTRIBUTES:
@@ -368,13 +361,10 @@ def _floaters(n: int, sh_degree: int, rng: np.random.Generator) -> Splats:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Light:
-    direction: Float32[np.ndarray, "3"]
-    """Unit vector towards the light."""
+    direction: Float32[np.ndarray, "3"]  # unit vector towards the light
     colour: Float32[np.ndarray, "3"]
-    wrap: float
-    """Extent of diffuse light: 0 lights the half of a ball that faces the light, 1 all of it, as an open sky does."""
-    softness: float
-    """Width of the specular lobe: SH band l is damped by exp(-l (l + 1) softness)."""
+    wrap: float  # 0 lights the half of a ball that faces the light, 1 all of it, as an open sky does
+    softness: float  # width of the specular lobe: SH band l is damped by exp(-l (l + 1) softness)
 
 
 SUN = _Light(direction=f32([-0.48, -0.64, -0.6]), colour=f32([0.78, 0.72, 0.62]), wrap=0.0, softness=0.04)

@@ -12,9 +12,10 @@ from typing import Annotated, NoReturn
 import typer
 
 from kissgs._version import __version__
-from kissgs.cli.bench import bench, evaluate, sample, warmup
+from kissgs.cli.bench import bench, warmup
 from kissgs.cli.compress import compact, compress
-from kissgs.cli.convert import convert, decompress, info
+from kissgs.cli.convert import convert, decompress, info, sample
+from kissgs.cli.evaluate import evaluate
 from kissgs.cli.files import discard_stdout, write_stdout
 from kissgs.cli.options import SCENE_OPTIONS, SEE_SCENE_OPTIONS, with_default_values
 from kissgs.cli.remote import app as remote

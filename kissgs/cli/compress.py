@@ -6,11 +6,11 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kissgs.cli.files import CHECKPOINT, for_each_input, progress_bar, say_notes, show, sibling, source, stdout
+from kissgs.cli.files import CHECKPOINT, Result, Work, for_each_input, progress_bar, say_notes, sibling, source, stdout
 from kissgs.cli.options import (
     EncodingOptions,
     ForceOption,
@@ -21,8 +21,8 @@ from kissgs.cli.options import (
     TrainingOptions,
     chosen,
     count_of,
-    device_of,
     open_views,
+    output_option,
     share_of,
     with_option_groups,
 )
@@ -39,11 +39,14 @@ class CompactionOptions:
     """Options of ``kissgs compact``: how many Gaussians to keep, and how."""
 
     count: Annotated[
-        str | None,
-        typer.Option("--count", "-n", metavar="N", help="Number of Gaussians to keep, such as 200k or 1.5M."),
+        int | None,
+        typer.Option(
+            "--count", "-n", metavar="N", parser=count_of, help="Number of Gaussians to keep, such as 200k or 1.5M."
+        ),
     ] = None
     ratio: Annotated[
-        str | None, typer.Option(metavar="SHARE", help="Share of the Gaussians to keep, such as 0.2 or 20%.")
+        float | None,
+        typer.Option(metavar="SHARE", parser=share_of, help="Share of the Gaussians to keep, such as 0.2 or 20%."),
     ] = None
     max_psnr_drop: Annotated[
         float | None,
@@ -62,13 +65,7 @@ class CompactionOptions:
 
     def settings(self) -> Settings:
         """Return the settings that these options stand for."""
-        values = {
-            "method": self.method,
-            "count": count_of(self.count),
-            "ratio": share_of(self.ratio),
-            "max_psnr_drop": self.max_psnr_drop,
-        }
-        given = {name: value for name, value in values.items() if value is not None}
+        given = {name: getattr(self, name) for name in ("method", "count", "ratio", "max_psnr_drop")}
         settings = chosen(self.preset, self.changes, group="compact", compact=given)
         if not settings.compact.enabled:
             raise UnsupportedError(
@@ -82,9 +79,7 @@ def compact(
     scenes: ScenesArgument,
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output", "-o", metavar="PATH", help="Output NAME.ply, a folder, or '-' for standard output. Required."
-        ),
+        output_option("Output NAME.ply, a folder, or '-' for standard output. Required."),
     ] = None,
     *,
     compaction: CompactionOptions,
@@ -101,6 +96,7 @@ def compact(
     The preset fast only prunes; balanced, small and paper also train.
     """
     from kissgs.cli.signals import stoppable
+    from kissgs.cli.tables import compaction_table
     from kissgs.io.ply import write_ply
     from kissgs.pipeline.pipeline import compact as run
     from kissgs.training.checkpoint import delete_checkpoints
@@ -109,9 +105,9 @@ def compact(
     training.refuse_without_training(settings)
     if output is None:
         raise UnsupportedError("missing -o: by default the output would overwrite the input")
-    capture, training_device = open_views(training.views), device_of(training.device)
+    capture = open_views(training.views)
 
-    def work(scene: str, target: Path) -> dict[str, Any]:
+    def work(scene: str, target: Path) -> Result:
         piped = str(target) == "-"
         with progress_bar(quiet) as bar, stoppable(bar, settings.searches) as progress:
             result = run(
@@ -125,7 +121,7 @@ def compact(
                 checkpoint=sibling(scene, CHECKPOINT) if training.checkpoint else None,
                 overwrite=force,
                 threads=common.threads,
-                device=training_device,
+                device=training.device,
                 progress=progress,
             )
         if piped:
@@ -133,13 +129,9 @@ def compact(
             with stdout():
                 write_ply(sys.stdout.buffer, result.splats)
             delete_checkpoints(result.checkpoint)
-        elif not quiet:
-            from kissgs.cli.tables import compaction_table
+        return Result(result.report.as_dict(), compaction_table(result.report, str(target)))
 
-            show(compaction_table(result.report, str(target)))
-        return result.report.as_dict()
-
-    for_each_input(scenes, output, ".ply", as_json, work)
+    for_each_input(scenes, output, ".ply", work, as_json=as_json, quiet=quiet)
 
 
 # ``kissgs compress``: compress scenes into containers.
@@ -150,12 +142,9 @@ def compress(
     scenes: ScenesArgument,
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="PATH",
-            help="Output NAME.zip, NAME.sog, FOLDER/lod-meta.json or NAME.sogxt/ for levels of detail, a folder, or "
-            "'-' for standard output. Default: next to the scene.",
+        output_option(
+            "Output NAME.zip, NAME.sog, FOLDER/lod-meta.json or NAME.sogxt/ for levels of detail, a folder, or "
+            "'-' for standard output. Default: next to the scene."
         ),
     ] = None,
     *,
@@ -202,7 +191,7 @@ def compress(
     renders = (
         encoding.evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
     )
-    capture, device = open_views(training.views), device_of(training.device)
+    capture = open_views(training.views)
     training.refuse_without_training(decided(settings, capture))
     if capture is not None and not renders and not common.quiet:
         sys.stderr.write(
@@ -219,16 +208,15 @@ def compress(
         checkpoint=training.checkpoint,
         force=force,
         threads=common.threads,
-        device=device,
+        device=training.device,
         quiet=common.quiet or as_json,
     )
-    ending = "" if unpacked else ending_of(kind)
+    work: Work = partial(compress_scenes.compress_here, each, capture)
+    during, ending = None, "" if unpacked else ending_of(kind)
     if manifest is not None:
         compress_scenes.refuse_options(manifest, each, container=encoding.container, unpacked=unpacked)
-        work = partial(compress_scenes.compress_streamed, each, ray)
-        for_each_input(scenes, manifest, ".json", as_json, work)
+        work, ending, output = partial(compress_scenes.compress_streamed, each, ray), ".json", str(manifest)
     elif ray is not None:
         cluster = compress_scenes.ClusterCompression(ray, each)
-        for_each_input(scenes, output, ending, as_json, cluster.result, during=cluster.submitted)
-    else:
-        for_each_input(scenes, output, ending, as_json, partial(compress_scenes.compress_here, each, capture))
+        work, during = cluster.result, cluster.submitted
+    for_each_input(scenes, output, ending, work, as_json=as_json, quiet=each.quiet, during=during)

@@ -1,4 +1,4 @@
-"""Compression of one scene, of many on a cluster, or of one as a streamed scene, as the command line shows it."""
+"""Compression of scenes: here, into levels of detail, or on a cluster."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 from rich.text import Text
 
-from kissgs.cli.files import CHECKPOINT, output, progress_bar, say_notes, show, sibling, source, write_stdout
+from kissgs.cli.files import CHECKPOINT, Result, output, progress_bar, say_notes, sibling, source, write_stdout
 from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
 from kissgs.cli.options import open_views
 from kissgs.cli.signals import stoppable
+from kissgs.cli.tables import report_table, streamed_table
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 from kissgs.core.progress import Progress, load_kernels, silent
 from kissgs.formats import ContainerName
@@ -83,21 +84,17 @@ class SceneCompression(BaseModel):
 # ``kissgs compress`` of one scene, in this process.
 
 
-def compress_here(options: SceneCompression, capture: Views | None, scene: str, target: Path) -> dict[str, Any]:
-    """Compress a scene, show a table of the result and return its report."""
+def compress_here(options: SceneCompression, capture: Views | None, scene: str, target: Path) -> Result:
+    """Compress a scene."""
     piped = str(target) == "-"
     searches = decided(options.settings, capture).searches
     with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:
-        result = options.run(scene, None if piped else target, capture, progress)
+        made = options.run(scene, None if piped else target, capture, progress)
     if piped:
-        say_notes(scene, (result.report.note, *result.report.cleaned.notes), options.quiet)
-        write_stdout(result.to_zip())
-        delete_checkpoints(*result.checkpoints)
-    elif not options.quiet:
-        from kissgs.cli.tables import report_table
-
-        show(report_table(result.report, str(target)))
-    return result.report.as_dict()
+        say_notes(scene, (made.report.note, *made.report.cleaned.notes), options.quiet)
+        write_stdout(made.to_zip())
+        delete_checkpoints(*made.checkpoints)
+    return Result(made.report.as_dict(), report_table(made.report, str(target)))
 
 
 # ``kissgs compress -o FOLDER/lod-meta.json`` of one scene, into levels of detail.
@@ -116,8 +113,8 @@ def refuse_options(manifest: Path, options: SceneCompression, *, container: str 
         raise UnsupportedError(f"levels of detail ({manifest.name}) are made without {wrong}")
 
 
-def compress_streamed(options: SceneCompression, ray: str | None, scene: str, target: Path) -> dict[str, Any]:
-    """Compress a scene into a streamed scene, show a table and return its report; ``ray`` is an address or None."""
+def compress_streamed(options: SceneCompression, ray: str | None, scene: str, target: Path) -> Result:
+    """Compress a scene into a streamed scene; ``ray`` is the address of a cluster, or None."""
     if scene == "-":
         raise UnsupportedError("levels of detail need a file: it is read more than once")
     with progress_bar(options.quiet) as bar, contextlib.ExitStack() as ending:
@@ -149,14 +146,17 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
             threads=options.threads,
             progress=progress,
         )
-    if not options.quiet:
-        from kissgs.cli.tables import streamed_table
-
-        show(streamed_table(report, str(target)))
-    return asdict(report)
+    return Result(asdict(report), streamed_table(report, str(target)))
 
 
-# ``compress_scene``: compression of one scene as a work item, for ``kissgs compress --ray``.
+# ``kissgs compress --ray``: scenes as work items on the nodes of a Ray cluster.
+
+PROCESS_BYTES = 500_000_000
+"""Memory that a scene of any size needs, bytes: mostly the libraries."""
+
+MEMORY_RATIO, TRAINING_RATIO, PACKED_RATIO = 4, 12, 10
+"""Memory that a scene needs for each byte of its ``.ply``: without and with training; and by how much the files of
+compressed formats are smaller than that. Measured: docs/benchmarks.md, "Time and memory by the number of Gaussians"."""
 
 
 def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
@@ -173,8 +173,6 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
     written = Path(attempt) / Path(arguments["target"]).name
     options = SceneCompression.model_validate(arguments["options"])
     report = options.run(str(scene), written, open_views(options.views), progress).report
-    from kissgs.cli.tables import report_table  # once the kernels are loaded
-
     table = io.StringIO()
     terminal = {"width": arguments["width"], "force_terminal": arguments["color"]}
     Console(file=table, highlight=False, markup=False, **terminal).print(report_table(report, arguments["target"]))
@@ -196,23 +194,12 @@ def _check_shared(scene: Path, size: int, work: Path) -> None:
     )
 
 
-# ``ClusterCompression``: ``kissgs compress --ray``, scenes as work items on the nodes of a Ray cluster.
-
-PROCESS_BYTES = 500_000_000
-"""Memory that a scene of any size needs, bytes: mostly the libraries."""
-
-MEMORY_RATIO, TRAINING_RATIO, PACKED_RATIO = 4, 12, 10
-"""Memory that a scene needs for each byte of its ``.ply``: without and with training; and by how much the files of
-compressed formats are smaller than that. Measured: docs/benchmarks.md, "Time and memory by the number of Gaussians"."""
-
-
 @dataclass
 class ClusterCompression:
-    """Compression of several scenes: :meth:`submitted` begins it, and :meth:`result` awaits each scene.
+    """Compression of several scenes, submitted at once; their results are awaited in order.
 
-    All scenes are submitted at once, and their results are awaited in order. An item writes below a work folder beside
-    its output, and the result is moved from there when its outcome has arrived: a node may be lost at any moment, and
-    nothing is written twice or in part.
+    An item writes below a work folder beside its output, and the result is moved from there when its outcome has
+    arrived: a node may be lost at any moment, and nothing is written twice or in part.
     """
 
     address: str
@@ -244,8 +231,8 @@ class ClusterCompression:
                 for work in self._work.values():
                     shutil.rmtree(work, ignore_errors=True)
 
-    def result(self, name: str, target: Path) -> dict[str, Any]:
-        """Wait for the result of one scene, move it to its place, show its table and return its report."""
+    def result(self, name: str, target: Path) -> Result:
+        """Wait for the result of one scene, and move it to its place."""
         handle = self._handles[target]
         if isinstance(handle, KissgsError):
             raise handle
@@ -256,16 +243,12 @@ class ClusterCompression:
             raise self._error(outcome, target)
         check_destination(target, overwrite=self.options.force)
         move_into_place(Path(outcome.result["written"]), target)
-        if not self.options.quiet:
-            show(Text.from_ansi(outcome.result["table"].removesuffix("\n")))
-        report: dict[str, Any] = outcome.result["report"]
-        return report
+        return Result(outcome.result["report"], Text.from_ansi(outcome.result["table"].removesuffix("\n")))
 
     def _request(self, runner: Runner, count: int) -> Resources:
         """Return the processors and GPUs of each of ``count`` scenes, which share all without ``--threads``."""
-        processors = [node.cpus for node in runner.nodes]
-        share = min(*processors, sum(processors) // count) if processors else 0
-        cpus = self.options.threads or max(1, int(share))
+        processors = [node.cpus for node in runner.nodes] or [0]
+        cpus = self.options.threads or max(1, int(min(*processors, sum(processors) // count)))
         requested = Resources(cpus, gpus=1 if self.options.device == "cuda" else 0)
         if refusal := runner.refusal(requested):
             raise UnsupportedError(f"{refusal}; choose another number with --threads, or --device cpu")
@@ -294,9 +277,7 @@ class ClusterCompression:
 
         def progress(stage: str, fraction: float, note: str = "") -> None:
             ended = sum(isinstance(each, KissgsError) or each.outcome.done() for each in list(self._handles.values()))
-            details = "; ".join(
-                filter(None, [f"{ended} of {len(self._handles)} scenes; {Path(name).name}: {stage}", note])
-            )
+            details = f"{ended} of {len(self._handles)} scenes; {Path(name).name}: {stage}{note and f'; {note}'}"
             self._bar("scenes", ended / max(len(self._handles), 1), details)
 
         return runner.submit(WorkItem("kissgs.cli.compress_scenes:compress_scene", arguments, resources), progress)

@@ -1,14 +1,14 @@
-"""``kissgs info``, ``kissgs decompress`` and ``kissgs convert``: describe, decode and rewrite scenes."""
+"""``kissgs info``, ``decompress``, ``convert`` and ``sample``: describe, decode, rewrite and make scenes."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from kissgs.cli.files import for_each_input, progress_bar, say_notes, show, source, stdout
+from kissgs.cli.files import Result, for_each_input, gaussians, progress_bar, say_notes, source, stdout
 from kissgs.cli.options import (
     FilesArgument,
     ForceOption,
@@ -16,32 +16,26 @@ from kissgs.cli.options import (
     OriginOption,
     SceneOptions,
     ScenesArgument,
+    output_option,
     with_option_groups,
 )
-from kissgs.core.errors import InvalidContainerError, InvalidSceneError, OutputError
+from kissgs.core.errors import InvalidContainerError, OutputError
 from kissgs.formats import ENDINGS, OUTPUT_FORMATS, SCENE_ENDINGS, WRITTEN, alternatives, output_format
 
 # ``kissgs info``: describe the contents of scene files.
 
 
 @with_option_groups
-def info(
-    files: FilesArgument,
-    as_json: JsonOption = False,
-    *,
-    common: SceneOptions,
-) -> None:
+def info(files: FilesArgument, as_json: JsonOption = False, *, common: SceneOptions) -> None:
     """Describe scenes of any format and containers: Gaussians, SH degree, bytes per file, value ranges."""
     from kissgs.cli.tables import info_table
     from kissgs.pipeline.scene_files import describe
 
-    def work(file: str, target: Path) -> dict[str, Any]:
+    def work(file: str, target: Path) -> Result:
         found = describe(Path(file), common.reading())
-        if not as_json:
-            show(info_table(found))
-        return found.as_dict()
+        return Result(found.as_dict(), info_table(found))
 
-    for_each_input(files, Path("-"), "", as_json, work, writes=False)
+    for_each_input(files, Path("-"), "", work, as_json=as_json, quiet=False, writes=False)
 
 
 # ``kissgs decompress``: decode containers and scenes of other formats into ``.ply`` files.
@@ -52,12 +46,7 @@ def decompress(
     containers: ScenesArgument,
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="PATH",
-            help="Output NAME.ply, a folder, or '-' for standard output. Default: next to the container.",
-        ),
+        output_option("Output NAME.ply, a folder, or '-' for standard output. Default: next to the container."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -69,7 +58,7 @@ def decompress(
 
     quiet = common.quiet or as_json
 
-    def work(container: str, target: Path) -> dict[str, Any]:
+    def work(container: str, target: Path) -> Result:
         piped = str(target) == "-"
         with progress_bar(quiet) as progress:
             splats = run(
@@ -89,15 +78,12 @@ def decompress(
 
             with stdout():
                 write_ply(sys.stdout.buffer, splats)
-            return {}
-        if not quiet:
-            from kissgs.cli.tables import gaussians
+            return Result({}, "")
+        report = {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": target.stat().st_size}
+        line = f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}"
+        return Result({**report, "notes": list(splats.notes)}, line)
 
-            show(f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}")
-        size = target.stat().st_size
-        return {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": size, "notes": list(splats.notes)}
-
-    for_each_input(containers, output, ".ply", as_json, work, unreadable=InvalidContainerError)
+    for_each_input(containers, output, ".ply", work, as_json=as_json, quiet=quiet, unreadable=InvalidContainerError)
 
 
 # ``kissgs convert``: write scenes of any format in a plain one.
@@ -135,7 +121,7 @@ def convert(
     kind = _output_format(output, to)
     reading, quiet = common.reading(origin), common.quiet or as_json
 
-    def work(scene: str, target: Path) -> dict[str, Any]:
+    def work(scene: str, target: Path) -> Result:
         piped = str(target) == "-"
         if not piped:
             refuse_existing(target, overwrite=force)
@@ -148,14 +134,12 @@ def convert(
         notes = [*splats.notes, *cleaned.notes, *losses]
         say_notes(str(target), notes, quiet)
         if piped:
-            return {}
-        if not quiet:
-            show(f"{target}  {len(splats):,} Gaussians, {target.stat().st_size:,} bytes")
-        degree = 0 if kind == "splat" else splats.sh_degree
-        size = target.stat().st_size
-        return {"format": kind, "count": len(splats), "sh_degree": degree, "bytes": size, "notes": notes}
+            return Result({}, "")
+        degree, size = 0 if kind == "splat" else splats.sh_degree, target.stat().st_size
+        report = {"format": kind, "count": len(splats), "sh_degree": degree, "bytes": size, "notes": notes}
+        return Result(report, f"{target}  {gaussians(len(splats))}, {size:,} bytes")
 
-    for_each_input(inputs, output, f".{kind}", as_json, work, unreadable=InvalidSceneError)
+    for_each_input(inputs, output, f".{kind}", work, as_json=as_json, quiet=quiet)
 
 
 def _output_format(output: str, to: str | None) -> str:
@@ -172,3 +156,19 @@ def _output_format(output: str, to: str | None) -> str:
         if found != wanted:
             raise OutputError(f"{output[:100]} has the ending of {found}, but --to asks for {wanted}; choose one")
     return wanted
+
+
+# ``kissgs sample``: write a synthetic scene for tests and demos.
+
+
+def sample(
+    output: Annotated[Path, typer.Argument(help="Output NAME.ply; other formats as for convert.")],
+    gaussians: Annotated[int, typer.Option(min=0, help="Number of Gaussians.")] = 60_000,
+    degree: Annotated[int, typer.Option(min=0, max=3, help="Degree of the spherical harmonics.")] = 3,
+    force: ForceOption = False,
+) -> None:
+    """Write a synthetic sample scene: shiny, textured objects on a table."""
+    from kissgs.pipeline.scene_files import save
+    from kissgs.synthetic import sample_scene
+
+    save(sample_scene(gaussians, sh_degree=degree), output, overwrite=force)

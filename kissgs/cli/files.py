@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,13 +23,18 @@ from rich.text import Text
 from kissgs.core.errors import InvalidSceneError, KissgsError, OutputError, UnsupportedError
 from kissgs.core.progress import Progress as Receiver
 from kissgs.core.progress import silent
-from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, SCENE_ENDINGS, named_manifest, names_folder
+from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, named_manifest, names_folder
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
 # Terminal output: the console for tables, and the progress bar.
+
+
+def gaussians(count: int) -> str:
+    """Format a number of Gaussians: "1 Gaussian", "60,000 Gaussians"."""
+    return f"{count:,} Gaussian{'' if count == 1 else 's'}"
 
 
 def output() -> Console:
@@ -85,22 +91,37 @@ def progress_bar(quiet: bool) -> Iterator[Receiver]:
 _SLASHES = tuple({"/", os.sep})
 
 
+@dataclass(frozen=True)
+class Result:
+    """The result of a command for one input: for ``--json``, and as a table or a line for the terminal."""
+
+    report: dict[str, Any]
+    shown: RenderableType
+
+
+Work = Callable[[str, Path], Result]
+"""Gets an input and the path of its output, "-" for standard output."""
+
+Pairs = list[tuple[str, Path]]
+
+
 def for_each_input(
     names: list[str],
     output: str | Path | None,
     suffix: str,
-    as_json: bool,
-    work: Callable[[str, Path], dict[str, Any]],
+    work: Work,
     *,
+    as_json: bool,
+    quiet: bool,
     writes: bool = True,
     unreadable: type[KissgsError] = InvalidSceneError,
-    during: Callable[[list[tuple[str, Path]]], AbstractContextManager[object]] | None = None,
+    during: Callable[[Pairs], AbstractContextManager[object]] | None = None,
 ) -> None:
-    """Call ``work`` for every input. If one of several fails, the others are still processed; the exit code is then 2.
+    """Call ``work`` for every input, and print its results.
 
-    A folder that is made for the outputs stays if all inputs fail: another command may be about to write into it.
-    ``work`` gets an input and the path of its output, and returns the report; the context of ``during``, which gets all
-    of them, encloses its calls. A slash at the end of ``output`` names a folder.
+    If one of several inputs fails, the others are still processed; the exit code is then 2. A folder that is made for
+    the outputs stays if all fail: another command may be about to write into it. The context of ``during``, which gets
+    all inputs with their outputs, encloses the work. A slash at the end of ``output`` names a folder.
     """
     inputs = expand(names)
     if writes and output is None:
@@ -110,42 +131,34 @@ def for_each_input(
     folder = output is not None and str(output).endswith(_SLASHES)
     output = None if output is None else Path(output)
     targets = _targets(inputs, output, suffix, folder) if writes else [Path("-")] * len(inputs)
-    pairs = list(zip(inputs, targets, strict=True))
+
+    def entry(name: str, target: Path) -> dict[str, Any]:
+        check_input(name, unreadable)
+        result = work(name, target)
+        if not (quiet or as_json or (writes and str(target) == "-")):
+            show(result.shown)
+        return {"input": name, **({"output": str(target)} if writes else {}), **result.report}
+
     with contextlib.ExitStack() as ending:
         if writes and output is not None and output not in targets:
             _make_folder(output)
+        pairs = list(zip(inputs, targets, strict=True))
         if during is not None:
             ending.enter_context(during(pairs))
-        if len(pairs) > 1:
-            _each(pairs, writes, as_json, work, unreadable)
-            return
-        check_input(inputs[0], unreadable)
-        report = work(*pairs[0])
-        if as_json:
-            print_json(_entry(*pairs[0], writes, report))
-
-
-def _each(
-    pairs: list[tuple[str, Path]],
-    writes: bool,
-    as_json: bool,
-    work: Callable[[str, Path], dict[str, Any]],
-    unreadable: type[KissgsError],
-) -> None:
-    """Process several inputs, print the errors of those that fail, and exit with code 2 if there are any."""
-    reports, failed = [], False
-    for name, target in pairs:
-        try:
-            check_input(name, unreadable)
-            reports.append(_entry(name, target, writes, work(name, target)))
-        except KissgsError as error:
-            failed = True
-            reports.append({"input": name, "error": {"code": error.code, "message": str(error)}})
-            named = name[:100] in str(error) or Path(name).name in str(error)
-            where = "" if named else f"{name}: "  # files of a container have names of their own
-            sys.stderr.write(f"kissgs: {where}{error}\n")
+        reports, failed = [], False
+        for name, target in pairs:
+            try:
+                reports.append(entry(name, target))
+            except KissgsError as error:
+                if len(pairs) == 1:
+                    raise
+                failed = True
+                reports.append({"input": name, "error": {"code": error.code, "message": str(error)}})
+                named = name[:100] in str(error) or Path(name).name in str(error)
+                where = "" if named else f"{name}: "  # files of a container have names of their own
+                sys.stderr.write(f"kissgs: {where}{error}\n")
     if as_json:
-        print_json(reports)
+        print_json(reports if len(pairs) > 1 else reports[0])
     if failed:
         raise typer.Exit(2)
 
@@ -164,10 +177,6 @@ def check_input(name: str, unreadable: type[KissgsError]) -> None:
         raise unreadable(f"cannot read {name:.100}: {reason_of(error)}") from error
 
 
-def _entry(name: str, target: Path, writes: bool, report: dict[str, Any]) -> dict[str, Any]:
-    return {"input": name, **({"output": str(target)} if writes else {}), **report}
-
-
 def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folder: bool) -> list[Path]:
     """Return the output path of each input: next to it, in the folder ``output``, or the file ``output``."""
     if "-" in inputs and (len(inputs) > 1 or output is None):
@@ -178,7 +187,8 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
             raise OutputError(f"{len(inputs)} inputs cannot all become {output}; {remedy}")
         return [output]
     if output is not None and not names_folder(str(output) + "/" * is_named_folder):
-        _refuse_file_name(output, suffix)
+        file = f"in {suffix} if it is a file, or " if suffix else ""
+        raise OutputError(f"there is no folder {output!s:.100}; end it {file}in a slash to make a folder")
     if output is not None and "-" in inputs:
         raise OutputError(f"-o {output} is a folder, but standard input has no name; give -o NAME{suffix}")
     targets = []
@@ -200,22 +210,6 @@ def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:
     read, written = (Path(name).suffix.lower() for name in inputs)
     if written != read and written in {suffix, *(ENDINGS if suffix in ENDINGS else ())} - {""}:
         raise OutputError(f"{inputs[1]:.100} does not exist; if it is the output, name it with -o {inputs[1]:.100}")
-
-
-def _refuse_file_name(folder: Path, suffix: str) -> None:
-    """Raise OutputError if the name of a folder to be made is that of a scene's file, which somebody expects there."""
-    ending = folder.suffix.lower()
-    if not ending:
-        file = f", or in {suffix}" if suffix else ""
-        raise OutputError(f"there is no folder {folder!s:.100}; end it in a slash to make it{file}")
-    if not suffix:
-        raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; end it in a slash")
-    if ending in (*ENDINGS, *SCENE_ENDINGS):
-        raise OutputError(
-            f"{folder!s:.100} has the ending of another format than {suffix}, which this command writes; use kissgs "
-            + ("compress" if ending in ENDINGS else "convert")
-        )
-    raise OutputError(f"{folder!s:.100} has an unknown ending; end it in {suffix}, or if it is a folder, in a slash")
 
 
 def _ends_with(path: Path, suffix: str) -> bool:
@@ -328,7 +322,6 @@ def say_notes(name: str, notes: Sequence[str], quiet: bool) -> None:
 
 def show(what: RenderableType) -> None:
     """Print a table or a line of text."""
-
     with stdout():
         output().print(what)
 

@@ -10,19 +10,90 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.formats import ENDINGS, SCENE_ENDINGS
 
+Device = Literal["cpu", "cuda"]
+
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
     from kissgs.io.scene_format import ReadOptions
     from kissgs.settings import Settings
 
+# Values of options: typer calls these functions with the words that a user has given.
+
+Values = dict[str, Any]
+
+
+def one_of(option: str, *allowed: str) -> Callable[[str], Any]:
+    """Return a function that checks that the value of an option is one of these."""
+
+    def check(value: str) -> str:
+        if value not in allowed:
+            *others, last = allowed
+            raise UnsupportedError(f"{option} {value}: choose {', '.join(others)}{' or ' * bool(others)}{last}")
+        return value
+
+    return check
+
+
+def steps_of(text: str) -> Values:
+    """Parse the value of ``--finetune``: a number of steps, or auto for that of the preset; 0 turns it off."""
+    if text == "auto":
+        return {"enabled": True}
+    if not text.isdecimal():
+        raise UnsupportedError(f"{FINETUNE} {text}: give a number of steps, or none for that of the preset")
+    return {"enabled": True, "steps": text} if int(text) else {"enabled": False}
+
+
+def count_of(text: str) -> int:
+    """Parse a number of Gaussians: 200000, 200,000, 200k, 1.5M."""
+    word = text.strip().lower()
+    if re.fullmatch(r"[0-9]{1,3}(,[0-9]{3})+|[0-9]+", word):
+        return int(word.replace(",", ""))
+    if re.fullmatch(r"[0-9]+(\.[0-9]+)?[km]", word):
+        return round(float(word[:-1]) * {"k": 1e3, "m": 1e6}[word[-1]])
+    raise UnsupportedError(
+        f"{text!r} is no number of Gaussians; give 200000, 200k or 1.5M, or a share with --ratio 0.2"
+    )
+
+
+def share_of(text: str) -> float:
+    """Parse a share: 0.2 or 20%."""
+    word = text.strip()
+    try:
+        return float(word.removesuffix("%")) * (0.01 if word.endswith("%") else 1.0)
+    except ValueError as error:
+        raise UnsupportedError(f"--ratio {text}: give a share such as 0.2 or 20%") from error
+
+
+def budget_of(text: str) -> Values:
+    """Parse the value of ``--compact``: 200k Gaussians, a share of 20%, a PSNR drop of 0.2dB, or auto with a goal."""
+    word = text.strip().lower().replace(" ", "")
+    if word == "auto":
+        return {"auto_count": True}
+    if found := re.fullmatch(r"([0-9]*\.?[0-9]+)(%|db)", word):
+        return {"ratio": float(found[1]) * 0.01} if found[2] == "%" else {"max_psnr_drop": float(found[1])}
+    try:
+        return {"count": count_of(word)}
+    except UnsupportedError as error:
+        raise UnsupportedError(
+            f"--compact {text}: give a number of Gaussians (200k), a share (20%), a PSNR drop (0.2dB), or auto with a "
+            "goal"
+        ) from error
+
+
 # Single arguments and options.
+
+
+def output_option(help: str, *, metavar: str = "PATH") -> Any:  # noqa: ANN401  as typer.Option
+    """Declare ``--output``, of which each command says something else."""
+    return typer.Option("--output", "-o", metavar=metavar, help=help)
+
 
 ScenesArgument = Annotated[
     list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
@@ -36,9 +107,10 @@ JsonOption = Annotated[
     bool, typer.Option("--json", help="Print a JSON report: an object for one file, a list for several.")
 ]
 OriginOption = Annotated[
-    str | None,
+    Literal["auto"] | None,
     typer.Option(
         metavar="auto",
+        parser=one_of("--origin", "auto"),
         help="auto: make positions relative to the middle of the scene, where they have fine steps, and record it: for "
         "scenes far from the origin. Default: as in the file.",
     ),
@@ -92,15 +164,15 @@ class SceneOptions:
     threads: Annotated[int, typer.Option(min=0, hidden=True)] = 0
     quiet: Annotated[bool, typer.Option("--quiet", "-q", hidden=True)] = False
 
-    def reading(self, origin: str | None = None) -> ReadOptions:
-        """Return the options of reading scenes; ``origin`` is the value of ``--origin``."""
+    def reading(self, origin: Literal["auto"] | None = None) -> ReadOptions:
+        """Return the options of reading scenes."""
         from kissgs.io.scene_format import ReadOptions
 
         return ReadOptions(
             max_gaussians=self.max_gaussians,
             level=self.level or 0,
             raw_axes=self.raw_axes,
-            origin=origin_of(origin),
+            origin=origin,
             antialiased=self.antialiased,
         )
 
@@ -165,18 +237,20 @@ class EncodingOptions:
         typer.Option(metavar="SSIM", help="Find the smallest container that loses at most this SSIM, such as 0.003."),
     ] = None
     compact: Annotated[
-        str | None,
+        Values | None,
         typer.Option(
             metavar="BUDGET",
+            parser=budget_of,
             help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
             "PSNR drop (0.2dB); 100% keeps all; auto searches the number that serves a goal best, which is the default "
             "with held-out photographs, and without --views where it is fine-tuned.",
         ),
     ] = None
     finetune: Annotated[
-        str | None,
+        Values | None,
         typer.Option(
             metavar="[STEPS]",
+            parser=steps_of,
             help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
             "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset; 0: never. "
             "Default with a goal, if photographs are held out or there is no --views.",
@@ -192,14 +266,11 @@ class EncodingOptions:
         return chosen(
             self.preset,
             self.changes,
-            compact=budget_of(self.compact),
-            finetune=steps_of(self.finetune),
+            compact=self.compact,
+            finetune=self.finetune,
             time=time,
             seed=seed,
-            psnr=self.psnr,
-            target_size=self.target_size,
-            max_psnr_drop=self.max_psnr_drop,
-            max_ssim_drop=self.max_ssim_drop,
+            **{name: getattr(self, name) for name in ("psnr", "target_size", "max_psnr_drop", "max_ssim_drop")},
         )
 
 
@@ -215,7 +286,12 @@ class TrainingOptions:
         bool, typer.Option("--checkpoint", help="Save the state of training next to the scene, and resume from it.")
     ] = False
     device: Annotated[
-        str, typer.Option(help="Device of training: cpu (reproducible) or cuda (results vary slightly).")
+        Device,
+        typer.Option(
+            metavar="NAME",
+            parser=one_of("--device", "cpu", "cuda"),
+            help="Device of training: cpu (reproducible) or cuda (results vary slightly).",
+        ),
     ] = "cpu"
 
     def refuse_without_training(self, settings: Settings) -> None:
@@ -243,7 +319,12 @@ class CaptureOptions:
     images: Annotated[
         Path | None, typer.Option(help="Folder of the photographs of --views, if it is not the capture's own.")
     ] = None
-    device: Annotated[str, typer.Option(help="Device of the rasteriser: cpu or cuda.")] = "cpu"
+    device: Annotated[
+        Device,
+        typer.Option(
+            metavar="NAME", parser=one_of("--device", "cpu", "cuda"), help="Device of the rasteriser: cpu or cuda."
+        ),
+    ] = "cpu"
 
     def open(self) -> Views | None:
         """Load the capture; return None if there is none, and refuse options of its photographs then."""
@@ -256,10 +337,7 @@ class CaptureOptions:
         return open_views(self.views, scale=self.scale, images=self.images)
 
 
-# Conversion of values to settings, captures and devices.
-
-Values = dict[str, Any]
-THOUSANDS = {"k": 1e3, "m": 1e6}
+# Settings and captures that options stand for.
 
 
 def chosen(
@@ -270,12 +348,9 @@ def chosen(
     compact: Values | None = None,
     finetune: Values | None = None,
     time: str | None = None,
-    **options: float | str | None,
+    **encode: float | str | None,
 ) -> Settings:
-    """Return the settings of a preset with ``NAME=VALUE`` or ``GROUP.NAME=VALUE`` changes, which the others override.
-
-    Changes may be values that belong to the preset; ``group`` is that of changes without one.
-    """
+    """Return the settings of a preset with changes as for ``--set``, of ``group`` by default; the others override."""
     from kissgs.settings import Settings
 
     values: dict[str, Values] = {"compact": {}, "encode": {}, "finetune": {}}
@@ -291,9 +366,8 @@ def chosen(
                 f"--set {change!r}: unknown group {of!r}; the groups are compact, encode and finetune"
             )
         values[of if dot else group][inner if dot else of] = None if value.strip() == "auto" else value.strip()
-    values["compact"].update(compact or {})
-    values["encode"].update({name: value for name, value in options.items() if value is not None})
-    values["finetune"].update(finetune or {})
+    for name, given in (("compact", compact or {}), ("encode", encode), ("finetune", finetune or {})):
+        values[name] |= {key: value for key, value in given.items() if value is not None}
     made = Settings.research if changes else Settings.from_preset
     return made(preset, time_limit=time, compact=values["compact"], finetune=values["finetune"], **values["encode"])
 
@@ -320,69 +394,10 @@ def with_default_values(words: list[str]) -> list[str]:
 
 
 def _is_host(word: str) -> bool:
-    """Whether a word that follows ``--ray`` is rather meant as a machine without a port, or as a URL, than as a scene.
-
-    It is if no file has the name, and it is not that of a file that may be missing.
-    """
+    """Whether a word after ``--ray`` is rather meant as a machine without a port, or as a URL, than as a scene."""
     if word.startswith("-") or not word or glob.has_magic(word) or os.path.lexists(word):
         return False
     return "://" in word or ("/" not in word and Path(word).suffix.lower() not in (*ENDINGS, *SCENE_ENDINGS, ".json"))
-
-
-def steps_of(text: str | None) -> Values:
-    """Parse the value of ``--finetune``: a number of steps, or auto for that of the preset; 0 turns it off."""
-    if text is None:
-        return {}
-    if text == "auto":
-        return {"enabled": True}
-    if not text.isdecimal():
-        raise UnsupportedError(f"{FINETUNE} {text}: give a number of steps, or none for that of the preset")
-    return {"enabled": True, "steps": text} if int(text) else {"enabled": False}
-
-
-def count_of(text: str | None) -> int | None:
-    """Parse a number of Gaussians: 200000, 200,000, 200k, 1.5M."""
-    if text is None:
-        return None
-    word = text.strip().lower()
-    if re.fullmatch(r"[0-9]{1,3}(,[0-9]{3})+|[0-9]+", word):
-        return int(word.replace(",", ""))
-    if re.fullmatch(r"[0-9]+(\.[0-9]+)?[km]", word):
-        return round(float(word[:-1]) * THOUSANDS[word[-1]])
-    raise UnsupportedError(
-        f"{text!r} is no number of Gaussians; give 200000, 200k or 1.5M, or a share with --ratio 0.2"
-    )
-
-
-def share_of(text: str | None) -> float | None:
-    """Parse a share: 0.2 or 20%."""
-    if text is None:
-        return None
-    word = text.strip()
-    try:
-        return float(word.removesuffix("%")) * (0.01 if word.endswith("%") else 1.0)
-    except ValueError as error:
-        raise UnsupportedError(f"--ratio {text}: give a share such as 0.2 or 20%") from error
-
-
-def budget_of(text: str | None) -> Values:
-    """Parse the value of ``--compact``: 200k Gaussians, a share of 20%, a PSNR drop of 0.2dB, or auto with a goal."""
-    if text is None:
-        return {}
-    word = text.strip().lower().replace(" ", "")
-    if word == "auto":
-        return {"auto_count": True}
-    for ending, name, unit in (("%", "ratio", 0.01), ("db", "max_psnr_drop", 1.0)):
-        number = word.removesuffix(ending)
-        if word.endswith(ending) and re.fullmatch(r"[0-9]*\.?[0-9]+", number):
-            return {name: float(number) * unit}
-    try:
-        return {"count": count_of(word)}
-    except UnsupportedError as error:
-        raise UnsupportedError(
-            f"--compact {text}: give a number of Gaussians (200k), a share (20%), a PSNR drop (0.2dB), or auto with a "
-            "goal"
-        ) from error
 
 
 def open_views(path: Path | None, *, scale: int | None = None, images: Path | None = None) -> Views | None:
@@ -392,23 +407,3 @@ def open_views(path: Path | None, *, scale: int | None = None, images: Path | No
     from kissgs.cameras.captures.load import load_views
 
     return load_views(path, scale=scale, images=images)
-
-
-def device_of(name: str) -> Literal["cpu", "cuda"]:
-    """Check the value of ``--device``."""
-    return cast(Literal["cpu", "cuda"], choice("--device", name, Literal["cpu", "cuda"]))
-
-
-def origin_of(name: str | None) -> Literal["auto"] | None:
-    """Check the value of ``--origin``."""
-    return None if name is None else cast(Literal["auto"], choice("--origin", name, Literal["auto"]))
-
-
-def choice(option: str, value: str, allowed: Any) -> str:  # noqa: ANN401  a Literal has no type of its own
-    """Check that the value of an option is one of ``allowed``, a Literal."""
-    names = get_args(allowed)
-    if value not in names:
-        others = ", ".join(names[:-1])
-        known = f"{others} or {names[-1]}" if others else names[-1]
-        raise UnsupportedError(f"{option} {value}: choose {known}")
-    return value

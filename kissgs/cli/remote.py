@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kissgs.cli.files import for_each_input, print_json, progress_bar, show
-from kissgs.cli.options import EncodingOptions, FilesArgument, ForceOption, origin_of, with_option_groups
+from kissgs.cli.files import Result, for_each_input, print_json, progress_bar, show
+from kissgs.cli.options import EncodingOptions, FilesArgument, ForceOption, output_option, with_option_groups
 from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.formats import ENDINGS, ending_of, named_container
 
@@ -38,9 +38,7 @@ def compress(
     scenes: FilesArgument,
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output", "-o", metavar="PATH", help="Output NAME.zip, NAME.sog or a folder. Default: next to the scene."
-        ),
+        output_option("Output NAME.zip, NAME.sog or a folder. Default: next to the scene."),
     ] = None,
     server: ServerOption = DEFAULT_SERVER,
     *,
@@ -57,7 +55,7 @@ def compress(
     kind, settings = named_container(encoding.container, output), encoding.settings()
     with _service(server) as remote:
 
-        def work(scene: str, target: Path) -> dict[str, Any]:
+        def work(scene: str, target: Path) -> Result:
             with progress_bar(quiet or as_json) as progress:
                 status = remote.compress(
                     scene,
@@ -65,22 +63,17 @@ def compress(
                     settings=settings,
                     container=kind,
                     evaluate=encoding.evaluate,
-                    origin=origin_of(encoding.origin),
+                    origin=encoding.origin,
                     overwrite=force,
                     progress=_announcing(progress, server, quiet),
                 )
-            if not (quiet or as_json):
-                show(status_table(status, str(target)))
-            return status
+            return Result(status, status_table(status, str(target)))
 
-        for_each_input(scenes, output, ending_of(kind), as_json, work)
+        for_each_input(scenes, output, ending_of(kind), work, as_json=as_json, quiet=quiet)
 
 
 @app.command(name="list")
-def list_jobs(
-    server: ServerOption = DEFAULT_SERVER,
-    as_json: ServiceJsonOption = False,
-) -> None:
+def list_jobs(server: ServerOption = DEFAULT_SERVER, as_json: ServiceJsonOption = False) -> None:
     """List the latest jobs on a server."""
     with _service(server) as remote:
         jobs = remote.jobs()
@@ -96,7 +89,7 @@ def list_jobs(
 def get(
     job: JobArgument,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Output NAME.zip or NAME.sog. Default: the name of the scene.")
+        Path | None, output_option("Output NAME.zip or NAME.sog. Default: the name of the scene.")
     ] = None,
     server: ServerOption = DEFAULT_SERVER,
     force: ForceOption = False,
@@ -119,10 +112,7 @@ def get(
 
 
 @app.command()
-def cancel(
-    job: JobArgument,
-    server: ServerOption = DEFAULT_SERVER,
-) -> None:
+def cancel(job: JobArgument, server: ServerOption = DEFAULT_SERVER) -> None:
     """Cancel a job."""
     with _service(server) as remote:
         show(f"{job} {remote.cancel(job)['state']}")

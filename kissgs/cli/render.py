@@ -10,17 +10,17 @@ import threading
 import webbrowser
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kissgs.cli.files import check_input, for_each_input, progress_bar, say_notes, show, source, write_output
+from kissgs.cli.files import Result, check_input, for_each_input, progress_bar, say_notes, show, source, write_output
 from kissgs.cli.interrupts import Interrupted
-from kissgs.cli.options import CaptureOptions, ForceOption, SceneOptions, device_of, with_option_groups
+from kissgs.cli.options import CaptureOptions, ForceOption, SceneOptions, output_option, with_option_groups
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
+from kissgs.formats import names_folder
 
 if TYPE_CHECKING:
-    from kissgs.cameras.render import RenderedImages
     from kissgs.preview import PageScene, StreamedFolder
 
 
@@ -34,11 +34,9 @@ def view(
     ],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
+        output_option(
+            "Write one HTML file with viewer and scene, which opens from disk without a network, and exit.",
             metavar="PAGE.html",
-            help="Write one HTML file with viewer and scene, which opens from disk without a network, and exit.",
         ),
     ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the server; 0 for a free one.")] = 0,
@@ -256,12 +254,9 @@ def render(
     file: Annotated[str, typer.Argument(metavar="FILE", help="Scene to render, of any format that kissgs reads.")],
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="PATH",
-            help="Output NAME.png, NAME.webp, a folder, or '-' for a PNG on standard output. Default: a .png next "
-            "to the scene.",
+        output_option(
+            "Output NAME.png, NAME.webp, a folder, or '-' for a PNG on standard output. Default: a .png next "
+            "to the scene."
         ),
     ] = None,
     *,
@@ -274,77 +269,60 @@ def render(
     common: SceneOptions,
 ) -> None:
     """Render an image of a scene, an orbit around it (animation or contact sheet), or all its views."""
-    from kissgs.cameras.captures.transforms_json import write_camera
+    from kissgs.cameras.captures.transforms_json import camera_as_dict, write_camera
     from kissgs.cameras.render import RenderJob
     from kissgs.evaluation.evaluate import in_scene_frame
     from kissgs.io.files import refuse_existing
     from kissgs.pipeline.scene_files import load
+    from kissgs.rendering.images import animated_webp, png
 
     suffix, threads, quiet = _suffix(file, output), common.threads, common.quiet or as_json
     image.refuse_contradictions(capture.views)
-    size, background, device = image.pixels(), image.colour(), device_of(capture.device)
-    views = capture.open()
+    size, background, views = image.pixels(), image.colour(), capture.open()
 
-    def work(name: str, target: Path) -> dict[str, Any]:
-        piped = str(target) == "-"
-        for path in ([] if piped else [target]) + ([] if image.save_camera is None else [image.save_camera]):
-            refuse_existing(path, overwrite=force)
+    def work(name: str, target: Path) -> Result:
+        for path in (target, image.save_camera):
+            if path is not None and str(path) != "-":
+                refuse_existing(path, overwrite=force)
         with progress_bar(quiet) as progress:
             job = RenderJob(
                 splats=load(Path(name), threads=threads, progress=progress, **asdict(common.reading())),
                 size=size,
                 background=background,
-                device=device,
+                device=capture.device,
                 threads=threads,
                 progress=progress,
             )
-            fitting = None
-            if views is not None:
-                fitting = in_scene_frame(job.splats, views, threads=threads, progress=progress)
+            fitting = views and in_scene_frame(job.splats, views, threads=threads, progress=progress)
             if image.orbit:
-                animated = suffix == ".webp"
-                rendered = job.animation(image.frames) if animated else job.orbit_sheet(image.frames)
+                rendered = (job.animation if suffix == ".webp" else job.orbit_sheet)(image.frames)
             else:
                 rendered = job.view_sheet(fitting) if image.sheet else job.single(fitting, image.view)
             progress("write", 0.0)
-            data = _encoded(rendered, suffix)
+            images = rendered.images
+            data = png(images[0]) if suffix == ".png" else animated_webp(images, fps=FPS, quality=QUALITY)
             progress("write", 1.0)
         say_notes(name, job.splats.notes, common.quiet)
         write_output(target, data, force=force)
         if image.save_camera is not None:
             write_camera(image.save_camera, rendered.views[0].camera, overwrite=force)
-        report = _report(rendered, len(data))
-        if not (quiet or piped):
-            saved = "" if image.save_camera is None else f"; {image.save_camera}"
-            show(f"{target}  {report['width']}x{report['height']}, {rendered.description}{saved}")
-        return report
+        saved = "" if image.save_camera is None else f"; {image.save_camera}"
+        height, width = rendered.images[0].shape[:2]
+        cameras = [{"name": view.name, **camera_as_dict(view.camera)} for view in rendered.views]
+        report = {"width": width, "height": height, "frames": len(rendered.images), "bytes": len(data)}
+        line = f"{target}  {width}x{height}, {rendered.description}{saved}"
+        return Result({**report, "cameras": cameras}, line)
 
-    for_each_input([file], output, suffix, as_json, work)
+    for_each_input([file], output, suffix, work, as_json=as_json, quiet=quiet)
 
 
 def _suffix(file: str, output: str | None) -> str:
     """Return the ending of the output: .png unless ``output`` ends in .webp."""
     if file == "-":
         raise UnsupportedError("kissgs render reads a file, not standard input")
-    from kissgs.formats import names_folder
-
     if output in (None, "-") or names_folder(output):
         return ".png"
     suffix = Path(output).suffix.lower()
     if suffix not in (".png", ".webp"):
         raise UnsupportedError(f"{output}: images are written as .png or .webp")
     return suffix
-
-
-def _encoded(rendered: RenderedImages, suffix: str) -> bytes:
-    from kissgs.rendering.images import animated_webp, png
-
-    return png(rendered.images[0]) if suffix == ".png" else animated_webp(rendered.images, fps=FPS, quality=QUALITY)
-
-
-def _report(rendered: RenderedImages, size: int) -> dict[str, Any]:
-    from kissgs.cameras.captures.transforms_json import camera_as_dict
-
-    height, width = rendered.images[0].shape[:2]
-    cameras = [{"name": view.name, **camera_as_dict(view.camera)} for view in rendered.views]
-    return {"width": width, "height": height, "frames": len(rendered.images), "bytes": size, "cameras": cameras}

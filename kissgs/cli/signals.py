@@ -27,11 +27,9 @@ if TYPE_CHECKING:
     from kissgs.core.progress import Progress
 
 
-STOPPING = (
+_STOPPING = (
     b"\nkissgs: stopping: completing the best result so far, if any, which may take minutes; Ctrl-C again aborts\n"
 )
-
-NOTHING_FOUND = f"nothing met the goal yet, and {NOTHING_LEFT}"
 
 
 def unwinding(work: Callable[[], None]) -> None:
@@ -44,8 +42,7 @@ def unwinding(work: Callable[[], None]) -> None:
         finally:
             exit_on_signal()
     except BaseException as error:
-        number = signal_behind(error)
-        if number is not None:
+        if (number := signal_behind(error)) is not None:
             exit_by_signal(number)
         raise
 
@@ -70,7 +67,7 @@ def stoppable(progress: Progress, searches: bool) -> Iterator[Progress]:
     def on_interrupt(number: int, frame: FrameType | None) -> None:
         pending.append(number)
         signal.signal(signal.SIGINT, before)
-        os.write(2, STOPPING)  # at once: the next progress event may take a while
+        os.write(2, _STOPPING)  # at once: the next progress event may take a while
 
     def receive(stage: str, fraction: float, note: str = "") -> None:
         if pending:
@@ -82,7 +79,7 @@ def stoppable(progress: Progress, searches: bool) -> Iterator[Progress]:
     try:
         yield receive
     except StopSearch as error:
-        say_when_interrupted(lambda: NOTHING_FOUND)
+        say_when_interrupted(lambda: f"nothing met the goal yet, and {NOTHING_LEFT}")
         raise Interrupted(signal.SIGINT) from error
     finally:
         signal.signal(signal.SIGINT, before)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -18,7 +18,7 @@ from kissgs.core.array_types import Float32, Float64, UInt8
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.evaluate import background_of, render_clamped
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison, format_metric
+from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison, format_metric
 from kissgs.rendering.images import to_bytes
 from kissgs.rendering.rasterizer import Device
 
@@ -53,10 +53,7 @@ def rms_difference(
 
 
 def full_scale(psnr: float) -> int:
-    """Return the error, in levels, of the brightest colour for an image with this PSNR in decibels.
-
-    It is the next of :data:`FULL_SCALES` above four times the root mean square error.
-    """
+    """Return the error, in levels, of the brightest colour: one of FULL_SCALES above four times the RMS error."""
     wanted = 4 * 255 * 10 ** (-psnr / 20) if math.isfinite(psnr) else 0.0
     return next((scale for scale in FULL_SCALES if scale >= wanted), FULL_SCALES[-1])
 
@@ -95,35 +92,26 @@ def _interval(middle: int, side: int, length: int) -> slice:
 # Text and tables of the page.
 
 
-def _summary(evaluation: Evaluation, shown: int) -> str:
-    """Return what was compared, as plain text to be escaped; ``shown`` is the number of views with images."""
-    rest = " Their images are below" if shown == len(evaluation.views) else f" Images of the worst {shown} are below"
-    rest += ", the worst first."
-    return f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}.{rest}"
-
-
-def _cards(evaluation: Evaluation, before: int | None, after: int | None) -> Iterable[str]:
-    """Yield cards with the means, and the bytes of both files if known."""
-    mean = evaluation.mean
+def _cards(evaluation: Evaluation, before: int | None, after: int | None) -> Iterator[tuple[str, str, str]]:
+    """Yield name, value and remark of each mean, and of the bytes of both files if known."""
+    mean, to_reference = evaluation.mean, evaluation.mean.candidate_vs_reference.texts()
     if mean.reference is not None:
-        change = f"{_psnr_change(mean)} dB: the reference has {format_metric(mean.reference.psnr, 2)} dB"
-        yield _card("PSNR, candidate to photographs", f"{format_metric(mean.candidate.psnr, 2)} dB", change)
         of_reference, of_candidate = mean.reference.texts(), mean.candidate.texts()
-        for name in list(of_candidate)[1:]:
-            remark = f"the reference has {of_reference[name]}"
-            yield _card(f"{name}, candidate to photographs", of_candidate[name], remark)
-    remark = f"of their renderings; {_other_metrics(mean.candidate_vs_reference)}"
-    yield _card("PSNR, candidate to reference", f"{format_metric(mean.candidate_vs_reference.psnr, 2)} dB", remark)
-    fifth = f"{format_metric(evaluation.fifth_percentile, 2)} dB is the 5th percentile"
-    yield _card(
-        "PSNR, worst view", f"{format_metric(evaluation.worst.comparison.candidate_vs_reference.psnr, 2)} dB", fifth
-    )
+        change = f"{_change(mean)} dB: the reference has {of_reference.pop('PSNR')} dB"
+        yield "PSNR, candidate to photographs", f"{of_candidate.pop('PSNR')} dB", change
+        for name, text in of_candidate.items():
+            yield f"{name}, candidate to photographs", text, f"the reference has {of_reference[name]}"
+    psnr = to_reference.pop("PSNR")
+    others = ", ".join(f"{name} {text}" for name, text in to_reference.items())
+    yield "PSNR, candidate to reference", f"{psnr} dB", f"of their renderings; {others}"
+    worst = evaluation.worst.comparison.candidate_vs_reference.texts()["PSNR"]
+    yield "PSNR, worst view", f"{worst} dB", f"{format_metric(evaluation.fifth_percentile, 2)} dB is the 5th percentile"
     counts = f"{evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians"
     if before and after:
         change = f"{before / after:.1f}× smaller" if before >= after else f"{after / before:.1f}× larger"
-        yield _card("Size", change, f"{before / 1e6:,.2f} → {after / 1e6:,.2f} MB; {counts}")
+        yield "Size", change, f"{before / 1e6:,.2f} → {after / 1e6:,.2f} MB; {counts}"
     else:
-        yield _card("Gaussians", f"{evaluation.candidate_count:,}", counts)
+        yield "Gaussians", f"{evaluation.candidate_count:,}", counts
 
 
 def _worst_views(evaluation: Evaluation) -> str:
@@ -131,23 +119,16 @@ def _worst_views(evaluation: Evaluation) -> str:
     text, surroundings = f"Candidate to reference: {evaluation.extremes}.", evaluation.surroundings
     if surroundings is None:
         return text
-    metrics = surroundings.mean.candidate_vs_reference
-    mean = f"PSNR {format_metric(metrics.psnr, 2)} dB, {_other_metrics(metrics)}"
+    mean = surroundings.mean.candidate_vs_reference.summary
     return f"{text} Surroundings, {surroundings.views_used} ({surroundings.source}): {mean}; {surroundings.extremes}."
 
 
-def _card(name: str, value: str, remark: str) -> str:
-    return f'<div class="card"><dt>{name}</dt><dd>{value}</dd><dd class="remark">{remark}</dd></div>'
+def _change(comparison: Comparison) -> str:
+    """Return the change of the PSNR to the photograph as HTML."""
+    return "" if comparison.change is None else _red_if_negative(format_metric(comparison.change, 2, signed=True))
 
 
-def _other_metrics(metrics: ImageMetrics) -> str:
-    """Return all metrics but the PSNR, as text."""
-    return ", ".join(f"{name} {text}" for name, text in list(metrics.texts().items())[1:])
-
-
-def _psnr_change(comparison: Comparison) -> str:
-    """Return the change of the PSNR to the photograph as HTML, a loss in red."""
-    text = "" if comparison.change is None else format_metric(comparison.change, 2, signed=True)
+def _red_if_negative(text: str) -> str:
     return f'<span class="worse">−{text[1:]}</span>' if text.startswith("-") else text
 
 
@@ -155,27 +136,24 @@ def _views_table(evaluation: Evaluation, shown: Sequence[int]) -> str:
     """Return a table with a row for each view, linked to its images if it is among ``shown``, and the means."""
     mean = evaluation.mean
     metrics = list(mean.candidate_vs_reference.texts())
-    renderings = [("candidate to reference", metrics)]
-    photographs = [("reference to photograph", metrics), ("candidate to photograph", metrics), ("change", ["dB"])]
-    groups = renderings if mean.reference is None else photographs + renderings
+    groups = [("candidate to reference", metrics)]
+    if mean.reference is not None:
+        to_photo = [(f"{side} to photograph", metrics) for side in ("reference", "candidate")]
+        groups = [*to_photo, ("change", ["dB"]), *groups]
     upper = "".join(f'<th colspan="{len(columns)}">{title}</th>' for title, columns in groups)
     lower = "".join(f"<th>{column}</th>" for _, columns in groups for column in columns)
-    rows = []
-    for i, compared in enumerate(evaluation.views):
-        name = escape(compared.view.name)
-        name = f'<a href="#view-{i}">{name}</a>' if i in shown else name
-        rows.append(f"<tr><td>{name}</td>{_cells(compared.comparison)}</tr>")
+    names = [escape(compared.view.name) for compared in evaluation.views]
+    links = [f'<a href="#view-{i}">{name}</a>' if i in shown else name for i, name in enumerate(names)]
+    rows = [_row(link, compared.comparison) for link, compared in zip(links, evaluation.views, strict=True)]
     return (
         f"<table><thead><tr><th></th>{upper}</tr><tr><th>view</th>{lower}</tr></thead>"
-        f"<tbody>{''.join(rows)}</tbody><tfoot><tr><td>mean</td>{_cells(mean)}</tr></tfoot></table>"
+        f"<tbody>{''.join(rows)}</tbody><tfoot>{_row('mean', mean)}</tfoot></table>"
     )
 
 
-def _cells(comparison: Comparison) -> str:
-    return "".join(
-        f'<td class="worse">−{cell[1:]}</td>' if cell.startswith("-") else f"<td>{cell}</td>"
-        for cell in comparison.cells()
-    )
+def _row(name: str, comparison: Comparison) -> str:
+    cells = "".join(f"<td>{_red_if_negative(cell)}</td>" for cell in comparison.cells())
+    return f"<tr><td>{name}</td>{cells}</tr>"
 
 
 MAX_VIEWS = 12
@@ -212,11 +190,7 @@ def html_report(
     threads: int = 0,
     progress: Progress = silent,
 ) -> str:
-    """Return an evaluation as a self-contained HTML page, with styles, script and images embedded.
-
-    The worst :data:`MAX_VIEWS` views are shown with images, the worst first. The worst :data:`MAX_SURROUNDINGS` views
-    of the ``surroundings`` follow. ``progress`` receives the stage "html".
-    """
+    """Return an evaluation as one HTML page with images of the worst views, then of the worst surroundings."""
     shown = _worst_first(evaluation)[:MAX_VIEWS]
     entries = [(f"view-{i}", evaluation, evaluation.views[i]) for i in shown]
     if (around := evaluation.surroundings) is not None:
@@ -233,12 +207,20 @@ def html_report(
         photo = view.load_photo() if group.against == "photos" else None
         sections.append(_section(anchor, compared, renderings, photo, full))
     progress("html", 1.0)
+    images = "Their images are" if len(shown) == len(evaluation.views) else f"Images of the worst {len(shown)} are"
+    summary = f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}. {images} below, the "
+    summary += "worst first."
+    if evaluation.note:
+        summary += f" {evaluation.note[0].upper()}{evaluation.note[1:]}."
     return Template(files("kissgs.evaluation").joinpath("report.html").read_text(encoding="utf-8")).substitute(
         title=escape(f"{candidate.name} compared with {reference.name}"),
         reference=escape(reference.name),
         candidate=escape(candidate.name),
-        summary=escape(_summary(evaluation, len(shown)) + _sentence(evaluation.note)),
-        cards="\n".join(_cards(evaluation, reference.bytes, candidate.bytes)),
+        summary=escape(summary),
+        cards="\n".join(
+            f'<div class="card"><dt>{name}</dt><dd>{value}</dd><dd class="remark">{remark}</dd></div>'
+            for name, value, remark in _cards(evaluation, reference.bytes, candidate.bytes)
+        ),
         table=_views_table(evaluation, shown),
         worst_views=escape(_worst_views(evaluation)),
         sections="\n".join(sections),
@@ -253,10 +235,6 @@ def _worst_first(evaluation: Evaluation) -> list[int]:
     return sorted(range(len(evaluation.views)), key=lambda i: evaluation.views[i].ranking_psnr)
 
 
-def _sentence(note: str) -> str:
-    return f" {note[0].upper()}{note[1:]}." if note else ""
-
-
 def _section(
     anchor: str,
     compared: ViewComparison,
@@ -268,12 +246,9 @@ def _section(
     name, (reference, candidate) = escape(compared.view.name), renderings
     levels = rms_difference(candidate, reference)
     crop = worst_crop(levels, max(MIN_CROP, min(MAX_CROP, min(levels.shape) // 2)))
-    layers = {
-        "reference": to_bytes(reference),
-        "candidate": to_bytes(candidate),
-        **({} if photo is None else {"photograph": photo}),
-        "difference": heat_map(levels, full),
-    }
+    layers = {"reference": to_bytes(reference), "candidate": to_bytes(candidate)}
+    layers |= {} if photo is None else {"photograph": photo}
+    layers["difference"] = heat_map(levels, full)
     mark, sources = _mark(crop, levels.shape), {layer: _large(pixels) for layer, pixels in layers.items()}
     figures = [_slider(name, sources["reference"], sources["candidate"], mark)]
     if photo is not None:
@@ -294,12 +269,10 @@ def _section(
 
 
 def _numbers(comparison: Comparison) -> str:
-    metrics = comparison.candidate_vs_reference
-    to_reference = f"candidate to reference {format_metric(metrics.psnr, 2)} dB, {_other_metrics(metrics)}"
+    to_reference = f"candidate to reference {comparison.candidate_vs_reference.summary}"
     if comparison.reference is None:
         return to_reference
-    psnr = f"candidate to photograph {format_metric(comparison.candidate.psnr, 2)} dB ({_psnr_change(comparison)})"
-    return f"{psnr}, {_other_metrics(comparison.candidate)} · {to_reference}"
+    return f"candidate to photograph {comparison.candidate.summary}, change {_change(comparison)} dB · {to_reference}"
 
 
 def _slider(name: str, reference: str, candidate: str, mark: str) -> str:

@@ -32,10 +32,7 @@ single unchanged view, at 120 dB or infinite, would hide damage in others."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageMetrics:
-    """Metrics of an image against a target, or their means over views.
-
-    NaN in an image gives NaN in the metrics and their means, so that no mean hides a failed rendering.
-    """
+    """Metrics of an image against a target, or their means over views; NaN where a rendering has failed."""
 
     psnr: float  # decibels; infinite for equal images
     ssim: float  # -1 to 1; 1 for equal images
@@ -52,6 +49,12 @@ class ImageMetrics:
         values = {"SSIM": self.ssim, "MS-SSIM": self.ms_ssim, "FLIP": self.flip, "LPIPS": self.lpips}
         others = {name: format_metric(value, 4) for name, value in values.items() if value is not None}
         return {"PSNR": format_metric(self.psnr, 2), **others}
+
+    @property
+    def summary(self) -> str:
+        """All metrics in one line: "PSNR 31.42 dB, SSIM 0.9310, MS-SSIM 0.9702"."""
+        psnr, *others = self.texts().items()
+        return ", ".join([f"PSNR {psnr[1]} dB", *(f"{name} {text}" for name, text in others)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,12 +76,8 @@ class Comparison:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the metrics by name, for JSON."""
-        reference = None if self.reference is None else self.reference.as_dict()
-        return {
-            "reference": reference,
-            "candidate": self.candidate.as_dict(),
-            "candidate_vs_reference": self.candidate_vs_reference.as_dict(),
-        }
+        found = {name: getattr(self, name) for name in ("reference", "candidate", "candidate_vs_reference")}
+        return {name: None if metrics is None else metrics.as_dict() for name, metrics in found.items()}
 
     def cells(self, names: Sequence[str] | None = None) -> list[str]:
         """Return a table row: reference, candidate, change, candidate to reference; without photographs the last.
@@ -86,11 +85,14 @@ class Comparison:
         ``names`` are metrics as :meth:`ImageMetrics.texts` names them, by default all.
         """
         names = list(self.candidate.texts()) if names is None else names
-        to_reference = [self.candidate_vs_reference.texts()[name] for name in names]
-        if self.reference is None or self.change is None:
+        *to_photo, to_reference = (
+            [metrics.texts()[name] for name in names]
+            for metrics in (self.reference, self.candidate, self.candidate_vs_reference)
+            if metrics is not None
+        )
+        if self.change is None:
             return to_reference
-        to_photo = [metrics.texts()[name] for metrics in (self.reference, self.candidate) for name in names]
-        return [*to_photo, format_metric(self.change, 2, signed=True), *to_reference]
+        return [*to_photo[0], *to_photo[1], format_metric(self.change, 2, signed=True), *to_reference]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -111,9 +113,8 @@ class ViewComparison:
     def pose(self) -> str:
         """Position of the camera, and its target or direction, in the world, as text."""
         pose = self.pose_as_dict()
-        if pose["target"] is None:
-            return f"at {_point(pose['position'])} looking along {_point(pose['direction'])}"
-        return f"at {_point(pose['position'])} looking at {_point(pose['target'])}"
+        looking = f"along {_point(pose['direction'])}" if pose["target"] is None else f"at {_point(pose['target'])}"
+        return f"at {_point(pose['position'])} looking {looking}"
 
     def pose_as_dict(self) -> dict[str, Any]:
         """Return the view's name, its PSNR of the candidate to the reference, and the camera's pose in the world."""
@@ -206,7 +207,7 @@ class Evaluation:
 
         NaN if a rendering failed; between a number and infinity, the number.
         """
-        values = sorted(view.comparison.candidate_vs_reference.psnr for view in self.views)
+        values = sorted(_psnrs(self))
         if any(math.isnan(value) for value in values):
             return math.nan
         rank = 0.05 * (len(values) - 1)
@@ -245,19 +246,17 @@ class Evaluation:
         }
 
 
-def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:
-    def mean(numbers: Sequence[float]) -> float:
-        return sum(numbers) / len(numbers)
+def _psnrs(evaluation: Evaluation) -> list[float]:
+    """Return the PSNR of the candidate to the reference in each view, decibels."""
+    return [view.comparison.candidate_vs_reference.psnr for view in evaluation.views]
 
-    flips = [value.flip for value in values if value.flip is not None]
-    lpips = [value.lpips for value in values if value.lpips is not None]
-    return ImageMetrics(
-        psnr=_mean_decibels([value.psnr for value in values]),
-        ssim=mean([value.ssim for value in values]),
-        ms_ssim=mean([value.ms_ssim for value in values]),
-        flip=mean(flips) if flips else None,
-        lpips=mean(lpips) if lpips else None,
-    )
+
+def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:
+    columns = {name: [getattr(value, name) for value in values] for name in ("ssim", "ms_ssim", "flip", "lpips")}
+    means: dict[str, Any] = {
+        name: None if None in column else sum(column) / len(column) for name, column in columns.items()
+    }
+    return ImageMetrics(psnr=_mean_decibels([value.psnr for value in values]), **means)
 
 
 def _mean_decibels(values: Sequence[float]) -> float:
@@ -302,10 +301,7 @@ renderings is negative."""
 
 
 def over_scene(evaluation: Evaluation) -> Evaluation:
-    """Return what says how near the candidate's renderings are to the reference's.
-
-    Without photographs, that are the cameras drawn over the whole scene (the surroundings), where there are any.
-    """
+    """Return the evaluation from cameras over the whole scene, where there are any and no photographs."""
     surroundings = evaluation.surroundings
     return evaluation if surroundings is None or evaluation.against == "photos" else surroundings
 
@@ -318,10 +314,7 @@ def psnr_of(evaluation: Evaluation) -> float:
     """
     evaluation = over_scene(evaluation)
     mean = evaluation.mean.candidate_vs_reference.psnr
-    worst = (
-        _mean_of_worst([_squared_error(view.comparison.candidate_vs_reference.psnr) for view in evaluation.views])
-        / MAX_ERROR_RATIO
-    )
+    worst = _mean_of_worst([_squared_error(psnr) for psnr in _psnrs(evaluation)]) / MAX_ERROR_RATIO
     return mean if math.isnan(mean) or worst <= 0 else min(mean, -10 * math.log10(worst))
 
 
@@ -340,9 +333,7 @@ def drop_of(evaluation: Evaluation) -> float:
     else:
         drop, groups = -mean.change, [_errors_added(evaluation)]
     worst = _worst(groups) / MAX_ERROR_RATIO
-    if math.isnan(drop) or math.isnan(worst):
-        return math.nan
-    return drop if worst <= 0 else max(drop, _drop_by(worst))
+    return _at_least(drop, worst if worst <= 0 else _drop_by(worst))
 
 
 def ssim_drop_of(evaluation: Evaluation) -> float:
@@ -352,10 +343,14 @@ def ssim_drop_of(evaluation: Evaluation) -> float:
     reference; at least the mean drop of the worst views divided by :data:`MAX_SSIM_RATIO`.
     """
     groups = [_ssim_drops(evaluation), _ssim_drops(over_scene(evaluation))]
-    mean, worst = sum(groups[0]) / len(groups[0]), _worst(groups) / MAX_SSIM_RATIO
-    if math.isnan(mean) or math.isnan(worst):
+    return _at_least(sum(groups[0]) / len(groups[0]), _worst(groups) / MAX_SSIM_RATIO)
+
+
+def _at_least(drop: float, worst: float) -> float:
+    """Return a mean drop, limited by that of the worst views if they lose anything; NaN if either is."""
+    if math.isnan(drop) or math.isnan(worst):
         return math.nan
-    return mean if worst <= 0 else max(mean, worst)
+    return drop if worst <= 0 else max(drop, worst)
 
 
 def _ssim_drops(evaluation: Evaluation) -> list[float]:
@@ -368,8 +363,7 @@ def _ssim_drops(evaluation: Evaluation) -> list[float]:
 
 def _errors_to_renderings(evaluation: Evaluation) -> list[float]:
     """Return each view's squared error to the reference's rendering, in units of that of :data:`ASSUMED_PSNR`."""
-    psnrs = [view.comparison.candidate_vs_reference.psnr for view in evaluation.views]
-    return [_squared_error(psnr) / _squared_error(ASSUMED_PSNR) for psnr in psnrs]
+    return [_squared_error(psnr) / _squared_error(ASSUMED_PSNR) for psnr in _psnrs(evaluation)]
 
 
 def _errors_added(evaluation: Evaluation) -> list[float]:

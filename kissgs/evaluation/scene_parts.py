@@ -27,10 +27,9 @@ FAIRNESS = 0.25
 
 
 def prominence(splats: Splats) -> Float64[np.ndarray, " N"]:
-    """Return the prominence of each Gaussian, 0 to 1: opacity times its area relative to its neighbourhood.
+    """Return the prominence of each Gaussian, 0 to 1: opacity times a / (a + median of its neighbourhood's areas).
 
-    The relative area is a / (a + median of the neighbourhood). So the details of a small object count as much as the
-    large Gaussians of a background, and one immense Gaussian at most twice as much as an ordinary one.
+    So the details of a small object count as much as a background, and an immense Gaussian at most twice as much.
     """
     weights = np.zeros(len(splats))
     opacities = drawn_opacities(splats)
@@ -62,11 +61,10 @@ class GaussianSampler:
 
     @classmethod
     def of(cls, means: Float64[np.ndarray, "N 3"], weights: Float64[np.ndarray, " N"]) -> GaussianSampler:
-        """Return a sampler whose probabilities are half proportional to the weights and half shared fairly in space.
+        """Return a sampler whose probabilities are half proportional to the weights and half shared in an octree.
 
-        The fair half is shared in an octree: the children of a cell get parts of its probability in proportion to the
-        fourth roots of their weights. So a small isolated cluster is not missed beside a large one, nor a large one
-        beside a few outliers.
+        There, the children of a cell share its probability by the fourth roots of their weights: a small cluster is not
+        missed beside a large one, nor a large one beside a few outliers.
         """
         codes = morton_codes(means)
         order = np.argsort(codes, kind="stable")
@@ -133,12 +131,11 @@ class Part:
 
 
 def find_parts(splats: Splats, counts: Float64[np.ndarray, " N"]) -> tuple[list[Part], Int[np.ndarray, " N"]]:
-    """Find the smallest separate parts of a scene.
+    """Return the smallest separate parts of a scene, and each Gaussian's part, -1 for none; ``counts`` are prominences.
 
-    A sample of the Gaussians is clustered by single linkage; as in HDBSCAN, no two Gaussians are nearer than their own
-    size. A cluster that has reached :data:`MIN_SHARE` of the scene is a part if the gap to the next cluster of at least
-    that size is :data:`MIN_GAP_RATIO` times the gap at which it reached the share.
-    Returns the parts, and the index of each Gaussian's part, -1 for none; ``counts`` are prominences.
+    A sample is clustered by single linkage; as in HDBSCAN, no two Gaussians are nearer than their own size. A cluster
+    that has reached :data:`MIN_SHARE` of the scene is a part if the gap to the next one of at least that size is
+    :data:`MIN_GAP_RATIO` times the gap at which it reached the share.
     """
     part_of = np.full(len(splats), -1)
     visible = np.flatnonzero(counts > 0)
@@ -194,11 +191,6 @@ class _Cluster:
     formed: float = np.inf  # length of the edge with which it became large enough for a part
     parts: list[list[int]] = field(default_factory=list)  # members of each part in it
 
-    def mark_if_separate(self, length: float) -> None:
-        """Mark the cluster as a part if the next one, at distance ``length``, is far enough away."""
-        if not self.parts and length > MIN_GAP_RATIO * self.formed:
-            self.parts = [self.members]
-
 
 def _separate_parts(edges: list[Edge], shares: Float64[np.ndarray, " n"]) -> list[list[int]]:
     """Return the members of each part; ``edges`` are a spanning tree, shortest first."""
@@ -206,8 +198,9 @@ def _separate_parts(edges: list[Edge], shares: Float64[np.ndarray, " n"]) -> lis
     for length, a, b in edges:
         one, other = cluster_of[a], cluster_of[b]
         if np.isfinite(one.formed) and np.isfinite(other.formed):
-            one.mark_if_separate(length)
-            other.mark_if_separate(length)
+            for cluster in (one, other):
+                if not cluster.parts and length > MIN_GAP_RATIO * cluster.formed:  # the next one is far away
+                    cluster.parts = [cluster.members]
         joined = _Cluster(one.members + other.members, one.share + other.share)
         joined.parts, joined.formed = one.parts + other.parts, min(one.formed, other.formed)
         if np.isinf(joined.formed) and joined.share >= MIN_SHARE and len(joined.members) >= MIN_SAMPLES:
@@ -236,10 +229,7 @@ def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
 
 
 def share_shown(splats: Splats, cameras: Sequence[Camera], *, threads: int = 0) -> float:
-    """Return the share of a scene, 0 to 1, that some cameras show; 1 for a scene without visible Gaussians.
-
-    A Gaussian is shown if it covers more than :data:`SHOWN_SHARE` of an image, and counts by its prominence.
-    """
+    """Return the share of a scene by prominence, 0 to 1, that cameras show; 1 without visible Gaussians."""
     counts, plain = prominence(splats), base_colors_only(splats)
     if not counts.any():
         return 1.0
