@@ -276,6 +276,7 @@ def render(
     """Render an image of a scene, an orbit around it (animation or contact sheet), or all its views."""
     from kissgs.cameras.captures.transforms_json import write_camera
     from kissgs.cameras.render import RenderJob
+    from kissgs.core.progress import Context
     from kissgs.evaluation.evaluate import in_scene_frame
     from kissgs.io.files import refuse_existing
     from kissgs.pipeline.scene_files import load
@@ -294,13 +295,11 @@ def render(
                 splats=load(Path(name), threads=threads, progress=progress, **asdict(common.reading())),
                 size=size,
                 background=background,
-                device=device,
-                threads=threads,
-                progress=progress,
+                context=Context(threads, device, progress),
             )
             fitting = None
             if views is not None:
-                fitting = in_scene_frame(job.splats, views, threads=threads, progress=progress)
+                fitting = in_scene_frame(job.splats, views, job.context)
             if image.orbit:
                 animated = suffix == ".webp"
                 rendered = job.animation(image.frames) if animated else job.orbit_sheet(image.frames)

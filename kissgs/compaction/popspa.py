@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kissgs.cameras.views import Views
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
 from kissgs.compaction.scene_training import (
     Phase,
@@ -25,12 +24,11 @@ from kissgs.compaction.scene_training import (
 )
 from kissgs.core.array_types import Int
 from kissgs.core.errors import OutputError
-from kissgs.core.progress import Deadline, Progress, as_stage, load_kernels, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Deadline, load_kernels
 from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import ImageMetrics
-from kissgs.rendering.rasterizer import Device
 from kissgs.settings import CompactSettings, Preset, Settings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import encode
@@ -85,52 +83,40 @@ class StepLog:
 
 
 def evaluate_scene(
-    scene: Splats, reference: Splats, supervision: SupervisionViews, threads: int = 0, progress: Progress = silent
+    scene: Splats, reference: Splats, supervision: SupervisionViews, context: Context = DEFAULT_CONTEXT
 ) -> tuple[ImageMetrics, int]:
     """Return the mean image metrics of a scene, and its bytes as a zip with the preset ``fast``.
 
     Evaluation views are used if they have photographs, else cameras drawn over all of ``reference``.
     """
-    as_evaluate = as_stage("evaluate", progress)
-    views = _views(reference, supervision, threads, as_evaluate)
-    evaluation = compare_images(reference, scene, views, threads=threads, progress=as_evaluate)
-    encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=as_evaluate)
+    context, views = replace(context.stage("evaluate"), device="cpu"), supervision.eval_views
+    if all(view.photo is None for view in views.test):
+        views = evaluation_views(reference, context)
+    evaluation = compare_images(reference, scene, views, context)
+    encoded = encode(scene, Settings(preset=Preset.FAST).encode, context)
     return evaluation.mean.candidate, len(zip_bytes(encoded.files))
 
 
-def step_log(
-    evaluate: bool, reference: Splats, supervision: SupervisionViews, threads: int, progress: Progress
-) -> StepLog:
+def step_log(evaluate: bool, reference: Splats, supervision: SupervisionViews, context: Context) -> StepLog:
     """Return an empty log, which evaluates each step if ``evaluate``; see :func:`evaluate_scene`."""
     if not evaluate:
         return StepLog(None)
-    return StepLog(
-        partial(evaluate_scene, reference=reference, supervision=supervision, threads=threads, progress=progress)
-    )
+    return StepLog(partial(evaluate_scene, reference=reference, supervision=supervision, context=context))
 
 
-def _views(reference: Splats, supervision: SupervisionViews, threads: int, progress: Progress) -> Views:
-    """Return the evaluation views of a capture with photographs, else cameras drawn over the whole scene."""
-    if any(view.photo is not None for view in supervision.test):
-        return supervision.eval_views
-    return evaluation_views(reference, threads=threads, progress=progress)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Popspa:
     """Compacts one scene by POPSpa.
 
-    On ``device`` "cuda", sums have no fixed order, so that results vary slightly. Scores are computed on the CPU.
+    On the device "cuda", sums have no fixed order, so that results vary slightly. Scores are computed on the CPU.
     """
 
     splats: Splats
     settings: CompactSettings  # their budget is ignored
     supervision: SupervisionViews
+    context: Context = DEFAULT_CONTEXT
     reference: Splats | None = None  # the original scene, if splats is already pruned
-    targets: TrainingTargets | None = None  # by default loaded or rendered when needed
-    threads: int = 0
-    device: Device = "cpu"
-    progress: Progress = silent
+    targets: TrainingTargets | None = None  # of these views; loaded or rendered when first needed
 
     def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
         """Return the scene with exactly ``count`` Gaussians; ``evaluate`` measures every step.
@@ -139,10 +125,12 @@ class Popspa:
         as without an interruption. It stays at the end.
         """
         scenes = (self.splats, self.original)
+        if self.settings.trains:
+            self.load_targets()
         key = ""
         if checkpoint is not None:
-            key = work_key(scenes, count, self.settings, self.supervision, evaluate, self.device)
-        log = step_log(evaluate, self.original, self.supervision, self.threads, self.progress)
+            key = work_key(scenes, count, self.settings, self.supervision, evaluate, self.context.device)
+        log = step_log(evaluate, self.original, self.supervision, self.context)
         compacted = _Run(self, count, Checkpoint(checkpoint, key), log).run()
         return replace(compacted, checkpoint=checkpoint) if self.settings.trains else compacted
 
@@ -152,12 +140,12 @@ class Popspa:
         return self.reference or self.splats
 
     def load_targets(self) -> TrainingTargets:
-        """Return the target images, loaded or rendered unless :attr:`targets` are given."""
+        """Return the target images, which are loaded or rendered once."""
         from kissgs.training.supervision import training_targets
 
-        return self.targets or training_targets(
-            self.original, self.supervision, threads=self.threads, device=self.device, progress=self.progress
-        )
+        if self.targets is None:
+            self.targets = training_targets(self.original, self.supervision, self.context)
+        return self.targets
 
 
 @dataclass(slots=True, eq=False)
@@ -173,12 +161,12 @@ class _Run:
 
     def __post_init__(self) -> None:
         task = self.task
-        self.training = SceneTraining(task.splats, task.settings, task.supervision, task.threads, task.device)
+        self.training = SceneTraining(task.splats, task.settings, task.supervision, task.context.device)
 
     def run(self) -> Compacted:
         """Do all steps, or those that remain after the checkpoint."""
         task = self.task
-        load_kernels(task.progress)
+        load_kernels(task.context.progress)
         phases = training_phases(task.settings, len(task.splats), self.count)
         if not phases:
             self._first_pruning(self.count)
@@ -208,7 +196,7 @@ class _Run:
     def _first_pruning(self, count: int) -> None:
         """Prune the input to ``count`` Gaussians."""
         self.log.record("input", self.task.splats)
-        self.training.prune(count, self.task.progress)
+        self.training.prune(count, self.task.context)
         self.log.record("prune", self.training.splats())
 
     def _train(self, phases: Sequence[Phase], number: int, done: int, state: State, targets: TrainingTargets) -> None:
@@ -220,19 +208,20 @@ class _Run:
             if self.checkpoint.due:
                 self._save(number, step, {} if sparsifier is None else sparsifier.state())
 
-        progress = stage_progress(self.task.progress, phases, number)
+        progress = stage_progress(self.task.context.progress, phases, number)
+        context = replace(self.task.context, progress=progress, deadline=None)  # a given count takes all steps
         training.train(
             phase,
             targets,
             (self.task.settings.seed, number),
+            context,
             regularizers=() if sparsifier is None else (sparsifier,),
             first=done,
             after=save_if_due,
-            progress=progress,
         )
         self.log.record(phase.name, training.splats())
         if len(training) > phase.count:
-            training.prune(phase.count, progress)
+            training.prune(phase.count, context)
             self.log.record("prune", training.splats())
 
     def _sparsifier(self, phase: Phase, state: State) -> AdmmSparsifier | None:
@@ -311,7 +300,6 @@ class TrainingPath:
     keep_states: bool = True  # every point, not just the last one, can be refined: that takes three times the memory
     points: list[PathPoint] = field(init=False)  # the whole scene first
     whole: PathPoint = field(init=False)  # without training, also after the first point was trained
-    _loaded: TrainingTargets | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         self.whole = PathPoint(0, self.task.splats, np.arange(len(self.task.splats)))
@@ -322,9 +310,9 @@ class TrainingPath:
 
         If a progress receiver raises here or in :meth:`train`, the path stays as it was.
         """
-        load_kernels(self.task.progress)
+        load_kernels(self.task.context.progress)
         training = self._at(self.points[-1])
-        training.prune(count, self.task.progress)
+        training.prune(count, self.task.context)
         return self._add(training, len(self.points))
 
     def train(self, deadline: Deadline | None = None) -> PathPoint:
@@ -336,12 +324,13 @@ class TrainingPath:
         task, point = self.task, self.points[-1]
         if task.settings.sparsify_steps == 0:
             return point
-        steps = POINT_STEPS[self.targets.target_source] * task.settings.sparsify_steps // task.settings.prune_rounds
+        targets, settings = task.load_targets(), task.settings
+        steps = POINT_STEPS[targets.target_source] * settings.sparsify_steps // settings.prune_rounds
         if steps == 0:
             return point
         training = self._at(point)
         if not point.trained:
-            training.begin(self.targets)
+            training.begin(targets)
         self._train(training, Phase("sparsify", steps, len(point)), point.number, deadline)
         self.points.pop()
         return self._add(training, point.number)
@@ -355,38 +344,30 @@ class TrainingPath:
         if refine and task.settings.refine_steps:
             training = self._at(point)
             if not point.trained:
-                training.begin(self.targets)
+                training.begin(task.load_targets())
             phase = Phase("refine", task.settings.refine_steps, len(point))
             self._train(training, phase, REFINEMENT + point.number, deadline)
             splats = training.splats()
         report = CompactionReport(
             source_count=len(task.splats),
             count=len(splats),
-            target_source=self.targets.target_source if point.trained or refine else "nothing",
+            target_source=task.load_targets().target_source if point.trained or refine else "nothing",
             source=task.supervision.source,
             steps=(),
             note=task.supervision.note,
         )
         return Compacted(splats, point.index, report)
 
-    def _train(self, training: SceneTraining, phase: Phase, number: int, deadline: Deadline | None = None) -> None:
-        task = self.task
-        seed = (task.settings.seed, number)
-        training.train(phase, self.targets, seed, deadline=deadline, progress=task.progress)
-
-    @property
-    def targets(self) -> TrainingTargets:
-        """Target images of the training, which are loaded or rendered when they are first needed."""
-        if self._loaded is None:
-            self._loaded = self.task.load_targets()
-        return self._loaded
+    def _train(self, training: SceneTraining, phase: Phase, number: int, deadline: Deadline | None) -> None:
+        seed, context = (self.task.settings.seed, number), replace(self.task.context, deadline=deadline)
+        training.train(phase, self.task.load_targets(), seed, context)
 
     def _at(self, point: PathPoint) -> SceneTraining:
         task = self.task
-        training = SceneTraining(task.splats, task.settings, task.supervision, task.threads, task.device)
+        training = SceneTraining(task.splats, task.settings, task.supervision, task.context.device)
         training.index = point.index
         if point.state is not None:
-            training.restore(point.state, point.index, self.targets)
+            training.restore(point.state, point.index, task.load_targets())
         return training
 
     def _add(self, training: SceneTraining, number: int) -> PathPoint:

@@ -7,7 +7,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -18,10 +18,10 @@ from kissgs.cameras.views import View
 from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.compaction.result import CompactionStep
 from kissgs.core.array_types import Float, Float32, Float64, Int
-from kissgs.core.progress import Deadline, Pace, Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Device, Pace, Progress
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.rasterizer import Device, removal_scores
+from kissgs.rendering.rasterizer import removal_scores
 from kissgs.rendering.sensitivity import Coverage
 from kissgs.settings import CompactSettings
 from kissgs.training.supervision import SupervisionViews
@@ -46,11 +46,10 @@ def prune_by_score(
     views: Sequence[View],
     background: Float32[np.ndarray, "3"],
     count: int,
+    context: Context = DEFAULT_CONTEXT,
     *,
     min_keep_per_scoring: float = 0.0,
     min_score: float = 0.0,
-    threads: int = 0,
-    progress: Progress = silent,
 ) -> Int[np.ndarray, " M"]:
     """Return the indices of the ``count`` Gaussians to keep: those whose removal would change the images most.
 
@@ -70,19 +69,19 @@ def prune_by_score(
             break
 
         def report(stage: str, fraction: float, note: str = "", done: int = round_) -> None:
-            progress(stage, (done + fraction) / rounds, note)
+            context.progress(stage, (done + fraction) / rounds, note)
 
         scene = splats.select(kept)
-        scores = _mean_scores(scene, views, background, threads, report)
+        scores = _mean_scores(scene, views, background, replace(context, progress=report))
         scores = np.maximum(scores, min_score * _nearby_scores(scores, close_up[kept]))
         left = count if round_ == rounds - 1 else max(count, round(len(splats) * shrink ** (round_ + 1)))
         kept = kept[highest_indices(scores, left)]
-    progress("score", 1.0)
+    context.progress("score", 1.0)
     return kept
 
 
 def _mean_scores(
-    scene: Splats, views: Sequence[View], background: Float32[np.ndarray, "3"], threads: int, progress: Progress
+    scene: Splats, views: Sequence[View], background: Float32[np.ndarray, "3"], context: Context
 ) -> Float64[np.ndarray, " N"]:
     """Return the sum over views of the mean squared error that each removal causes, each view on its background."""
     groups = defaultdict[tuple[int, tuple[float, ...]], list[Camera]](list)
@@ -93,9 +92,10 @@ def _mean_scores(
     for (pixels, colour), cameras in groups.items():
 
         def report(stage: str, fraction: float, note: str = "", done: int = done, count: int = len(cameras)) -> None:
-            progress(stage, (done + fraction * count) / len(views), note)
+            context.progress(stage, (done + fraction * count) / len(views), note)
 
-        scores += removal_scores(scene, cameras, background=colour, threads=threads, progress=report) / (3 * pixels)
+        found = removal_scores(scene, cameras, replace(context, progress=report), background=colour)
+        scores += found / (3 * pixels)
         done += len(cameras)
     return scores
 
@@ -260,7 +260,6 @@ class SceneTraining:
     source: Splats
     settings: CompactSettings
     supervision: SupervisionViews
-    threads: int = 0
     device: Device = "cpu"
     index: Int[np.ndarray, " M"] = field(init=False)
     _model: GaussianModel | None = field(init=False, default=None)
@@ -288,17 +287,16 @@ class SceneTraining:
             return self.trained.splats()
         return self.source if len(self) == len(self.source) else self.source.select(self.index)
 
-    def prune(self, count: int, progress: Progress) -> None:
+    def prune(self, count: int, context: Context) -> None:
         """Keep the ``count`` Gaussians that images would miss most; reports the stage "score"."""
         kept = prune_by_score(
             self.splats(),
             self.supervision.score,
             self.supervision.background,
             count,
+            context,
             min_keep_per_scoring=self.settings.min_keep_per_scoring,
             min_score=MIN_SCORE[self.supervision.captured],
-            threads=self.threads,
-            progress=progress,
         )
         self.index = self.index[kept]
         if self._model is not None:
@@ -326,29 +324,25 @@ class SceneTraining:
         phase: Phase,
         targets: TrainingTargets,
         seed: Sequence[int],
+        context: Context,
         *,
         regularizers: tuple[Regularizer, ...] = (),
         first: int = 0,
         after: Callable[[int], None] = lambda done: None,
-        deadline: Deadline | None = None,
-        progress: Progress,
     ) -> None:
-        """Train for one phase, with fewer steps where ``deadline`` comes first.
-
-        The other arguments are those of :func:`kissgs.training.loop.train`.
-        """
+        """Train for one phase, see :func:`kissgs.training.loop.train`, with fewer steps where the deadline is near."""
         from kissgs.training.loop import TrainingPlan, train
 
         plan = TrainingPlan(
             stage=phase.name,
-            pace=Pace(phase.steps, deadline),
+            pace=Pace(phase.steps, context.deadline),
             rates=lr_schedule(self.settings, phase, targets.target_source),
             ssim_weight=self.settings.ssim_weight,
             mse_weight=self.settings.mse_weight,
             seed=seed,
             regularizers=(*self._shape_regularizers(targets), *regularizers),
         )
-        train(self.trained, targets, plan, first=first, after=after, threads=self.threads, progress=progress)
+        train(self.trained, targets, plan, context, first=first, after=after)
 
     def _shape_regularizers(self, targets: TrainingTargets) -> tuple[Regularizer, ...]:
         settings = self.settings

@@ -15,12 +15,11 @@ import numpy as np
 from PIL import Image
 
 from kissgs.core.array_types import Float32, Float64, UInt8
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
 from kissgs.evaluation.evaluate import background_of, render_clamped
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison, format_metric
 from kissgs.rendering.images import to_bytes
-from kissgs.rendering.rasterizer import Device
 
 # Error maps: differences of two images per pixel, as colours, and the crop with the largest error.
 
@@ -207,15 +206,12 @@ def html_report(
     evaluation: Evaluation,
     reference: ReportScene,
     candidate: ReportScene,
-    *,
-    device: Device = "cpu",
-    threads: int = 0,
-    progress: Progress = silent,
+    context: Context = DEFAULT_CONTEXT,
 ) -> str:
     """Return an evaluation as a self-contained HTML page, with styles, script and images embedded.
 
     The worst :data:`MAX_VIEWS` views are shown with images, the worst first. The worst :data:`MAX_SURROUNDINGS` views
-    of the ``surroundings`` follow. ``progress`` receives the stage "html".
+    of the ``surroundings`` follow. Reports the stage "html".
     """
     shown = _worst_first(evaluation)[:MAX_VIEWS]
     entries = [(f"view-{i}", evaluation, evaluation.views[i]) for i in shown]
@@ -225,14 +221,14 @@ def html_report(
     lowest = min((compared for _, _, compared in entries), key=lambda compared: compared.ranking_psnr)
     full, sections = full_scale(lowest.comparison.candidate_vs_reference.psnr), []
     for done, (anchor, group, compared) in enumerate(entries):
-        progress("html", done / len(entries))
+        context.progress("html", done / len(entries))
         view, background = compared.view, background_of(compared.view, group.background)
         renderings = [
-            render_clamped(scene.splats, view.camera, background, device, threads) for scene in (reference, candidate)
+            render_clamped(scene.splats, view.camera, background, context) for scene in (reference, candidate)
         ]
         photo = view.load_photo() if group.against == "photos" else None
         sections.append(_section(anchor, compared, renderings, photo, full))
-    progress("html", 1.0)
+    context.progress("html", 1.0)
     return Template(files("kissgs.evaluation").joinpath("report.html").read_text(encoding="utf-8")).substitute(
         title=escape(f"{candidate.name} compared with {reference.name}"),
         reference=escape(reference.name),

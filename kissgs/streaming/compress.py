@@ -15,7 +15,7 @@ from typing import Any
 from kissgs._version import __version__
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.positions import middle_of, with_origin, world_positions
-from kissgs.core.progress import Progress, as_stage, silent
+from kissgs.core.progress import Context, Progress, silent
 from kissgs.core.splats import BLOCK, Splats
 from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
 from kissgs.io.files import reason_of
@@ -208,7 +208,8 @@ def _make(
             return
         for at, item in enumerate(left):
             part(at / len(left))
-            item.run(threads, as_stage(stage, lambda _, now, note="", at=at: part((at + now) / len(left))))
+            context = Context(progress=lambda _, now, note="", at=at: part((at + now) / len(left)))
+            item.run(threads, context.stage(stage).progress)
 
     item = partial(Item, str(work.absolute()), encode.model_dump(mode="json"))
     run("merge", [item(chunk=chunk) for chunk in layout.filled])
