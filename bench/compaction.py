@@ -97,7 +97,7 @@ def main() -> None:
             count = max(1, round(len(scene) * ratio))
             wall, cpu = time.perf_counter(), time.process_time()
             reduced = scene if start is None else start(scene, count)
-            found = Popspa(reduced, own, supervised, reference=scene, targets=targets)(count)
+            found = Popspa(reduced, own, supervised, targets=targets)(count)
             report(name, found.splats, time.perf_counter() - wall, time.process_time() - cpu)
 
 

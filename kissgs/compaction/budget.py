@@ -14,7 +14,7 @@ import numpy as np
 
 from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.samples import random_poses
-from kissgs.compaction.popspa import Popspa, StepLog, step_log
+from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.result import Compacted, CompactionReport, CountTrial
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import DEFAULT_CONTEXT, Context
@@ -76,18 +76,15 @@ class SearchEvaluation:
         if self.views is not None:
             pixels = sum(view.camera.width * view.camera.height for view in self.views.test)
             images = self._images if pixels <= KEPT_PIXELS else None
-            return self._compare(candidate, self.views, images, context)
+            return compare_images(self.original, candidate, self.views, context, reference_images=images)
         if self._poses is None or self._drawn is None:
             poses = random_poses(self.original, context, side=SIDE, count=COUNT, seed=SEARCH_SEED)
             self._drawn = evaluation_views(self.original, context, seed=SEARCH_SEED)
             self._poses = replace(poses, train=(), test=_over_backgrounds(poses.train + poses.test))
-        found = self._compare(candidate, self._poses, self._images, context)
-        return replace(found, surroundings=self._compare(candidate, self._drawn, self._drawn_images, context))
-
-    def _compare(
-        self, candidate: Splats, views: Views, images: dict[int, Rendering] | None, context: Context
-    ) -> Evaluation:
-        return compare_images(self.original, candidate, views, context, reference_images=images)
+        scenes = self.original, candidate
+        found = compare_images(*scenes, self._poses, context, reference_images=self._images)
+        around = compare_images(*scenes, self._drawn, context, reference_images=self._drawn_images)
+        return replace(found, surroundings=around)
 
 
 def _over_backgrounds(views: Sequence[View]) -> tuple[View, ...]:
@@ -138,8 +135,6 @@ def compact_scene(
     count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
     if count >= len(splats):
         return unchanged(splats, "no more than requested")
-    if settings.method == "merge" and not evaluate and settings.max_psnr_drop is None:  # no cameras are needed
-        return _merge(splats, count, context)
     task = Popspa(splats, settings, chosen_views(splats, settings, views, context), context)
     if settings.max_psnr_drop is None:
         return _compacted(task, count, evaluate=evaluate, checkpoint=checkpoint)
@@ -156,30 +151,25 @@ def unchanged(splats: Splats, reason: str) -> Compacted:
     return Compacted(splats, np.arange(len(splats)), report)
 
 
-def _merge(
-    splats: Splats,
-    count: int,
-    context: Context,
-    *,
-    evaluate: bool = False,
-    supervision: SupervisionViews | None = None,
-) -> Compacted:
-    """Return the scene with ``count`` Gaussians by merging; ``supervision`` is needed to evaluate the steps."""
-    context.progress("kernels", 0.0)
+def _merge(task: Popspa, count: int, *, evaluate: bool) -> Compacted:
+    """Return the scene with ``count`` Gaussians by merging."""
+    progress = task.context.progress
+    progress("kernels", 0.0)
     from kissgs.compaction.merging import merge_gaussians  # loads kernels that pruning does not need
 
-    context.progress("kernels", 1.0)
-    log = StepLog(None) if supervision is None else step_log(evaluate, splats, supervision, context)
-    log.record("input", splats)
-    merged, index = merge_gaussians(splats, count, context)
+    progress("kernels", 1.0)
+    log = task.step_log(evaluate=evaluate)
+    log.record("input", task.splats)
+    merged, index = merge_gaussians(task.splats, count, task.context)
     log.record("merge", merged)
+    uses_views = evaluate or task.settings.max_psnr_drop is not None
     report = CompactionReport(
-        source_count=len(splats),
+        source_count=len(task.splats),
         count=count,
         target_source="nothing",
         source="",
         steps=tuple(log.steps),
-        note="" if supervision is None else supervision.note,
+        note=task.supervision.note if uses_views else "",
     )
     return Compacted(merged, index, report)
 
@@ -206,7 +196,7 @@ def estimate_note(supervision: SupervisionViews) -> str:
 def _compacted(task: Popspa, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
     """Return the scene with exactly ``count`` Gaussians, from 1 to fewer than it has, by the method of the settings."""
     if task.settings.method == "merge":
-        return _merge(task.splats, count, task.context, evaluate=evaluate, supervision=task.supervision)
+        return _merge(task, count, evaluate=evaluate)
     return task(count, evaluate=evaluate, checkpoint=checkpoint)
 
 

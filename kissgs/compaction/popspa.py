@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kissgs._version import __version__
+from kissgs.cameras.captures.photos import open_file
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
 from kissgs.compaction.scene_training import (
     Phase,
@@ -20,12 +23,11 @@ from kissgs.compaction.scene_training import (
     first_pruning_count,
     stage_progress,
     training_phases,
-    work_key,
 )
 from kissgs.core.array_types import Int
 from kissgs.core.errors import OutputError
 from kissgs.core.progress import DEFAULT_CONTEXT, Context, Deadline, load_kernels
-from kissgs.core.splats import Splats
+from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import ImageMetrics
@@ -97,13 +99,6 @@ def evaluate_scene(
     return evaluation.mean.candidate, len(zip_bytes(encoded.files))
 
 
-def step_log(evaluate: bool, reference: Splats, supervision: SupervisionViews, context: Context) -> StepLog:
-    """Return an empty log, which evaluates each step if ``evaluate``; see :func:`evaluate_scene`."""
-    if not evaluate:
-        return StepLog(None)
-    return StepLog(partial(evaluate_scene, reference=reference, supervision=supervision, context=context))
-
-
 @dataclass(slots=True, eq=False)
 class Popspa:
     """Compacts one scene by POPSpa.
@@ -115,7 +110,6 @@ class Popspa:
     settings: CompactSettings  # their budget is ignored
     supervision: SupervisionViews
     context: Context = DEFAULT_CONTEXT
-    reference: Splats | None = None  # the original scene, if splats is already pruned
     targets: TrainingTargets | None = None  # of these views; loaded or rendered when first needed
 
     def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
@@ -124,28 +118,42 @@ class Popspa:
         Training continues from ``checkpoint`` if that exists and belongs to this work, on the CPU with the same result
         as without an interruption. It stays at the end.
         """
-        scenes = (self.splats, self.original)
         if self.settings.trains:
             self.load_targets()
-        key = ""
-        if checkpoint is not None:
-            key = work_key(scenes, count, self.settings, self.supervision, evaluate, self.context.device)
-        log = step_log(evaluate, self.original, self.supervision, self.context)
-        compacted = _Run(self, count, Checkpoint(checkpoint, key), log).run()
+        key = "" if checkpoint is None else self._key(count, evaluate)
+        compacted = _Run(self, count, Checkpoint(checkpoint, key), self.step_log(evaluate=evaluate)).run()
         return replace(compacted, checkpoint=checkpoint) if self.settings.trains else compacted
 
-    @property
-    def original(self) -> Splats:
-        """The original scene: the reference, or else the scene itself."""
-        return self.reference or self.splats
+    def step_log(self, *, evaluate: bool) -> StepLog:
+        """Return an empty log, which evaluates each step if requested; see :func:`evaluate_scene`."""
+        views, context = self.supervision, self.context
+        measure = partial(evaluate_scene, reference=self.splats, supervision=views, context=context)
+        return StepLog(measure if evaluate else None)
 
     def load_targets(self) -> TrainingTargets:
         """Return the target images, which are loaded or rendered once."""
         from kissgs.training.supervision import training_targets
 
         if self.targets is None:
-            self.targets = training_targets(self.original, self.supervision, self.context)
+            self.targets = training_targets(self.splats, self.supervision, self.context)
         return self.targets
+
+    def _key(self, count: int, evaluate: bool) -> str:
+        """Return the key of the work's checkpoint, equal only for equal results."""
+        views, device, settings = self.supervision, self.context.device, self.settings.model_dump_json()
+        text = f"{__version__} {count} {evaluate} {device} {settings} {views.background} "
+        key = hashlib.sha256(f"{text}{views.synthetic} {views.synthetic_per_epoch}".encode())
+        for view in (*views.train, *views.score, *views.test):
+            camera = view.camera
+            key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
+            key.update(f"{camera.dilation} {view.background} {view.undistortion} {view.sampling}".encode())
+            if view.photo is not None:
+                with open_file(view.photo) as (file, _):
+                    key.update(file.read())
+        for name in ATTRIBUTES:
+            key.update(getattr(self.splats, name).tobytes())
+        key.update(b"antialiased" * self.splats.antialiased)
+        return key.hexdigest()
 
 
 @dataclass(slots=True, eq=False)

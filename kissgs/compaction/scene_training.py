@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections import defaultdict
@@ -12,14 +11,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from kissgs._version import __version__
-from kissgs.cameras.captures.photos import open_file
 from kissgs.cameras.views import View
 from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.compaction.result import CompactionStep
 from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.progress import DEFAULT_CONTEXT, Context, Device, Pace, Progress
-from kissgs.core.splats import ATTRIBUTES, Splats
+from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import removal_scores
 from kissgs.rendering.sensitivity import Coverage
@@ -182,7 +179,7 @@ def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> 
     return exponential_lr(base, begin, end if phase.name == "refine" else begin)
 
 
-# Checkpoint of a compaction: the key that identifies the work, and the status beside the state of the training.
+# Checkpoint of a compaction: the status beside the state of the training.
 
 State = Mapping[str, np.ndarray]
 """Arrays of a checkpoint by name."""
@@ -209,31 +206,6 @@ class Status:
         """Return the status in a checkpoint."""
         values = json.loads(state[STATUS_ENTRY].tobytes())
         return cls(**{**values, "steps": [CompactionStep(**step) for step in values["steps"]]})
-
-
-def work_key(
-    scenes: Sequence[Splats],
-    count: int,
-    settings: CompactSettings,
-    supervision: SupervisionViews,
-    evaluate: bool,
-    device: Device,
-) -> str:
-    """Return the key of the work's checkpoint, equal only for equal results; ``scenes`` include the original scene."""
-    text = f"{__version__} {count} {evaluate} {device} {settings.model_dump_json()} {supervision.background} "
-    key = hashlib.sha256(f"{text}{supervision.synthetic} {supervision.synthetic_per_epoch}".encode())
-    for view in (*supervision.train, *supervision.score, *supervision.test):
-        camera = view.camera
-        key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
-        key.update(f"{camera.dilation} {view.background} {view.undistortion} {view.sampling}".encode())
-        if view.photo is not None:
-            with open_file(view.photo) as (file, _):
-                key.update(file.read())
-    for scene in scenes:
-        for name in ATTRIBUTES:
-            key.update(getattr(scene, name).tobytes())
-        key.update(b"antialiased" * scene.antialiased)
-    return key.hexdigest()
 
 
 # ``SceneTraining``: a scene that is pruned and trained in turn, and its state.

@@ -315,7 +315,8 @@ def compress(
     if settings.encode.has_goal:
         made, trials, note = _search(work, aims=requested.aims)
     else:
-        work.context, trials, note = after_search, (), ""
+        work.context = after_search
+        trials, note = (), ""
         made = _encode_once(work, checkpoint, disposable=not (evaluate or isinstance(source, Splats)))
     compacted, encoded = compacted or made.compacted, made.encoded
 
@@ -423,12 +424,10 @@ def _encode_once(work: Work, checkpoint: Path | None, *, disposable: bool) -> Co
     from kissgs.pipeline.goal import Container
 
     settings, compacted = work.settings.encode, len(work.original) - len(work.splats)
-    measured = measure(work, work.splats, settings)
     if work.settings.finetune.enabled and len(work.splats) > 0:
         file = None if checkpoint is None else finetune_checkpoint_path(checkpoint)
-        return encode(work, measured, settings, make_tuner(work), checkpoint=file)
-    chosen = plan(work, measured, settings, work.context)
-    del measured
+        return encode(work, measure(work, work.splats, settings), settings, make_tuner(work), checkpoint=file)
+    chosen = plan(work, measure(work, work.splats, settings), settings, work.context)
     if disposable:
         work.splats = work.original = empty_splats(0, 0)
         work.sensitivity = None

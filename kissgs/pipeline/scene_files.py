@@ -315,23 +315,13 @@ def read_scene(
     only_containers: bool = False,
 ) -> Splats:
     """Read a scene without cleaning. With ``only_containers``, a ``.ply`` is refused."""
-    splats = reading.marked(_read(source, reading, threads, progress, only_containers))
-    return centred(splats) if reading.origin == "auto" else splats
-
-
-def _read(
-    source: Path | bytes | Mapping[str, bytes],
-    reading: ReadOptions,
-    threads: int,
-    progress: Progress,
-    only_containers: bool,
-) -> Splats:
     found = recognise(source)
     root = scene_root(source) if isinstance(source, Path) else source
     if only_containers and found == "ply":
         found = "sogxt"  # whose reader says what is wrong
     refuse_level(found, root, reading.level)
-    return FORMATS[found].codec.read(root, reading, threads, progress)
+    splats = reading.marked(FORMATS[found].codec.read(root, reading, threads, progress))
+    return centred(splats) if reading.origin == "auto" else splats
 
 
 def has_levels(path: Path) -> bool:

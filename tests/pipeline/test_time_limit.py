@@ -10,8 +10,9 @@ from helpers.training_scenes import cloud
 
 import kissgs
 from kissgs import Settings, UnsupportedError
-from kissgs.compaction.budget import SearchEvaluation
+from kissgs.compaction import budget
 from kissgs.core.progress import Deadline
+from kissgs.evaluation.evaluate import compare_images
 from kissgs.pipeline import limited_time as machine_speed
 from kissgs.pipeline.limited_time import MEETING, SearchTime, encode_seconds, in_time, save_speed
 from kissgs.settings import Preset
@@ -99,13 +100,13 @@ def test_the_shares_of_a_search_fill_its_time():
 
 @pytest.mark.quick(0)
 def test_a_search_evaluates_in_at_most_16_held_out_photographs(tmp_path, monkeypatch):
-    seen, compare = [], SearchEvaluation._compare
+    seen = []
 
-    def noting(self, candidate, views, images, progress):
+    def noting(reference, candidate, views, *rest, **options):
         seen.append([view.name for view in views.test])
-        return compare(self, candidate, views, images, progress)
+        return compare_images(reference, candidate, views, *rest, **options)
 
-    monkeypatch.setattr(SearchEvaluation, "_compare", noting)
+    monkeypatch.setattr(budget, "compare_images", noting)
     scene = cloud(200)
     views = photographs(scene, tmp_path, train=12, held_out=20)
     kissgs.compress(scene, settings=with_photographs(max_psnr_drop=3.0), views=views)
