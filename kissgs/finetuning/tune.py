@@ -14,9 +14,8 @@ import numpy as np
 import torch
 
 from kissgs._version import __version__
-from kissgs.cameras.views import Views
 from kissgs.core.errors import OutputError
-from kissgs.core.progress import DEFAULT_CONTEXT, Context, Pace
+from kissgs.core.progress import Context, Pace
 from kissgs.core.splats import ATTRIBUTES, MAX_GAUSSIANS, Splats, clean
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
@@ -33,7 +32,7 @@ from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
-from kissgs.training.supervision import SupervisionViews, TrainingTargets, supervision_views, training_targets
+from kissgs.training.supervision import SupervisionViews, TrainingTargets
 
 SENSITIVITY_VIEWS = 64
 """Approximate number of training cameras from which costs are measured, if the plan has none."""
@@ -73,32 +72,11 @@ class Tuner:
     original: Splats  # the original scene, clean; its renderings are the targets if there are no photographs
     settings: FinetuneSettings
     supervision: SupervisionViews
-    targets: TrainingTargets
+    targets: TrainingTargets  # of the supervision's training views
     context: Context  # its receiver gets the stage "finetune", and then those of writing
     container: ContainerModel = EVEN_LEVELS
     decode: Decode = decode_sogxt
     ending_seconds: float = 0.0  # expected time of what comes after the training; measured by the first container
-
-    @classmethod
-    def of(
-        cls,
-        original: Splats,
-        settings: FinetuneSettings,
-        views: Views | None,
-        context: Context = DEFAULT_CONTEXT,
-        *,
-        container: ContainerModel = EVEN_LEVELS,
-        decode: Decode = decode_sogxt,
-        prepared: tuple[SupervisionViews, TrainingTargets] | None = None,
-    ) -> Tuner:
-        """Prepare the targets: photographs of ``views``, or renderings of the original from virtual cameras.
-
-        ``prepared`` are views and targets that exist already for these settings.
-        """
-        if prepared is None:
-            supervision = supervision_views(original, views, settings, context, scoring_stride=0)
-            prepared = supervision, training_targets(original, supervision, context)
-        return cls(original, settings, *prepared, context, container, decode)
 
     def __call__(
         self,

@@ -30,10 +30,10 @@ from kissgs.rendering.rasterizer import need_cuda
 from kissgs.settings import EncodeSettings, FinetuneSettings, Settings
 
 if TYPE_CHECKING:
+    from kissgs.compaction.popspa import Popspa
     from kissgs.finetuning.tune import Tuner
     from kissgs.pipeline.limited_time import SearchTime
     from kissgs.rendering.sensitivity import WeightedCameras
-    from kissgs.training.supervision import SupervisionViews, TrainingTargets
 
 
 def read_sensitivity(path: Path, key: str) -> Sensitivity | None:
@@ -202,26 +202,19 @@ def _pruned_for_finetune(settings: EncodeSettings, finetune: FinetuneSettings) -
     return settings.model_copy(update={"prune_threshold_bits": threshold})
 
 
-def make_tuner(
-    work: Work,
-    settings: FinetuneSettings | None = None,
-    prepared: tuple[SupervisionViews, TrainingTargets] | None = None,
-) -> Tuner:
-    """Return what fine-tunes the levels, by default with the settings of the work.
-
-    ``prepared`` are views and targets of compaction, which are used if those of fine-tuning are the same.
-    """
+def make_tuner(work: Work, settings: FinetuneSettings | None = None, compaction: Popspa | None = None) -> Tuner:
+    """Return what fine-tunes the levels, with the images of a compaction if the settings would choose the same."""
     from kissgs.finetuning.tune import Tuner
+    from kissgs.training.supervision import supervision_views, training_targets
 
-    return Tuner.of(
-        work.original,
-        settings or work.settings.finetune,
-        work.views,
-        work.context,
-        container=MODELS[work.container],
-        decode=DECODERS[work.container],
-        prepared=prepared if _same_views(work.settings) else None,
-    )
+    settings = settings or work.settings.finetune
+    if compaction is not None and compaction.settings.trains and _same_views(work.settings):
+        supervision, targets = compaction.supervision, compaction.load_targets()
+    else:
+        supervision = supervision_views(work.original, work.views, settings, work.context, scoring_stride=0)
+        targets = training_targets(work.original, supervision, work.context)
+    model, decode = MODELS[work.container], DECODERS[work.container]
+    return Tuner(work.original, settings, supervision, targets, work.context, model, decode)
 
 
 def _same_views(settings: Settings) -> bool:

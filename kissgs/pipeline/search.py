@@ -430,8 +430,7 @@ class Search:
         finetune, compactor = self.work.settings.finetune, path.task
         changes = {name: factor * getattr(finetune, name) for name, factor in COMPLETING.items()}
         changes["steps"] = max(1, round(changes["steps"]))
-        prepared = (compactor.supervision, compactor.load_targets()) if compactor.settings.trains else None
-        tuner = make_tuner(self.work, finetune.model_copy(update=changes), prepared)
+        tuner = make_tuner(self.work, finetune.model_copy(update=changes), compactor)
         if self.work.time is None:
             return tuner
         seconds = self.compare.seconds if compactor.supervision.captured else 0.0

@@ -24,6 +24,7 @@ from kissgs.pipeline.scene_files import describe
 from kissgs.rendering.sensitivity import measure_sensitivity
 from kissgs.sogxt.container import YAML_NAME, zip_bytes
 from kissgs.training.checkpoint import Checkpoint
+from kissgs.training.supervision import supervision_views, training_targets
 
 SHORT = {"enabled": True, "steps": 12, "lr": 0.2, "codebook_lr": 0.3, "synthetic_lr_scale": 1.0}
 SHORT |= {"views": 16, "view_size": 60}
@@ -38,7 +39,9 @@ def tuner(scene, container="sogxt", size=40, **changes):
     capture = Views(around(12, size), around(7, size)[1:3], black(), "circle")
     settings = FinetuneSettings(**{**SHORT, "synthetic_view_share": 0.0, **changes})
     made_for = {"container": MODELS[container], "decode": DECODERS[container]}
-    return Tuner.of(scene, settings, capture, Context(1), **made_for)
+    supervision = supervision_views(scene, capture, settings, Context(1), scoring_stride=0)
+    targets = training_targets(scene, supervision, Context(1))
+    return Tuner(scene, settings, supervision, targets, Context(1), **made_for)
 
 
 def written(settings, container="sogxt"):
