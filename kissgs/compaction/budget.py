@@ -14,7 +14,7 @@ import numpy as np
 
 from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.samples import random_poses
-from kissgs.compaction.popspa import Popspa
+from kissgs.compaction.popspa import Popspa, StepLog
 from kissgs.compaction.result import Compacted, CompactionReport, CountTrial
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import DEFAULT_CONTEXT, Context
@@ -158,7 +158,7 @@ def _merge(task: Popspa, count: int, *, evaluate: bool) -> Compacted:
     from kissgs.compaction.merging import merge_gaussians  # loads kernels that pruning does not need
 
     progress("kernels", 1.0)
-    log = task.step_log(evaluate=evaluate)
+    log = StepLog(task.evaluate if evaluate else None)
     log.record("input", task.splats)
     merged, index = merge_gaussians(task.splats, count, task.context)
     log.record("merge", merged)

@@ -6,7 +6,6 @@ import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,43 +59,17 @@ class StepLog:
 
     def record(self, name: str, scene: Splats) -> None:
         """Add the step that has just ended with ``scene``."""
-        seconds = self.seconds
-        metrics, size = (None, None) if self.evaluate is None else self.evaluate(scene)
-        self.steps.append(
-            CompactionStep(
-                name=name,
-                count=len(scene),
-                seconds=seconds,
-                psnr=None if metrics is None else metrics.psnr,
-                ssim=None if metrics is None else metrics.ssim,
-                ms_ssim=None if metrics is None else metrics.ms_ssim,
-                bytes=size,
-            )
-        )
+        step = CompactionStep(name=name, count=len(scene), seconds=self.seconds)
+        if self.evaluate is not None:
+            found, size = self.evaluate(scene)
+            step = replace(step, psnr=found.psnr, ssim=found.ssim, ms_ssim=found.ms_ssim, bytes=size)
+        self.steps.append(step)
         self._started = time.perf_counter()
 
     def restore(self, steps: Sequence[CompactionStep], seconds: float) -> None:
         """Continue after ``steps``, with ``seconds`` of the next one spent before the interruption."""
         self.steps = list(steps)
         self._started -= seconds
-
-
-# Evaluation of compacted scenes: image quality in views that no training used, and the size of the container.
-
-
-def evaluate_scene(
-    scene: Splats, reference: Splats, supervision: SupervisionViews, context: Context = DEFAULT_CONTEXT
-) -> tuple[ImageMetrics, int]:
-    """Return the mean image metrics of a scene, and its bytes as a zip with the preset ``fast``.
-
-    Evaluation views are used if they have photographs, else cameras drawn over all of ``reference``.
-    """
-    context, views = replace(context.stage("evaluate"), device="cpu"), supervision.eval_views
-    if all(view.photo is None for view in views.test):
-        views = evaluation_views(reference, context)
-    evaluation = compare_images(reference, scene, views, context)
-    encoded = encode(scene, Settings(preset=Preset.FAST).encode, context)
-    return evaluation.mean.candidate, len(zip_bytes(encoded.files))
 
 
 @dataclass(slots=True, eq=False)
@@ -121,14 +94,21 @@ class Popspa:
         if self.settings.trains:
             self.load_targets()
         key = "" if checkpoint is None else self._key(count, evaluate)
-        compacted = _Run(self, count, Checkpoint(checkpoint, key), self.step_log(evaluate=evaluate)).run()
+        log = StepLog(self.evaluate if evaluate else None)
+        compacted = _Run(self, count, Checkpoint(checkpoint, key), log).run()
         return replace(compacted, checkpoint=checkpoint) if self.settings.trains else compacted
 
-    def step_log(self, *, evaluate: bool) -> StepLog:
-        """Return an empty log, which evaluates each step if requested; see :func:`evaluate_scene`."""
-        views, context = self.supervision, self.context
-        measure = partial(evaluate_scene, reference=self.splats, supervision=views, context=context)
-        return StepLog(measure if evaluate else None)
+    def evaluate(self, scene: Splats) -> tuple[ImageMetrics, int]:
+        """Return the mean image metrics of a scene with fewer Gaussians, and its bytes as a zip by the preset ``fast``.
+
+        Evaluation views are used if they have photographs, else cameras drawn over the whole scene.
+        """
+        context, views = replace(self.context.stage("evaluate"), device="cpu"), self.supervision.eval_views
+        if all(view.photo is None for view in views.test):
+            views = evaluation_views(self.splats, context)
+        evaluation = compare_images(self.splats, scene, views, context)
+        encoded = encode(scene, Settings(preset=Preset.FAST).encode, context)
+        return evaluation.mean.candidate, len(zip_bytes(encoded.files))
 
     def load_targets(self) -> TrainingTargets:
         """Return the target images, which are loaded or rendered once."""
@@ -168,8 +148,7 @@ class _Run:
     checkpoint_note: str = field(init=False, default="")
 
     def __post_init__(self) -> None:
-        task = self.task
-        self.training = SceneTraining(task.splats, task.settings, task.supervision, task.context.device)
+        self.training = SceneTraining(self.task)
 
     def run(self) -> Compacted:
         """Do all steps, or those that remain after the checkpoint."""
@@ -179,25 +158,24 @@ class _Run:
         if not phases:
             self._first_pruning(self.count)
             return self._result("nothing")
-        targets = task.load_targets()
-        first, done, state = self._start(targets)
+        first, done, state = self._start()
         for number in range(first, len(phases)):
-            self._train(phases, number, done, state, targets)
+            self._train(phases, number, done, state)
             done, state = 0, {}
         self._save(len(phases), 0, {})
-        return self._result(targets.target_source)
+        return self._result(task.load_targets().target_source)
 
-    def _start(self, targets: TrainingTargets) -> tuple[int, int, State]:
+    def _start(self) -> tuple[int, int, State]:
         """Do the first pruning, or load the checkpoint; return the current phase, its steps done, and the state."""
         task = self.task
         state = self.checkpoint.load()
         if state is not None:
             status = Status.from_state(state)
-            self.training.restore(state, state["index"], targets)
+            self.training.restore(state, state["index"])
             self.log.restore(status.steps, status.seconds)
             return status.phase, status.done, state
         self._first_pruning(first_pruning_count(task.settings, len(task.splats), self.count))
-        self.training.begin(targets)
+        self.training.begin()
         self._save(0, 0, {})  # a file that cannot be written must be reported before the training
         return 0, 0, {}
 
@@ -207,7 +185,7 @@ class _Run:
         self.training.prune(count, self.task.context)
         self.log.record("prune", self.training.splats())
 
-    def _train(self, phases: Sequence[Phase], number: int, done: int, state: State, targets: TrainingTargets) -> None:
+    def _train(self, phases: Sequence[Phase], number: int, done: int, state: State) -> None:
         """Train phase ``number`` from step ``done`` on, then prune; ``state`` is that of the checkpoint, or empty."""
         phase, training = phases[number], self.training
         sparsifier = self._sparsifier(phase, state)
@@ -220,8 +198,7 @@ class _Run:
         context = replace(self.task.context, progress=progress, deadline=None)  # a given count takes all steps
         training.train(
             phase,
-            targets,
-            (self.task.settings.seed, number),
+            number,
             context,
             regularizers=() if sparsifier is None else (sparsifier,),
             first=done,
@@ -332,14 +309,15 @@ class TrainingPath:
         task, point = self.task, self.points[-1]
         if task.settings.sparsify_steps == 0:
             return point
-        targets, settings = task.load_targets(), task.settings
-        steps = POINT_STEPS[targets.target_source] * settings.sparsify_steps // settings.prune_rounds
+        per_point = POINT_STEPS[task.load_targets().target_source]
+        steps = per_point * task.settings.sparsify_steps // task.settings.prune_rounds
         if steps == 0:
             return point
         training = self._at(point)
         if not point.trained:
-            training.begin(targets)
-        self._train(training, Phase("sparsify", steps, len(point)), point.number, deadline)
+            training.begin()
+        context = replace(task.context, deadline=deadline)
+        training.train(Phase("sparsify", steps, len(point)), point.number, context)
         self.points.pop()
         return self._add(training, point.number)
 
@@ -352,9 +330,9 @@ class TrainingPath:
         if refine and task.settings.refine_steps:
             training = self._at(point)
             if not point.trained:
-                training.begin(task.load_targets())
+                training.begin()
             phase = Phase("refine", task.settings.refine_steps, len(point))
-            self._train(training, phase, REFINEMENT + point.number, deadline)
+            training.train(phase, REFINEMENT + point.number, replace(task.context, deadline=deadline))
             splats = training.splats()
         report = CompactionReport(
             source_count=len(task.splats),
@@ -366,16 +344,11 @@ class TrainingPath:
         )
         return Compacted(splats, point.index, report)
 
-    def _train(self, training: SceneTraining, phase: Phase, number: int, deadline: Deadline | None) -> None:
-        seed, context = (self.task.settings.seed, number), replace(self.task.context, deadline=deadline)
-        training.train(phase, self.task.load_targets(), seed, context)
-
     def _at(self, point: PathPoint) -> SceneTraining:
-        task = self.task
-        training = SceneTraining(task.splats, task.settings, task.supervision, task.context.device)
+        training = SceneTraining(self.task)
         training.index = point.index
         if point.state is not None:
-            training.restore(point.state, point.index, task.load_targets())
+            training.restore(point.state, point.index)
         return training
 
     def _add(self, training: SceneTraining, number: int) -> PathPoint:

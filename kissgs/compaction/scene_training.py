@@ -15,18 +15,17 @@ from kissgs.cameras.views import View
 from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.compaction.result import CompactionStep
 from kissgs.core.array_types import Float, Float32, Float64, Int
-from kissgs.core.progress import DEFAULT_CONTEXT, Context, Device, Pace, Progress
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Pace, Progress
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import removal_scores
 from kissgs.rendering.sensitivity import Coverage
 from kissgs.settings import CompactSettings
-from kissgs.training.supervision import SupervisionViews
 
 if TYPE_CHECKING:
+    from kissgs.compaction.popspa import Popspa
     from kissgs.training.loop import LrSchedule, Regularizer
     from kissgs.training.model import GaussianModel
-    from kissgs.training.supervision import TrainingTargets
 
 
 # Pruning by the scores of GaussianPOP: the squared image error that the removal of one Gaussian would cause.
@@ -224,20 +223,14 @@ show what matters, False for virtual views."""
 
 @dataclass(slots=True, eq=False)
 class SceneTraining:
-    """Prunes and trains one scene, step by step.
+    """Prunes and trains the scene of a task, step by step."""
 
-    ``source`` is the scene before any pruning, and ``index`` that in it of each Gaussian that is left, ascending.
-    """
-
-    source: Splats
-    settings: CompactSettings
-    supervision: SupervisionViews
-    device: Device = "cpu"
-    index: Int[np.ndarray, " M"] = field(init=False)
+    task: Popspa
+    index: Int[np.ndarray, " M"] = field(init=False)  # in that scene, of each Gaussian that is left, ascending
     _model: GaussianModel | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        self.index = np.arange(len(self.source))
+        self.index = np.arange(len(self.task.splats))
 
     def __len__(self) -> int:
         return len(self.index)
@@ -257,35 +250,37 @@ class SceneTraining:
         """Return the current scene."""
         if self._model is not None:
             return self.trained.splats()
-        return self.source if len(self) == len(self.source) else self.source.select(self.index)
+        source = self.task.splats
+        return source if len(self) == len(source) else source.select(self.index)
 
     def prune(self, count: int, context: Context) -> None:
         """Keep the ``count`` Gaussians that images would miss most; reports the stage "score"."""
+        views = self.task.supervision
         kept = prune_by_score(
             self.splats(),
-            self.supervision.score,
-            self.supervision.background,
+            views.score,
+            views.background,
             count,
             context,
-            min_keep_per_scoring=self.settings.min_keep_per_scoring,
-            min_score=MIN_SCORE[self.supervision.captured],
+            min_keep_per_scoring=self.task.settings.min_keep_per_scoring,
+            min_score=MIN_SCORE[views.captured],
         )
         self.index = self.index[kept]
         if self._model is not None:
             self._model.keep(kept)
 
-    def begin(self, targets: TrainingTargets) -> None:
+    def begin(self) -> None:
         """Make the current scene trainable."""
         from kissgs.training.model import GaussianModel
 
-        self._model = GaussianModel(self.splats(), self.device, self._position_extents(targets))
+        self._model = GaussianModel(self.splats(), self.task.context.device, self._position_extents())
 
-    def restore(self, state: State, index: Int[np.ndarray, " M"], targets: TrainingTargets) -> None:
+    def restore(self, state: State, index: Int[np.ndarray, " M"]) -> None:
         """Continue from the :meth:`kissgs.training.model.GaussianModel.state` of the Gaussians at ``index``."""
         from kissgs.training.model import GaussianModel
 
-        self.index = index
-        self._model = GaussianModel.restored(state, self.source, self.device, self._position_extents(targets))
+        self.index, device = index, self.task.context.device
+        self._model = GaussianModel.restored(state, self.task.splats, device, self._position_extents())
 
     def state(self) -> State:
         """Return a copy of the state of the training, see :meth:`restore`."""
@@ -294,49 +289,52 @@ class SceneTraining:
     def train(
         self,
         phase: Phase,
-        targets: TrainingTargets,
-        seed: Sequence[int],
+        number: int,
         context: Context,
         *,
         regularizers: tuple[Regularizer, ...] = (),
         first: int = 0,
         after: Callable[[int], None] = lambda done: None,
     ) -> None:
-        """Train for one phase, see :func:`kissgs.training.loop.train`, with fewer steps where the deadline is near."""
+        """Train for a phase, in fewer steps where the deadline is near; each ``number`` has another order of images.
+
+        The other arguments are those of :func:`kissgs.training.loop.train`.
+        """
         from kissgs.training.loop import TrainingPlan, train
 
+        settings, targets = self.task.settings, self.task.load_targets()
         plan = TrainingPlan(
             stage=phase.name,
             pace=Pace(phase.steps, context.deadline),
-            rates=lr_schedule(self.settings, phase, targets.target_source),
-            ssim_weight=self.settings.ssim_weight,
-            mse_weight=self.settings.mse_weight,
-            seed=seed,
-            regularizers=(*self._shape_regularizers(targets), *regularizers),
+            rates=lr_schedule(settings, phase, targets.target_source),
+            ssim_weight=settings.ssim_weight,
+            mse_weight=settings.mse_weight,
+            seed=(settings.seed, number),
+            regularizers=(*self._shape_regularizers(), *regularizers),
         )
         train(self.trained, targets, plan, context, first=first, after=after)
 
-    def _shape_regularizers(self, targets: TrainingTargets) -> tuple[Regularizer, ...]:
-        settings = self.settings
+    def _shape_regularizers(self) -> tuple[Regularizer, ...]:
+        settings = self.task.settings
         if not (settings.erank_weight or settings.min_scale_weight):
             return ()
         from kissgs.compaction.regularizers import ShapeRegularizer
 
-        return (ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent(targets)),)
+        return (ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent()),)
 
-    def _camera_extent(self, targets: TrainingTargets) -> float:
+    def _camera_extent(self) -> float:
         """Return the extent of the cameras, world units; the scene's radius if they are nearly at one position."""
-        radius = scene_bounds(self.source).radius
-        return targets.extent if targets.extent > MIN_RELATIVE_EXTENT * radius else radius
+        radius, extent = scene_bounds(self.task.splats).radius, self.task.load_targets().extent
+        return extent if extent > MIN_RELATIVE_EXTENT * radius else radius
 
-    def _position_extents(self, targets: TrainingTargets) -> Float32[np.ndarray, " M"]:
+    def _position_extents(self) -> Float32[np.ndarray, " M"]:
         """Return the unit of the position learning rate of each Gaussian, from its position and size in the source.
 
         The rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size,
         and positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes.
         """
-        settings = self.settings
-        extents = targets.local_extents(self.source.means[self.index], self._camera_extent(targets))
-        sizes = np.exp(np.median(self.source.scales[self.index].astype(np.float64), axis=1))
+        settings, source = self.task.settings, self.task.splats
+        extents = self.task.load_targets().local_extents(source.means[self.index], self._camera_extent())
+        sizes = np.exp(np.median(source.scales[self.index].astype(np.float64), axis=1))
         most = BASE_LR["means"] * max(settings.means_lr_scale, settings.final_means_lr_scale)
         return np.minimum(MOST_STEP_PER_SIZE / most * sizes, extents).astype(np.float32)

@@ -13,6 +13,7 @@ from helpers.tuning_scenes import Interrupted, chosen, stopping_after
 import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
 from kissgs.cameras.views import Views, black
+from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.scene_training import Phase, SceneTraining
 from kissgs.core.progress import Context
 from kissgs.core.splats import ATTRIBUTES
@@ -88,9 +89,9 @@ def test_training_has_the_loss_of_the_settings(preset, weights, stage, monkeypat
         files = written(Settings.from_preset("fast").encode)
         work(plan, plan, scene, files)
     else:
-        training = SceneTraining(scene, settings, work.supervision)
-        training.begin(work.targets)
-        training.train(Phase("refine", 1, 40), work.targets, (0,), Context(1))
+        training = SceneTraining(Popspa(scene, settings, work.supervision, targets=work.targets))
+        training.begin()
+        training.train(Phase("refine", 1, 40), 0, Context(1))
     assert [(plan.ssim_weight, plan.mse_weight) for plan in plans] == [weights]
 
 
