@@ -26,7 +26,7 @@ class StopRule:
         settled: whether the search between a point that meets the goal and the next one that does not can end.
         most_step: largest distance of an evaluation from known points, except for one at a bound.
         caution: share of the distance to the nearest point that meets the goal by which the last point is nearer, and
-            the largest such step.
+            the largest such step; share by which the last step is longer where no point meets the goal.
     """
 
     attempts: int = ATTEMPTS
@@ -81,9 +81,9 @@ def find_root(
             x = bounds[(inside is None) == (slope > 0)]
         else:
             x = _next(known, slope, tolerance_at(x) / 2, stop.most_step)
-            if len(known) == attempts - 1 and inside is not None:
+            if len(known) == attempts - 1:
                 share, most = stop.caution
-                x += min(max(share * (inside - x), -most), most)
+                x += share * (x - list(known)[-1]) if inside is None else min(max(share * (inside - x), -most), most)
             x = min(max(_rounded(x, grain), bounds[0]), bounds[1])
     bound = bounds[slope > 0]
     if stop.tries_bound and len(known) > 1 and bound not in known and all(found < 0 for found in known.values()):

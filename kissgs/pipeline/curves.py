@@ -167,7 +167,8 @@ HALF_ERROR_DB = 10 * math.log10(2)
 
 MAX_STEP, CAUTION = 2.0, (0.15, 0.1)
 """Largest step, as log2 of the number of Gaussians. Share of the distance to a container that met the goal by which the
-last one stays nearer to it, and the largest such distance: missing the goal would lose all of it."""
+last one stays nearer to it, and the largest such distance; share of the last step by which it is longer where none met
+the goal. Missing it would lose all of the training."""
 
 SMALL_SCENE = 10_000
 """Number of Gaussians below which a search begins as for a loss of 0.1 dB, whatever the goal allows."""
@@ -217,9 +218,9 @@ def along_path(
             attempt = encode(first, None)
             begin = math.nan if attempt.rd_lambda is None else math.log2(attempt.rd_lambda)
         else:
-            # Whole points only: training at another number of Gaussians changes the loss by some chance.
-            points = math.trunc((1 - LAMBDA_SHARE) * step * POINTS_PER_HALVING)
-            number = min(max(first + points, 1), last)
+            # Less than a point changes lambda alone: another training changes the loss by some chance.
+            points = (1 - LAMBDA_SHARE) * step * POINTS_PER_HALVING
+            number = min(max(first + round(points) * (abs(points) >= 1), 1), last)
             rest = step - (number - first) / POINTS_PER_HALVING
             x = begin + DOUBLINGS_PER_HALVING * rest
             attempt = encode(number, min(max(x, LOG2_LAMBDA_RANGE[0]), LOG2_LAMBDA_RANGE[1]))

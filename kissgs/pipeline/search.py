@@ -288,10 +288,27 @@ class Search:
             self._search_all_gaussians(tunes=False)
             left = limited.plan(photographs=True, aims=self.aims).containers
             self.plan = replace(self.plan, containers=min(self.plan.containers, left))
+        if limited is None and not self.goal.by_size:
+            first = self._point_near_the_limit(path, first)
         if not self._whole_searched or self.plan.containers > 1:
             self._along_path(path, first)
         if self.best is None and not self.aims:
             self._search_all_gaussians()
+
+    def _point_near_the_limit(self, path: TrainingPath, number: int) -> int:
+        """Train along the path, from point ``number`` on while the goal is met before encoding; return the nearest one.
+
+        Photographs may show more than the scene does: training then makes it better than it was, and a container of
+        point ``number`` would use up little of what may be lost. Far from the limit, several points are pruned at once.
+        """
+        last, rooms = last_number(len(path.whole)), dict[int, float]()
+        while True:
+            found = self._try_unencoded(self._train_to(path, number).splats)
+            room = rooms[number] = self.goal.log2_room(found)
+            if number == last or not 0 <= room < math.inf:
+                return min(rooms, key=lambda n: abs(rooms[n]))
+            number += min(max(int(room), 1), PRUNABLE_POINTS, last - number)
+            self._prune_to(path, number - 1)
 
     def _recovers(self, path: TrainingPath) -> bool:
         """Train up to the first point, and return whether fine-tuning can be expected to recover what is still lost.

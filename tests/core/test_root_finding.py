@@ -80,6 +80,17 @@ def test_the_bound_is_not_tried_where_each_evaluation_is_expensive():
     assert margin.arguments == [30.0, 26.0]
 
 
+@pytest.mark.parametrize(
+    ("start", "slope", "arguments"),
+    [(0.0, -2.0, [0.0, 3.95, 1.975 - 0.1]), (8.0, -0.5, [8.0, 5.95, 5.95 - 1.5 * 2.05])],
+)
+def test_the_last_attempt_is_cautious(start, slope, arguments):
+    """It stays nearer to the point that met the goal, and goes further where none did."""
+    margin = Recorded(lambda x: slope * x + (4.0 if slope < -1 else 2.0))
+    find_root(margin, start, -1.0, 0.1, (-40, 40), stop=StopRule(3, tries_bound=False, caution=(0.5, 0.1)))
+    assert margin.arguments == pytest.approx(arguments)
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_goal_met_everywhere_ends_at_the_far_bound(sign):
     margin = Recorded(lambda x: 3.0 + 0.01 * sign * x)

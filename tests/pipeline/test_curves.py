@@ -197,10 +197,11 @@ def test_a_container_ends_the_search_if_an_eighth_of_a_halving_or_less_is_left(l
     assert len(made) == trials
 
 
-def test_a_step_changes_number_and_lambda():
-    """A step of 1.03: of 1.9 points the whole one, and 1.77 doublings of lambda."""
-    _, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=-0.15))
-    assert positions[1] == (7, pytest.approx(START + 1.767, abs=0.001))
+@pytest.mark.parametrize(("at_start", "number", "doublings"), [(-0.15, 8, 0.962), (0.05, 6, 1.009)])
+def test_a_step_changes_number_and_lambda(at_start, number, doublings):
+    """A step of 1.03 is 1.9 points, rounded to two, and 0.96 doublings; one of 0.4 is less than a point."""
+    _, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=at_start))
+    assert positions[1] == (number, pytest.approx(START + doublings, abs=0.01))
 
 
 def test_the_limit_with_the_least_room_decides():
