@@ -18,7 +18,7 @@ from kissgs import Splats, load
 from kissgs.cli.options import chosen
 from kissgs.compaction.merging import merge_gaussians
 from kissgs.compaction.popspa import Popspa
-from kissgs.compaction.scene_training import highest_indices
+from kissgs.compaction.scoring import highest_indices
 from kissgs.training.supervision import SCORING_STRIDE, supervision_views, training_targets
 
 

@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from kissgs._version import __version__
 from kissgs.cameras.captures.photos import open_file
+from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
-from kissgs.compaction.scene_training import (
-    Phase,
-    SceneTraining,
-    State,
-    Status,
-    first_pruning_count,
-    stage_progress,
-    training_phases,
-)
-from kissgs.core.array_types import Int
+from kissgs.compaction.scoring import prune_by_score
+from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import OutputError
-from kissgs.core.progress import DEFAULT_CONTEXT, Context, Deadline, load_kernels
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Deadline, Pace, Progress, load_kernels
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
@@ -34,11 +28,111 @@ from kissgs.settings import CompactSettings, Preset, Settings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import encode
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.supervision import SupervisionViews
+from kissgs.training.supervision import SupervisionViews, TrainingTargets, training_targets
 
 if TYPE_CHECKING:
     from kissgs.compaction.regularizers import AdmmSparsifier
-    from kissgs.training.supervision import TrainingTargets
+    from kissgs.training.loop import LrSchedule, Regularizer
+    from kissgs.training.model import GaussianModel
+
+
+# Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.1).
+
+BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
+"""Learning rates of 3DGS by parameter; that of positions is in units of the extent of the cameras around each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """Training steps, and the number of Gaussians that the pruning after them leaves."""
+
+    name: Literal["sparsify", "refine"]
+    steps: int
+    count: int
+
+
+def first_pruning_count(settings: CompactSettings, source_count: int, count: int) -> int:
+    """Return the number of Gaussians that the first pruning leaves, before any training."""
+    fraction = settings.initial_prune_fraction if settings.sparsify_steps else 1.0
+    return round(source_count * (count / source_count) ** fraction)
+
+
+def training_phases(settings: CompactSettings, source_count: int, count: int) -> list[Phase]:
+    """Return all phases of training: one before each further pruning, then refinement; none if nothing is trained.
+
+    The prunings are spread evenly over ``sparsify_steps``, and each keeps the same share of the Gaussians.
+    """
+    phases = []
+    if settings.sparsify_steps:
+        rounds = min(settings.prune_rounds, settings.sparsify_steps)
+        first, fractions = first_pruning_count(settings, source_count, count), np.arange(1, rounds + 1) / rounds
+        counts = np.rint(first * (count / first) ** fractions).astype(int)
+        ends = np.rint(settings.sparsify_steps * np.concatenate([[0], fractions])).astype(int)
+        phases = [Phase("sparsify", int(steps), int(left)) for steps, left in zip(np.diff(ends), counts, strict=True)]
+    if settings.refine_steps:
+        phases.append(Phase("refine", settings.refine_steps, count))
+    return phases
+
+
+def stage_progress(progress: Progress, phases: Sequence[Phase], number: int) -> Progress:
+    """Return a receiver that reports phase ``number`` and the pruning after it as a part of one stage.
+
+    All phases of the same name, and the prunings after them, are one stage of that name.
+    """
+    name = phases[number].name
+    before = sum(phase.steps for phase in phases[:number] if phase.name == name)
+    total = sum(phase.steps for phase in phases if phase.name == name)
+
+    def receive(stage: str, fraction: float, note: str = "") -> None:
+        done = phases[number].steps * (fraction if stage == name else 1.0)
+        progress(name, (before + done) / total, note)
+
+    return receive
+
+
+def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> LrSchedule:
+    """Return learning rates: constant while Gaussians are pruned, falling exponentially during refinement.
+
+    3DGS does the latter for positions only. ``target_source`` is that of the training targets: "photos" or
+    "renderings".
+    """
+    from kissgs.training.loop import exponential_lr
+
+    base = dict(BASE_LR)
+    if target_source == "renderings":
+        base = {name: rate * settings.synthetic_lr_scale for name, rate in base.items()}
+    begin = {name: settings.means_lr_scale if name == "means" else settings.lr_scale for name in base}
+    end = {name: settings.final_means_lr_scale if name == "means" else settings.final_lr_scale for name in base}
+    return exponential_lr(base, begin, end if phase.name == "refine" else begin)
+
+
+# Checkpoint of a compaction: the status beside the state of the training.
+
+State = Mapping[str, np.ndarray]
+"""Arrays of a checkpoint by name."""
+
+STATUS_ENTRY = "status"
+"""Name of the array that holds the status as JSON; part of the file format."""
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Progress of a compaction."""
+
+    phase: int  # the number of phases once all are done
+    done: int  # steps of this phase
+    seconds: float  # since the last recorded step
+    steps: Sequence[CompactionStep]
+
+    def as_state(self) -> State:
+        """Return the status as an array for the checkpoint, see :meth:`from_state`."""
+        return {STATUS_ENTRY: np.frombuffer(json.dumps(asdict(self)).encode(), np.uint8)}
+
+    @classmethod
+    def from_state(cls, state: State) -> Status:
+        """Return the status in a checkpoint."""
+        values = json.loads(state[STATUS_ENTRY].tobytes())
+        return cls(**{**values, "steps": [CompactionStep(**step) for step in values["steps"]]})
 
 
 # ``StepLog``: the steps of a compaction for the report.
@@ -112,8 +206,6 @@ class Popspa:
 
     def load_targets(self) -> TrainingTargets:
         """Return the target images, which are loaded or rendered once."""
-        from kissgs.training.supervision import training_targets
-
         if self.targets is None:
             self.targets = training_targets(self.splats, self.supervision, self.context)
         return self.targets
@@ -134,6 +226,139 @@ class Popspa:
             key.update(getattr(self.splats, name).tobytes())
         key.update(b"antialiased" * self.splats.antialiased)
         return key.hexdigest()
+
+
+# ``SceneTraining``: a scene that is pruned and trained in turn, and its state.
+
+MIN_RELATIVE_EXTENT = 1e-4
+"""Extent of the cameras, in radii of the scene, up to which they count as being at one position: a rotating camera,
+whose extent is 0 except for rounding."""
+
+MOST_STEP_PER_SIZE = 0.025
+"""Largest learning rate of a position, in units of the Gaussian's size: the middle one of its three scales."""
+
+MIN_SCORE = {True: 0.05, False: 0.3}
+"""Lowest score, in units of the score that an unobstructed camera nearby would find: True with a capture, whose cameras
+show what matters, False for virtual views."""
+
+
+@dataclass(slots=True, eq=False)
+class SceneTraining:
+    """Prunes and trains the scene of a task, step by step."""
+
+    task: Popspa
+    index: Int[np.ndarray, " M"] = field(init=False)  # in that scene, of each Gaussian that is left, ascending
+    _model: GaussianModel | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        self.index = np.arange(len(self.task.splats))
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @property
+    def trained(self) -> GaussianModel:
+        """The trainable scene, after :meth:`begin`."""
+        assert self._model is not None  # noqa: S101  callers begin first
+        return self._model
+
+    @property
+    def begun(self) -> bool:
+        """Whether the scene is trainable."""
+        return self._model is not None
+
+    def splats(self) -> Splats:
+        """Return the current scene."""
+        if self._model is not None:
+            return self.trained.splats()
+        source = self.task.splats
+        return source if len(self) == len(source) else source.select(self.index)
+
+    def prune(self, count: int, context: Context) -> None:
+        """Keep the ``count`` Gaussians that images would miss most; reports the stage "score"."""
+        views = self.task.supervision
+        kept = prune_by_score(
+            self.splats(),
+            views.score,
+            views.background,
+            count,
+            context,
+            min_keep_per_scoring=self.task.settings.min_keep_per_scoring,
+            min_score=MIN_SCORE[views.captured],
+        )
+        self.index = self.index[kept]
+        if self._model is not None:
+            self._model.keep(kept)
+
+    def begin(self) -> None:
+        """Make the current scene trainable."""
+        from kissgs.training.model import GaussianModel
+
+        self._model = GaussianModel(self.splats(), self.task.context.device, self._position_extents())
+
+    def restore(self, state: State, index: Int[np.ndarray, " M"]) -> None:
+        """Continue from the :meth:`kissgs.training.model.GaussianModel.state` of the Gaussians at ``index``."""
+        from kissgs.training.model import GaussianModel
+
+        self.index, device = index, self.task.context.device
+        self._model = GaussianModel.restored(state, self.task.splats, device, self._position_extents())
+
+    def state(self) -> State:
+        """Return a copy of the state of the training, see :meth:`restore`."""
+        return {name: array.copy() for name, array in self.trained.state().items()}
+
+    def train(
+        self,
+        phase: Phase,
+        number: int,
+        context: Context,
+        *,
+        regularizers: tuple[Regularizer, ...] = (),
+        first: int = 0,
+        after: Callable[[int], None] = lambda done: None,
+    ) -> None:
+        """Train for a phase, in fewer steps where the deadline is near; each ``number`` has another order of images.
+
+        The other arguments are those of :func:`kissgs.training.loop.train`.
+        """
+        from kissgs.training.loop import TrainingPlan, train
+
+        settings, targets = self.task.settings, self.task.load_targets()
+        plan = TrainingPlan(
+            stage=phase.name,
+            pace=Pace(phase.steps, context.deadline),
+            rates=lr_schedule(settings, phase, targets.target_source),
+            ssim_weight=settings.ssim_weight,
+            mse_weight=settings.mse_weight,
+            seed=(settings.seed, number),
+            regularizers=(*self._shape_regularizers(), *regularizers),
+        )
+        train(self.trained, targets, plan, context, first=first, after=after)
+
+    def _shape_regularizers(self) -> tuple[Regularizer, ...]:
+        settings = self.task.settings
+        if not (settings.erank_weight or settings.min_scale_weight):
+            return ()
+        from kissgs.compaction.regularizers import ShapeRegularizer
+
+        return (ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent()),)
+
+    def _camera_extent(self) -> float:
+        """Return the extent of the cameras, world units; the scene's radius if they are nearly at one position."""
+        radius, extent = scene_bounds(self.task.splats).radius, self.task.load_targets().extent
+        return extent if extent > MIN_RELATIVE_EXTENT * radius else radius
+
+    def _position_extents(self) -> Float32[np.ndarray, " M"]:
+        """Return the unit of the position learning rate of each Gaussian, from its position and size in the source.
+
+        The rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size,
+        and positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes.
+        """
+        settings, source = self.task.settings, self.task.splats
+        extents = self.task.load_targets().local_extents(source.means[self.index], self._camera_extent())
+        sizes = np.exp(np.median(source.scales[self.index].astype(np.float64), axis=1))
+        most = BASE_LR["means"] * max(settings.means_lr_scale, settings.final_means_lr_scale)
+        return np.minimum(MOST_STEP_PER_SIZE / most * sizes, extents).astype(np.float32)
 
 
 @dataclass(slots=True, eq=False)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import kissgs
 from kissgs.cameras.views import black
-from kissgs.compaction.scene_training import highest_indices, prune_by_score
+from kissgs.compaction.scoring import highest_indices, prune_by_score
 from kissgs.core.progress import Context
 from kissgs.core.splats import ATTRIBUTES, SH_C0
 from kissgs.rendering.rasterizer import removal_scores

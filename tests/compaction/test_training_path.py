@@ -10,8 +10,8 @@ from helpers.training_scenes import around, cloud, same
 import kissgs
 from kissgs import CompactSettings
 from kissgs.cameras.views import black
-from kissgs.compaction.popspa import Popspa, TrainingPath
-from kissgs.compaction.scene_training import MOST_STEP_PER_SIZE, prune_by_score
+from kissgs.compaction.popspa import MOST_STEP_PER_SIZE, Popspa, TrainingPath
+from kissgs.compaction.scoring import prune_by_score
 from kissgs.core.progress import Context, Deadline, silent
 from kissgs.training.supervision import SupervisionViews
 

@@ -13,8 +13,7 @@ from helpers.tuning_scenes import Interrupted, chosen, stopping_after
 import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
 from kissgs.cameras.views import Views, black
-from kissgs.compaction.popspa import Popspa
-from kissgs.compaction.scene_training import Phase, SceneTraining
+from kissgs.compaction.popspa import Phase, Popspa, SceneTraining
 from kissgs.core.progress import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.evaluation.evaluate import evaluate
