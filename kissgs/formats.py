@@ -47,10 +47,10 @@ LOD_NAME, LEVELS_NAME = "lod-meta.json", "levels.json"
 
 FORMATS = {
     "ply": Format(module="kissgs.io.ply", endings=(".ply",), written=(".ply", ".compressed.ply")),
-    "sogxt": Format(module="kissgs.sogxt.scenes", written=(".zip",), is_container=True),
-    "sog": Format(module="kissgs.sog.scenes", endings=(".sog",), written=(".sog",), is_container=True),
-    "streamed-sog": Format(module="kissgs.sog.scenes", manifest=LOD_NAME, is_container=True),
-    "streamed-sogxt": Format(module="kissgs.sogxt.scenes", manifest=LEVELS_NAME, is_container=True),
+    "sogxt": Format(module="kissgs.sogxt.decode", written=(".zip",), is_container=True),
+    "sog": Format(module="kissgs.sog.decode", endings=(".sog",), written=(".sog",), is_container=True),
+    "streamed-sog": Format(module="kissgs.sog.decode", manifest=LOD_NAME, is_container=True),
+    "streamed-sogxt": Format(module="kissgs.sogxt.decode", manifest=LEVELS_NAME, is_container=True),
     "spz": Format(module="kissgs.io.spz", endings=(".spz",), written=(".spz",)),
     "splat": Format(module="kissgs.io.splat", endings=(".splat",), written=(".splat",), by_ending=True),
     "ksplat": Format(module="kissgs.io.ksplat", endings=(".ksplat",), by_ending=True),

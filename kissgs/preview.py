@@ -32,9 +32,9 @@ from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.io.streamed import StreamedFormat
 from kissgs.pipeline.pipeline import compress
 from kissgs.pipeline.scene_files import open_scene, recognise, scene_root
-from kissgs.sog import scenes as sog_scenes
+from kissgs.sog import decode as sog
 from kissgs.sog.metadata import read_layout
-from kissgs.sogxt import scenes as sogxt_scenes
+from kissgs.sogxt import decode as sogxt
 from kissgs.sogxt.container import zip_bytes
 
 PAGE_GAUSSIANS = 1_000_000
@@ -93,7 +93,7 @@ def _file_inside(root: Path, name: str) -> Path | None:
 
 
 def _format(source: Path | bytes) -> StreamedFormat:
-    return sog_scenes.STREAMED if recognise(source) == "streamed-sog" else sogxt_scenes.STREAMED
+    return sog.STREAMED if recognise(source) == "streamed-sog" else sogxt.STREAMED
 
 
 def _container_files(files: Source, name: str) -> list[str]:

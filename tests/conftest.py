@@ -51,13 +51,29 @@ for name in CHECKED:  # a module that has moved must stay checked
 install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "helpers.shape_checks.typechecker")
 
 
+WITH_FEWER_CAMERAS = ("io", "sog", "sogxt", "extremes", "finetuning")
+SMALLER_UNLESS_EXHAUSTIVE = ("compaction", "evaluation", "pipeline", "planning", "streaming")
+AS_USERS_HAVE_IT = (
+    "test_promises",
+    "test_nothing_is_lost",
+    "test_cameras",
+    "test_overlooked",
+    "test_html",
+    "test_capture_fit",
+)
+
+
 @pytest.fixture(autouse=True)
-def fewer_virtual_cameras(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let tests of formats choose virtual cameras from fewer, which take most of the time of encoding a small scene."""
-    if request.path.parent.name in ("io", "sog", "sogxt", "extremes", "finetuning"):
-        from helpers.fewer_cameras import try_fewer  # after the hook
+def fewer_and_smaller_images(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Choose virtual cameras from fewer, and evaluate smaller images: they take most of the time for a small scene."""
+    folder = request.path.parent.name
+    thorough = request.node.get_closest_marker("exhaustive") or request.path.stem in AS_USERS_HAVE_IT
+    if folder in WITH_FEWER_CAMERAS or (folder in SMALLER_UNLESS_EXHAUSTIVE and not thorough):
+        from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
 
         try_fewer(monkeypatch)
+        if folder in SMALLER_UNLESS_EXHAUSTIVE:
+            evaluate_smaller(monkeypatch, searches=folder == "pipeline")
 
 
 @pytest.fixture(scope="session")
@@ -67,6 +83,14 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("the real scenes (shared/data beside the repository) are not here")
     return folder
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Return one worker more than there are processors, because a quarter of the time of tests is waiting."""
+    from kissgs.core.resources import processors  # after the hook
+
+    return processors() + 1
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -93,7 +93,7 @@ def test_the_public_names_are_these_and_are_explained():
 
 HEAVY = ("torch", "numba", "scipy", "rich", "typer")
 ENCODER = ("kissgs.planning", "kissgs.rendering", "kissgs.cameras", "kissgs.settings", "kissgs.sogxt.encode")
-READERS = ("kissgs.io.ply", "kissgs.io.spz", "kissgs.io.gltf", "kissgs.sog.decode", "kissgs.sogxt.decode")
+READERS = ("kissgs.io.ply", "kissgs.io.spz", "kissgs.io.gltf", "kissgs.sog.decode")
 IMPORTS = f"""
 import sys, time
 times = [time.process_time()]
@@ -121,7 +121,7 @@ def test_importing_gives_the_public_names_quickly_and_loads_nothing_heavy():
 
 
 def test_reading_loads_neither_kernels_nor_the_encoder_nor_other_readers(tmp_path):
-    """First the metadata of a container is read, which needs no decoder, and then the whole."""
+    """First the metadata of a container is read, and then the whole."""
     kissgs.compress(kissgs.sample_scene(50), tmp_path / "scene.zip", settings=kissgs.Settings(preset="fast"))
     program = f"""
 import sys

@@ -58,6 +58,7 @@ def test_a_quality_offset_replaces_every_goal() -> None:
     assert (other.encode.quality_offset_db, other.encode.psnr, other.preset) == (-3.5, None, "small")
 
 
+@pytest.mark.quick(0)
 def test_an_external_codec_is_measured_without_this_process(tmp_path: Path) -> None:
     """The tool holds 128 MB; this process holds 1 GB, which Linux would count as that of the process it starts."""
     scene, tool, held = tmp_path / "scene.ply", tmp_path / "tool.py", b"x" * 2**30

@@ -22,6 +22,7 @@ from kissgs.evaluation.results import Evaluation
 from kissgs.finetuning.planes import FIELDS, TABLES
 from kissgs.finetuning.quantized_scene import QuantizedScene, RateLoss, TotalVariationLoss, table_name
 from kissgs.finetuning.result import FinetuneReport
+from kissgs.io.scene_format import ReadOptions
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
 from kissgs.planning.rate_distortion import implied_lambda
@@ -62,7 +63,7 @@ Write = Callable[[EncodingPlan, int, Context], Encoded]
 
 
 Decode = Callable[..., Splats]
-"""Decoder of a container: takes its files, ``max_gaussians`` and ``threads``."""
+"""Decoder of a container: takes its files, ``ReadOptions`` and ``threads``."""
 
 
 @dataclass(slots=True, eq=False)
@@ -152,7 +153,8 @@ class Tuner:
         return float(np.mean([_squared_error(view.comparison.candidate_vs_reference.psnr) for view in views]))
 
     def _compare(self, reference: Splats, encoded: Encoded, context: Context) -> Evaluation:
-        decoded = self.decode(encoded.files, max_gaussians=max(len(reference), MAX_GAUSSIANS), threads=context.threads)
+        reading = ReadOptions(max_gaussians=max(len(reference), MAX_GAUSSIANS))
+        decoded = self.decode(encoded.files, reading, threads=context.threads)
         return compare_images(reference, decoded, self.supervision.eval_views, context)
 
     def _train(

@@ -252,6 +252,12 @@ def refuse_more_than(limit: int | None, count: int, name: str) -> None:
         )
 
 
+def refuse_degree(degree: int, name: str) -> None:
+    """Raise UnsupportedError if an SH degree is above 3."""
+    if degree > 3:
+        raise UnsupportedError(f"{name} has SH degree {degree}; export it with degree 3 or lower")
+
+
 def marked(splats: Splats, marks: Sequence[bool]) -> Splats:
     """Return a scene of several parts as antialiased if all of them are; a note says if only some are."""
     if any(marks) and not all(marks):

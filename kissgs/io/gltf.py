@@ -1,96 +1,339 @@
 """glTF with ``KHR_gaussian_splatting``: GLB or JSON; also with the attributes in ``.spz`` inside it.
 
-All primitives of the scene's nodes are read, at each of their instances, moved by the transforms of both, and turned
-from glTF's axes (x left, y up, z forward) to those of a ``.ply``.
+All primitives of the scene's nodes are read, moved by the nodes' transforms and turned from glTF's axes (x left, y up,
+z forward) to those of a ``.ply``; ``.glb`` is written with one primitive.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+import base64
+import io
+import json
+import struct
+import urllib.parse
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kissgs.core.array_types import Float64
+from kissgs.core.array_types import Float32, Float64, Shaped, UInt8
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.positions import WORLD, from_world, origin_for
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
-from kissgs.io.conventions import log_scales, mirror, move, opacity_logits, steps
-from kissgs.io.files import listed, marked, open_scene_file, refuse_more_than
-from kissgs.io.gltf_document import (
-    EXTENSION,
-    GLB_MAGIC,
-    SPZ_EXTENSIONS,
-    TO_PLY,
-    Document,
-    node_matrix,
-    write_glb,
-    write_spz_glb,
+from kissgs.io.containers import is_file_name
+from kissgs.io.conventions import (
+    Signs,
+    colors_of,
+    log_scales,
+    mirror,
+    move,
+    note_mark,
+    opacities_of,
+    opacity_logits,
+    sh_signs,
+    steps,
+    to_bytes,
+)
+from kissgs.io.files import (
+    BinaryWriter,
+    SceneFile,
+    is_number,
+    listed,
+    marked,
+    open_scene_file,
+    parse_json,
+    refuse_degree,
+    refuse_more_than,
+    whole_number,
 )
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
-from kissgs.io.spz import largest_spz, read_spz, read_spz_info
+from kissgs.io.spz import (
+    decode_positions,
+    encode_positions,
+    fractional_bits_for,
+    largest_spz,
+    read_spz,
+    read_spz_info,
+    write_spz,
+)
 
-INSTANCING, VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
+EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
 
-_COMPRESSIONS = ("EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_draco_mesh_compression")
-
-_READ = {EXTENSION, *SPZ_EXTENSIONS, INSTANCING, VISIBILITY, "KHR_mesh_quantization"}
+_READ = {EXTENSION, *SPZ_EXTENSIONS, "KHR_mesh_quantization"}
 """Extensions that are read. Quantised meshes have integers where others have floats, which need nothing special."""
 
-_OF_SURFACES = re.compile(r"(KHR_materials|KHR_texture|EXT_texture|MSFT_texture|KHR_lights)_.*")
-"""Extensions that say nothing about Gaussians."""
+_OF_SURFACES = ("KHR_materials", "KHR_texture", "EXT_texture", "MSFT_texture", "KHR_lights")
+"""Beginnings of the names of extensions that say nothing about Gaussians."""
 
-_KNOWN_ATTRIBUTES = re.compile(
-    rf"POSITION|NORMAL|COLOR_0|{EXTENSION}:(ROTATION|SCALE|OPACITY|SH_DEGREE_[0-3]_COEF_[0-6])"
-)
+_NEEDED = {
+    "EXT_mesh_gpu_instancing",
+    "KHR_node_visibility",
+    "EXT_meshopt_compression",
+    "KHR_meshopt_compression",
+    "KHR_draco_mesh_compression",
+}
+"""Extensions that are not read, and without which the Gaussians are others, even in files that do not require them."""
+
+_USUAL = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "projection": "perspective",
+    "sortingMethod": "cameraDistance",
+}
+"""The only way to draw that is read, by key of the extension."""
+
+TO_PLY: Signs = (-1, -1, 1)
+"""Signs from glTF's axes to those of a ``.ply``."""
+
+MAX_JSON_BYTES, MAX_GLTF_BYTES = 1 << 22, 1 << 30
+"""Largest size of the JSON in a GLB, some kilobytes for a scene; and of a ``.gltf``, whose buffers may be in it."""
+
+MAX_SHOWN, MAX_ATTRIBUTES = 1000, 100
+"""Largest number of nodes, and of primitives, each counted at every node that shows it; and of attributes of one, of
+which a scene of SH degree 3 has 21."""
+
+_MAGIC = b"glTF"
+_BANDS = [[f"{EXTENSION}:SH_DEGREE_{band}_COEF_{i}" for i in range(2 * band + 1)] for band in range(5)]
+"""Names of the attributes of SH coefficients, by band; those of the last are not read."""
+
+_ATTRIBUTES = {
+    *("POSITION", "NORMAL", "COLOR_0"),
+    *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")),
+    *(name for band in _BANDS for name in band),
+}
 """Attributes that are read or repeat what others say, as ``COLOR_0`` does."""
 
-_USUAL = {"projection": "perspective", "sortingMethod": "cameraDistance"}
-"""Ways to draw that kissgs has no other of, by key of the extension."""
+_DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
-_MAX_INSTANCES = 1000
-"""Largest number of nodes, and of primitives, each counted at every node and instance that shows it."""
+_KINDS = {list: "a list", dict: "an object", int: "a whole number"}
 
-_MAX_ATTRIBUTES = 100
-"""Largest number of attributes of a primitive; a scene of SH degree 3 has 21."""
+
+class _Document:
+    """Parsed glTF file, whose data is read when it is needed, one buffer view at a time: the file must still be open.
+
+    Methods raise InvalidSceneError for whatever contradicts the format.
+    """
+
+    def __init__(self, opened: SceneFile, folder: Path | None) -> None:
+        self.name, self._opened, self._folder = opened.name, opened, folder
+        text, self._binary = _split(opened)
+        self.root = parse_json(text, f"{self.name}, read as glTF,", error=InvalidSceneError)
+        if not isinstance(self.root, dict):
+            raise self.invalid("its JSON is no object")
+        self._buffers: dict[int, bytes] = {}
+        version = str(self.value(self.root, "asset", dict).get("version", "2.0"))
+        if not version.startswith("2."):
+            raise UnsupportedError(f"{self.name} is glTF of version {version[:20]!r}; export it as glTF 2.0")
+        for name in map(str, self.value(self.root, "extensionsRequired", list)):
+            if name not in _READ and not name.startswith(_OF_SURFACES):
+                raise self.unread(name)
+
+    def invalid(self, problem: str) -> InvalidSceneError:
+        """Return the error of a file that contradicts the format."""
+        return InvalidSceneError(f"{self.name} is not valid glTF: {problem}; export it again")
+
+    def unread(self, extension: str) -> UnsupportedError:
+        """Return the error of a file with an extension without which the Gaussians would be others."""
+        return UnsupportedError(
+            f"{self.name} needs the extension {extension[:60]!r}, which is not read; export it without"
+        )
+
+    def value(self, parent: dict[str, Any], key: str, kind: type, default: int | None = None) -> Any:  # noqa: ANN401
+        """Return a list, an object, both empty by default, or a whole number of an object."""
+        found = parent.get(key, default if kind is int else kind())
+        found = whole_number(found, 0, 1 << 53) if kind is int else found
+        if not isinstance(found, kind):
+            raise self.invalid(f"{key} is not {_KINDS[kind]}")
+        return found
+
+    def item(self, key: str, index: object) -> dict[str, Any]:
+        """Return an object of one of the document's lists."""
+        items = self.value(self.root, key, list)
+        number = whole_number(index, 0, len(items) - 1)
+        if number is None or not isinstance(items[number], dict):
+            raise self.invalid(f"it names {key}[{str(index)[:20]!r}] of {len(items)}")
+        return items[number]
+
+    def extensions(self, parent: dict[str, Any]) -> dict[str, Any]:
+        """Return the extensions of an object; refuse those without which the Gaussians would be others."""
+        found: dict[str, Any] = self.value(parent, "extensions", dict)
+        if needed := _NEEDED.intersection(found):
+            raise self.unread(min(needed))
+        return found
+
+    def meshes(self) -> Iterator[tuple[dict[str, Any], Float64[np.ndarray, "4 4"]]]:
+        """Yield every mesh that the scene's nodes show, with its transform; without scenes, all meshes as they are."""
+        if not self.value(self.root, "scenes", list):
+            for index in range(len(self.value(self.root, "meshes", list))):
+                yield self.item("meshes", index), np.eye(4)
+            return
+        scene = self.item("scenes", self.root.get("scene", 0))
+        waiting = [(index, np.eye(4)) for index in self.value(scene, "nodes", list)]
+        for visited in range(MAX_SHOWN):
+            if not waiting:
+                return
+            index, above = waiting.pop(0)
+            node = self.item("nodes", index)
+            self.extensions(node)
+            with np.errstate(all="ignore"):  # numbers that overflow are refused where they are used
+                matrix = above @ self.matrix(node)
+            if "mesh" in node:
+                yield self.item("meshes", node["mesh"]), matrix
+            waiting += [(child, matrix) for child in self.value(node, "children", list)]
+            if len(waiting) > MAX_SHOWN - visited:
+                break
+        raise self.invalid(f"its nodes form a circle or are more than {MAX_SHOWN:,}")
+
+    def matrix(self, node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
+        """Return the transform of a node, from its matrix, by columns, or its translation, rotation and scale."""
+
+        def vector(key: str, *default: float) -> list[float]:
+            values = node.get(key, list(default))
+            numbers = isinstance(values, list) and all(is_number(value, 1e30) for value in values)
+            if not numbers or len(values) != len(default):
+                raise self.invalid(f"a node's {key} is not {len(default)} numbers")
+            return [float(value) for value in values]
+
+        if "matrix" in node:
+            return np.reshape(vector("matrix", *np.eye(4).ravel()), (4, 4)).T
+        x, y, z, w = vector("rotation", 0, 0, 0, 1)
+        matrix = np.eye(4)
+        matrix[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        matrix[:3, :3] *= vector("scale", 1, 1, 1)
+        matrix[:3, 3] = vector("translation", 0, 0, 0)
+        return matrix
+
+    def count(self, index: object) -> int:
+        """Return the number of elements of an accessor."""
+        return self.value(self.item("accessors", index), "count", int)
+
+    def numbers(self, index: object, width: int, what: str) -> Shaped[np.ndarray, "N C"]:
+        """Return an accessor of ``width`` columns; normalised integers become fractions of their largest value."""
+        accessor = self.item("accessors", index)
+        if "bufferView" not in accessor or "sparse" in accessor:
+            raise UnsupportedError(f"{self.name} has sparse or empty data for {what}; export it without")
+        kind, code = accessor.get("type"), self.value(accessor, "componentType", int)
+        if kind != _TYPES[width] or code not in _DTYPES:
+            raise self.invalid(f"{what} is {str(kind)[:20]!r} of component type {code}")
+        dtype, count = np.dtype(_DTYPES[code]), self.value(accessor, "count", int)
+        row = dtype.itemsize * width
+        stride = self.value(self.item("bufferViews", accessor["bufferView"]), "byteStride", int, 0) or row
+        if not row <= stride <= 252:  # the largest of the format
+            raise self.invalid(f"{what} has rows of {row} bytes every {stride:,}")
+        if not count:
+            return np.empty((0, width), dtype)
+        offset = self.value(accessor, "byteOffset", int, 0)
+        data = self.view(accessor["bufferView"], offset, stride * (count - 1) + row)
+        values: np.ndarray = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
+        if dtype.kind == "f" or not accessor.get("normalized", False):
+            return values
+        if dtype.itemsize > 2:
+            raise self.invalid(f"{what} is normalised, but not of 8 or 16 bits")
+        return np.maximum(values.astype(np.float32) / np.float32(np.iinfo(dtype).max), np.float32(-1))
+
+    def view(self, index: object, first: int = 0, length: int | None = None, *, most: int = 1 << 53) -> memoryview:
+        """Return bytes of a buffer view: ``length`` from ``first``, or all, but at most ``most``."""
+        view = self.item("bufferViews", index)
+        self.extensions(view)
+        offset, size = self.value(view, "byteOffset", int, 0), self.value(view, "byteLength", int)
+        number = self.value(view, "buffer", int)
+        uri = self.item("buffers", number).get("uri")
+        wanted = size - first if length is None else length
+        if not 0 <= wanted <= size - first:
+            raise self.invalid("an accessor needs more bytes than its buffer view has")
+        inside = self._binary if uri is None and number == 0 else None
+        if inside is None and number not in self._buffers:
+            self._buffers[number] = self._load(uri, number)
+        if offset + size > (len(self._buffers[number]) if inside is None else inside[1]):
+            raise self.invalid("a buffer view reaches beyond its buffer")
+        start, wanted = offset + first, min(wanted, most)
+        if inside is None:
+            return memoryview(self._buffers[number])[start : start + wanted]
+        return memoryview(self._opened.read(inside[0] + start, wanted))
+
+    def _load(self, uri: object, number: int) -> bytes:
+        """Return the bytes of a buffer: base64 in the JSON, or a file beside the scene."""
+        if not isinstance(uri, str):
+            raise self.invalid(f"buffers[{number}] has no data")
+        if uri.startswith("data:"):
+            try:
+                return base64.b64decode(uri.partition(";base64,")[2], validate=True)
+            except ValueError as error:
+                raise self.invalid(f"buffers[{number}].uri is not base64") from error
+        path = urllib.parse.unquote(uri)
+        if not is_file_name(path):
+            raise UnsupportedError(f"{self.name} names a buffer outside its folder; put the file beside it")
+        if self._folder is None:
+            raise UnsupportedError(f"{self.name} needs the file {path[:80]!r} beside it; give the path, or a .glb")
+        with open_scene_file(self._folder / path, "put the buffer there") as opened:
+            return opened.read(0, opened.size)
+
+
+def _split(opened: SceneFile) -> tuple[bytes, tuple[int, int] | None]:
+    """Return the JSON, and where the binary part of a GLB begins and how long it is."""
+    if opened.size < 20 or opened.read(0, 4) != _MAGIC:
+        if opened.size > MAX_GLTF_BYTES:
+            raise UnsupportedError(f"{opened.name} has {opened.size:,} bytes of text; export it as .glb")
+        return opened.read(0, opened.size), None
+    _, version, length, size, kind = struct.unpack("<4sIII4s", opened.read(0, 20))
+    if version != 2:
+        raise UnsupportedError(f"{opened.name} is GLB of version {version}; version 2 is read")
+    if kind != b"JSON" or size > MAX_JSON_BYTES:
+        raise InvalidSceneError(f"{opened.name} is not valid GLB: its first chunk is not JSON; export it again")
+    if length > opened.size:
+        raise opened.cut_short(length)
+    text, start = opened.read(20, size), 28 + size
+    if start > length:
+        return text, None
+    size, kind = struct.unpack("<I4s", opened.read(start - 8, 8))
+    if start + size > opened.size:
+        raise opened.cut_short(start + size)
+    return text, (start, size) if kind == b"BIN\0" else None
+
+
+# Reading.
 
 
 @dataclass(frozen=True, slots=True)
-class _Primitive:
-    """Primitive and where it stands: ``matrix`` is its node's transform. ``spz`` is the buffer view of its ``.spz``."""
+class _Part:
+    """Primitive with Gaussians, and the transform of its node; ``spz`` is the buffer view of its ``.spz``."""
 
     attributes: dict[str, Any]
     matrix: Float64[np.ndarray, "4 4"]
     count: int
     degree: int
-    spz: int | None
+    spz: int | None = None
     antialiased: bool = False
 
 
 def _sniff(head: bytes, size: int) -> Match:
     start = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     is_text = start.startswith(b"{") and not any(byte < 32 and byte not in b"\t\r\n" for byte in start)
-    return Match.SURE if head.startswith(GLB_MAGIC) else Match.POSSIBLE if is_text else Match.NO
+    return Match.SURE if head.startswith(_MAGIC) else Match.POSSIBLE if is_text else Match.NO
 
 
 def describe(source: Path | bytes, level: int = 0) -> Facts:
     """Read the JSON, and the headers of ``.spz`` inside."""
     with open_scene_file(source) as opened:
-        binary = opened.file.read(4) == GLB_MAGIC
-        document = Document(opened, None if isinstance(source, bytes) else source.parent)
-        found = list(_primitives(document, {}))
-    spz = any(primitive.spz is not None for primitive in found)
-    antialiased = all(primitive.antialiased for primitive in found)
+        binary = opened.file.read(4) == _MAGIC
+        parts, _ = _parts(_Document(opened, None if isinstance(source, bytes) else source.parent))
+    spz = any(part.spz is not None for part in parts)
+    antialiased = all(part.antialiased for part in parts)
     kinds = ("GLB" if binary else "JSON", "compressed as SPZ" if spz else "", "antialiased" if antialiased else "")
     return Facts(
         title=titled("glTF scene", *kinds),
-        count=sum(primitive.count for primitive in found),
-        sh_degree=max(primitive.degree for primitive in found),
-        details={"binary": binary, "primitives": len(found), "spz": spz, "antialiased": antialiased},
+        count=sum(part.count for part in parts),
+        sh_degree=max(part.degree for part in parts),
+        details={"binary": binary, "primitives": len(parts), "spz": spz, "antialiased": antialiased},
     )
 
 
@@ -99,244 +342,120 @@ def read_gltf(
 ) -> Splats:
     """Read a scene; primitives of a lower SH degree get zeros for the coefficients above it.
 
-    What the scene has beyond Gaussians is named in ``notes``; so are hidden nodes, which are left out too. Buffers in
-    other files must be below the folder of the scene.
+    What the scene has beyond Gaussians is named in ``notes``. Buffers in other files must be below its folder.
     """
     with open_scene_file(source) as opened:
-        document = Document(opened, None if isinstance(source, bytes) else source.parent)
-        left_out: dict[str, None] = {}
-        found, notes = list(_primitives(document, left_out)), dict[str, None]()
-        count = sum(primitive.count for primitive in found)
+        document = _Document(opened, None if isinstance(source, bytes) else source.parent)
+        parts, left_out = _parts(document)
+        notes = dict.fromkeys([f"left out: {listed(left_out)}"] if left_out else [])
+        count = sum(part.count for part in parts)
         refuse_more_than(reading.max_compressed, count, document.name)
         progress("read", 0.0)
-        splats = empty_splats(count, SH_REST_COUNTS[max(primitive.degree for primitive in found)])
+        splats = empty_splats(count, SH_REST_COUNTS[max(part.degree for part in parts)])
         start, placed = 0, np.empty((count, 3))
-        for primitive in found:
-            rows = slice(start, start + primitive.count)
-            part = splats.select(rows)
-            if primitive.spz is None:
-                _read_attributes(document, primitive, part)
+        for part in parts:
+            rows = slice(start, start + part.count)
+            own = splats.select(rows)
+            if part.spz is None:
+                _read_attributes(document, part, own)
             else:
-                notes |= dict.fromkeys(_read_spz(document, primitive.spz, part))
+                notes |= dict.fromkeys(_read_spz(document, part.spz, own))
             with np.errstate(all="ignore"):  # numbers that overflow are refused
-                placed[rows] = part.means.astype(np.float64) @ primitive.matrix[:3, :3].T + primitive.matrix[:3, 3]
-            _apply(document, primitive.matrix, part)
-            start += primitive.count
+                placed[rows] = own.means.astype(np.float64) @ part.matrix[:3, :3].T + part.matrix[:3, 3]
+            _apply(document, part.matrix, own)
+            start += part.count
             progress("read", start / max(count, 1))
     _turn_to_ply(splats)
-    if left_out:
-        notes[f"left out: {listed(list(left_out))}"] = None
     whole = replace(splats, notes=tuple(notes))
     if (world := placed * TO_PLY).size and origin_for(world, whole.scales) != WORLD:
         whole = from_world(whole, world)
-    return marked(whole, [primitive.antialiased for primitive in found])
+    return marked(whole, [part.antialiased for part in parts])
 
 
-def _primitives(document: Document, left_out: dict[str, None]) -> Iterator[_Primitive]:
-    """Yield the primitives that hold Gaussians; add what else the scene has to the keys of ``left_out``."""
-    _check_required(document)
-    left_out |= dict.fromkeys(key for key in ("animations", "skins") if document.items(key))
-    left_out |= dict.fromkeys(f"extension {name[:60]}" for name in _extensions(document, "extensionsUsed"))
-    if len(document.items("scenes")) > 1:
+def _parts(document: _Document) -> tuple[list[_Part], list[str]]:
+    """Return the primitives that hold Gaussians, and what else the scene has."""
+    parts, shown = list[_Part](), 0
+    left_out = dict.fromkeys(key for key in ("animations", "skins") if document.value(document.root, key, list))
+    for name in map(str, document.value(document.root, "extensionsUsed", list)):
+        if name not in _READ and not name.startswith(_OF_SURFACES):
+            left_out[f"extension {name[:60]}"] = None
+    if len(document.value(document.root, "scenes", list)) > 1:
         left_out["other scenes"] = None
-    seen, number = 0, 0
-    for mesh, matrix in _instances(document, left_out):
-        primitives = document.items("primitives", mesh)
-        seen += len(primitives) or 1
-        if seen > _MAX_INSTANCES:
-            raise document.invalid(f"its nodes show more than {_MAX_INSTANCES:,} primitives")
+    for mesh, matrix in document.meshes():
+        primitives = document.value(mesh, "primitives", list)
+        shown += len(primitives) or 1
+        if shown > MAX_SHOWN:
+            raise document.invalid(f"its nodes show more than {MAX_SHOWN:,} primitives")
         for primitive in primitives:
-            splatting = document.child(document.child(primitive, "extensions"), EXTENSION)
-            if EXTENSION in document.child(primitive, "extensions"):
-                number += 1
-                found = _primitive(document, primitive, splatting, matrix)
-                unread = [str(key) for key in ("indices", "targets") if key in primitive]
-                unread += [
-                    f"{key} {str(splatting[key])[:40]!r}"
-                    for key, usual in _USUAL.items()
-                    if splatting.get(key, usual) != usual
-                ]
-                unread += [
-                    key for key in found.attributes if found.spz is None and not _KNOWN_ATTRIBUTES.fullmatch(key)
-                ]
-                left_out |= dict.fromkeys(unread)
-                yield found
-            else:
+            if not isinstance(primitive, dict):
+                raise document.invalid("a primitive is not an object")
+            if EXTENSION not in document.extensions(primitive):
                 left_out["meshes without Gaussians"] = None
-    if number:
-        return
-    meshes = (primitive for mesh in document.items("meshes") for primitive in document.items("primitives", mesh))
-    if any(EXTENSION in document.child(primitive, "extensions") for primitive in meshes):
+                continue
+            parts.append(part := _part(document, primitive, matrix))
+            if part.spz is None:
+                left_out |= dict.fromkeys(name for name in part.attributes if name not in _ATTRIBUTES)
+    if not parts:
         raise InvalidSceneError(
-            f"{document.name} shows none of its Gaussians: no visible node of its scene has them; export them visible"
+            f"{document.name} has no Gaussians: no mesh of its scene uses {EXTENSION}; name a 3DGS scene"
         )
-    raise InvalidSceneError(f"{document.name} has no Gaussians: none of its meshes uses {EXTENSION}; name a 3DGS scene")
+    return parts, list(left_out)
 
 
-def _check_required(document: Document) -> None:
-    asset = document.child(document.root, "asset")
-    version, least = (str(asset.get(key, "2.0")) for key in ("version", "minVersion"))
-    if not version.startswith("2.") or least != "2.0":
-        wanted = least if version.startswith("2.") else version
-        raise UnsupportedError(f"{document.name} is glTF of version {wanted[:20]!r}; export it as glTF 2.0")
-    _refuse_compressions(
-        document, [name for name in document.entries("extensionsRequired", document.root, str) if name in _COMPRESSIONS]
-    )
-    for name in _extensions(document, "extensionsRequired"):
-        raise UnsupportedError(
-            f"{document.name} requires the extension {name[:60]!r}, which is not read; export it without"
-        )
-
-
-def _refuse_compressions(document: Document, names: list[str]) -> None:
-    for name in names:
-        raise UnsupportedError(f"{document.name} is compressed by {name[:60]!r}; export it without or with .spz")
-
-
-def _extensions(document: Document, key: str) -> list[str]:
-    """Return the extensions in a list of the file that may matter to Gaussians and are not read."""
-    return [
-        name
-        for name in document.entries(key, document.root, str)
-        if name not in _READ and not _OF_SURFACES.fullmatch(name)
-    ]
-
-
-def _instances(
-    document: Document, left_out: dict[str, None]
-) -> Iterator[tuple[dict[str, Any], Float64[np.ndarray, "4 4"]]]:
-    """Yield every mesh that the scene's nodes show, with its transform; without scenes, all meshes as they are."""
-    scenes = document.items("scenes")
-    if not scenes:
-        yield from ((mesh, np.eye(4)) for mesh in document.items("meshes"))
-        return
-    scene = document.item("scenes", document.root.get("scene", 0))
-    waiting = [(index, np.eye(4)) for index in document.entries("nodes", scene)]
-    for visited in range(_MAX_INSTANCES):
-        if not waiting:
-            return
-        index, above = waiting.pop(0)
-        node = document.item("nodes", index)
-        extensions = document.child(node, "extensions")
-        if document.child(extensions, VISIBILITY).get("visible") is False:
-            left_out["hidden nodes"] = None
-            continue
-        with np.errstate(all="ignore"):  # numbers that overflow are refused where they are used
-            matrix = above @ node_matrix(document, node)
-            placed = [matrix]
-            if INSTANCING in extensions:
-                placed = [matrix @ inner for inner in _placements(document, document.child(extensions, INSTANCING))]
-        if "mesh" in node:
-            mesh = document.item("meshes", node["mesh"])
-            yield from ((mesh, place) for place in placed)
-        waiting += [(child, matrix) for child in document.entries("children", node)]
-        if len(waiting) > _MAX_INSTANCES - visited:
-            break
-    raise document.invalid(f"its nodes form a circle or are more than {_MAX_INSTANCES:,}")
-
-
-def _placements(document: Document, instancing: dict[str, Any]) -> Iterator[Float64[np.ndarray, "4 4"]]:
-    """Yield the transform of each instance within its node."""
-    attributes = document.child(instancing, "attributes")
-    counts = {document.count(index) for index in attributes.values()}
-    if len(counts) != 1:
-        raise document.invalid(f"the attributes of {INSTANCING} have different counts, or there are none")
-    (count,) = counts
-    if count > _MAX_INSTANCES:
-        raise UnsupportedError(f"{document.name} shows a mesh {count:,} times; {_MAX_INSTANCES:,} instances are read")
-    widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
-    columns = {
-        name.lower(): document.numbers(index, widths[name], name).astype(np.float64)
-        for name, index in attributes.items()
-        if name in widths
-    }
-    if "rotation" in columns:  # of integers they are not quite of unit length
-        lengths = np.linalg.norm(columns["rotation"], axis=1, keepdims=True)
-        if not lengths.all():
-            raise document.invalid("an instance has a rotation of length zero")
-        columns["rotation"] /= lengths
-    for row in range(count):
-        yield node_matrix(document, {name: values[row].tolist() for name, values in columns.items()})
-
-
-def _primitive(
-    document: Document, primitive: dict[str, Any], splatting: dict[str, Any], matrix: Float64[np.ndarray, "4 4"]
-) -> _Primitive:
-    """Check a primitive's extension and attributes."""
-    kernel, space = splatting.get("kernel", "ellipse"), splatting.get("colorSpace", "srgb_rec709_display")
-    if kernel != "ellipse":
-        raise UnsupportedError(f"{document.name} has the kernel {str(kernel)[:40]!r}; only 'ellipse' is read")
-    if space != "srgb_rec709_display":
-        raise UnsupportedError(
-            f"{document.name} has the colour space {str(space)[:40]!r}; export it with 'srgb_rec709_display'"
-        )
-    attributes = document.child(primitive, "attributes")
-    if len(attributes) > _MAX_ATTRIBUTES:
+def _part(document: _Document, primitive: dict[str, Any], matrix: Float64[np.ndarray, "4 4"]) -> _Part:
+    """Check a primitive's extensions and attributes."""
+    splatting = document.value(document.extensions(primitive), EXTENSION, dict)
+    for key, usual in _USUAL.items():
+        if (found := splatting.get(key, usual)) != usual:
+            raise UnsupportedError(f"{document.name} has the {key} {str(found)[:40]!r}; export it with {usual!r}")
+    attributes = document.value(primitive, "attributes", dict)
+    if len(attributes) > MAX_ATTRIBUTES:
         raise document.invalid(f"a primitive has {len(attributes):,} attributes")
-    compressions = document.child(splatting, "extensions")
-    unread = []
+    count = document.count(attributes["POSITION"]) if "POSITION" in attributes else None
+    compressions = document.extensions(splatting)
     for name in compressions:
-        if name in SPZ_EXTENSIONS:
-            view = document.whole(document.child(compressions, name), "bufferView", -1)
-            header = read_spz_info(bytes(document.view(view, most=512)))
-            if "POSITION" in attributes and document.count(attributes["POSITION"]) != header.count:
-                raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
-            return _Primitive(attributes, matrix, header.count, header.sh_degree, view, header.antialiased)
-        unread.append(str(name))
-    unread += [str(name) for name in document.child(primitive, "extensions") if name in _COMPRESSIONS]
-    _refuse_compressions(document, unread)
-    if "POSITION" not in attributes:
+        if name not in SPZ_EXTENSIONS:
+            raise document.unread(name)
+        view = document.value(document.value(compressions, name, dict), "bufferView", int)
+        header = read_spz_info(bytes(document.view(view, most=512)))
+        if count not in (None, header.count):
+            raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
+        return _Part(attributes, matrix, header.count, header.sh_degree, view, header.antialiased)
+    if count is None:
         raise document.invalid("a primitive has no POSITION")
-    return _Primitive(attributes, matrix, document.count(attributes["POSITION"]), _degree(document, attributes), None)
+    degree = max((band for band, names in enumerate(_BANDS) if not attributes.keys().isdisjoint(names)), default=0)
+    refuse_degree(degree, document.name)
+    return _Part(attributes, matrix, count, degree)
 
 
-def _degree(document: Document, attributes: dict[str, Any]) -> int:
-    """Return the SH degree, all of whose coefficients must be there."""
-    prefix = f"{EXTENSION}:SH_DEGREE_"
-    present = {name.removeprefix(prefix) for name in attributes if name.startswith(prefix)}
-    degree = 0
-    for band in range(4):
-        wanted = {f"{band}_COEF_{i}" for i in range(2 * band + 1)}
-        if band == 0 or present & wanted:
-            missing = sorted(wanted - present)
-            if missing or degree < band - 1:
-                raise document.invalid(f"it lacks {prefix}{missing[0] if missing else f'{band - 1}_COEF_0'}")
-            degree = band
-    if any(name.startswith("4_") for name in present):
-        raise UnsupportedError(f"{document.name} has an SH degree above 3; export it with degree 3 or lower")
-    return degree
-
-
-def _read_attributes(document: Document, primitive: _Primitive, out: Splats) -> None:
+def _read_attributes(document: _Document, part: _Part, out: Splats) -> None:
     """Read the accessors of a primitive into ``out``, in glTF's axes."""
 
     def column(name: str, width: int) -> np.ndarray:
-        key = name if name == "POSITION" else f"{EXTENSION}:{name}"
-        if key not in primitive.attributes:
-            raise document.invalid(f"a primitive has no {key}")
-        values = document.numbers(primitive.attributes[key], width, key)
+        if name not in part.attributes:
+            raise document.invalid(f"a primitive has no {name}")
+        values = document.numbers(part.attributes[name], width, name)
         if len(values) != len(out):
-            raise document.invalid(f"{key} has {len(values):,} values for {len(out):,} Gaussians")
+            raise document.invalid(f"{name} has {len(values):,} values for {len(out):,} Gaussians")
         return values
 
     with np.errstate(all="ignore"):  # values may be any floats; they are not cleaned here
         out.means[:] = column("POSITION", 3)
-        out.quats[:] = np.roll(column("ROTATION", 4), 1, axis=1)  # x, y, z, w
-        scales = column("SCALE", 3)
+        out.quats[:] = np.roll(column(f"{EXTENSION}:ROTATION", 4), 1, axis=1)  # x, y, z, w
+        scales = column(f"{EXTENSION}:SCALE", 3)
         if scales.size and float(scales.min()) < 0:
             raise document.invalid("it has negative scales, as drafts of the extension had them")
-        opacities = column("OPACITY", 1)[:, 0]
-        for part in steps(len(out)):
-            out.scales[part] = log_scales(scales[part].astype(np.float64))
-            out.opacities[part] = opacity_logits(opacities[part].astype(np.float64))
-        out.sh0[:] = column("SH_DEGREE_0_COEF_0", 3)
-        bands = [f"SH_DEGREE_{band}_COEF_{i}" for band in range(1, primitive.degree + 1) for i in range(2 * band + 1)]
-        for i, name in enumerate(bands):
+        opacities = column(f"{EXTENSION}:OPACITY", 1)[:, 0]
+        for rows in steps(len(out)):
+            out.scales[rows] = log_scales(scales[rows].astype(np.float64))
+            out.opacities[rows] = opacity_logits(opacities[rows].astype(np.float64))
+        out.sh0[:] = column(_BANDS[0][0], 3)
+        for i, name in enumerate(name for band in _BANDS[1 : part.degree + 1] for name in band):
             out.shN[:, i] = column(name, 3)
 
 
-def _read_spz(document: Document, view: int, out: Splats) -> tuple[str, ...]:
-    """Read a ``.spz`` inside the file into ``out``, in glTF's axes (x left, y up, z forward); return its notes."""
+def _read_spz(document: _Document, view: int, out: Splats) -> tuple[str, ...]:
+    """Read a ``.spz`` inside the file into ``out``, in glTF's axes; return its notes."""
     stored = read_spz(bytes(document.view(view, most=largest_spz(len(out)))), ReadOptions(max_gaussians=len(out)))
     mirror(stored, TO_PLY)
     for name in ATTRIBUTES:
@@ -347,7 +466,7 @@ def _read_spz(document: Document, view: int, out: Splats) -> tuple[str, ...]:
 
 
 @np.errstate(all="ignore")  # numbers that overflow are refused
-def _apply(document: Document, matrix: Float64[np.ndarray, "4 4"], out: Splats) -> None:
+def _apply(document: _Document, matrix: Float64[np.ndarray, "4 4"], out: Splats) -> None:
     """Move Gaussians by the transform of their node."""
     if np.array_equal(matrix, np.eye(4)):
         return
@@ -372,6 +491,168 @@ def _turn_to_ply(splats: Splats) -> None:
     w, x, y, z = (splats.quats[:, i].copy() for i in range(4))
     for i, values in enumerate((z, -y, x, -w)):
         splats.quats[:, i] = values
+
+
+# Writing of ``.glb``: one primitive, all attributes as floats or as ``.spz`` inside.
+#
+# In the form of floats, colours and opacities are also there as ``COLOR_0``, so that programs without the extension
+# show coloured points.
+
+MAX_GLB_BYTES = (1 << 32) - 1
+"""Largest GLB: its header has 32 bits for the size."""
+
+_NOT_IN_SPZ = (f"{EXTENSION}:OPACITY", _BANDS[0][0])
+"""Attributes that the extension for ``.spz`` gives no source: there, ``COLOR_0`` is colour and opacity."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Column:
+    """Attribute of the primitive: its width, and the values of some rows as they are stored."""
+
+    name: str
+    width: int
+    values: Callable[[slice], Shaped[np.ndarray, "B width"]]
+    dtype: str = "<f4"
+
+    @property
+    def row_bytes(self) -> int:
+        return self.width * np.dtype(self.dtype).itemsize
+
+
+def write_glb(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a scene in glTF's axes."""
+    ends = _ends(splats.means)
+    columns, views, start = list(_columns(splats)), list[dict[str, int]](), 0
+    for column in columns:
+        length = len(splats) * column.row_bytes
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": length, "target": 34962})  # ARRAY_BUFFER
+        start += length
+    _write_head(file, splats, columns, ends, views)
+    for done, column in enumerate(columns, 1):
+        for rows in steps(len(splats)):
+            file.write(column.values(rows).astype(column.dtype).tobytes())
+        progress("write", done / len(columns))
+    notes: list[str] = []
+    note_mark(notes, splats.antialiased)
+    return tuple(notes)
+
+
+def write_spz_glb(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a scene as ``.spz`` inside ``.glb``.
+
+    The ``.spz`` has its own axes (x right, y up, z back), as the extension wants it, whose text has the library of
+    ``.spz`` turn them from and to those of glTF. Accessors have types and counts, and no data.
+    """
+    ends = _ends(splats.means)
+    packed = io.BytesIO()  # its size stands before it
+    notes = write_spz(packed, splats, progress=progress)
+    bits = fractional_bits_for(float(np.abs(splats.means).max()))
+    decode_positions(encode_positions(ends, bits), bits, ends)  # as they are read: in steps
+    columns = [column for column in _columns(splats) if column.name not in _NOT_IN_SPZ]
+    body = packed.getbuffer()
+    view = {"buffer": 0, "byteOffset": 0, "byteLength": len(body)}
+    _write_head(file, splats, columns, ends, [view], {SPZ_EXTENSIONS[0]: {"bufferView": 0}})
+    file.write(body)
+    file.write(bytes(-len(body) % 4))
+    return notes
+
+
+def _ends(means: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "2 3"]:
+    """Return the smallest and the largest coordinates of a scene, which must have Gaussians."""
+    if not len(means):
+        raise UnsupportedError("a scene without Gaussians cannot be written as .glb; write it as .ply")
+    return np.stack([means.min(axis=0), means.max(axis=0)])
+
+
+def _columns(splats: Splats) -> Iterator[_Column]:
+    """Yield all attributes in glTF's axes, half a turn about z from those of a ``.ply``."""
+    axes = np.array(TO_PLY, np.float32)
+    yield _Column("POSITION", 3, lambda rows: splats.means[rows] * axes)
+    yield _Column("COLOR_0", 4, lambda rows: _linear_colors(splats.select(rows)), "u1")
+    # Half a turn of the Gaussian about its own axis precedes: the reader has the reason.
+    turned = np.array([-1, 1, 1, -1], np.float32)
+    yield _Column(f"{EXTENSION}:ROTATION", 4, lambda rows: splats.quats[rows][:, [2, 1, 0, 3]] * turned)
+    yield _Column(f"{EXTENSION}:SCALE", 3, lambda rows: np.exp(splats.scales[rows].astype(np.float64)))
+    yield _Column(f"{EXTENSION}:OPACITY", 1, lambda rows: opacities_of(splats.opacities[rows])[:, None])
+    yield _Column(_BANDS[0][0], 3, lambda rows: splats.sh0[rows])
+    signs = sh_signs(TO_PLY, splats.shN.shape[1])
+
+    def coefficient(k: int) -> Callable[[slice], Shaped[np.ndarray, "B 3"]]:
+        return lambda rows: splats.shN[rows, k] * signs[k]
+
+    for k, name in enumerate(name for band in _BANDS[1 : splats.sh_degree + 1] for name in band):
+        yield _Column(name, 3, coefficient(k))
+
+
+def _linear_colors(splats: Splats) -> UInt8[np.ndarray, "B 4"]:
+    """Return linear colours, as glTF's vertex colours are, and opacities."""
+    srgb = np.clip(colors_of(splats.sh0), 0, 1)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return to_bytes(255 * np.concatenate([linear, opacities_of(splats.opacities)[:, None]], axis=1))
+
+
+def _write_head(
+    file: BinaryWriter,
+    splats: Splats,
+    columns: list[_Column],
+    ends: Float32[np.ndarray, "2 3"],
+    views: list[dict[str, int]],
+    compression: dict[str, Any] | None = None,
+) -> None:
+    """Write all that stands before the buffer; ``compression`` is the extension that gives accessors their data."""
+    text = _json(splats, columns, ends, views, compression or {})
+    body = sum(view["byteLength"] for view in views)
+    body += -body % 4
+    size = 12 + 8 + len(text) + 8 + body
+    if size > MAX_GLB_BYTES:
+        raise UnsupportedError(
+            f"{len(splats):,} Gaussians take {size:,} bytes, and .glb ends at 4 GiB; write .spz or .ply"
+        )
+    file.write(struct.pack("<4sIII4s", _MAGIC, 2, size, len(text), b"JSON") + text)
+    file.write(struct.pack("<I4s", body, b"BIN\0"))
+
+
+def _json(
+    splats: Splats,
+    columns: list[_Column],
+    ends: Float32[np.ndarray, "2 3"],
+    views: list[dict[str, int]],
+    compression: dict[str, Any],
+) -> bytes:
+    """Return the JSON, filled up with spaces to a multiple of four bytes; the node moves positions to the world."""
+    accessors: list[dict[str, Any]] = []
+    for column in columns:
+        component = {"componentType": 5126} if column.dtype == "<f4" else {"componentType": 5121, "normalized": True}
+        accessors.append({**component, "count": len(splats), "type": _TYPES[column.width]})
+    corners = ends * np.array(TO_PLY, np.float32)
+    accessors[0] |= {"min": corners.min(axis=0).tolist(), "max": corners.max(axis=0).tolist()}
+    if not compression:
+        for i, accessor in enumerate(accessors):
+            accessor["bufferView"] = i
+    translation = [sign * value + 0.0 for sign, value in zip(TO_PLY, splats.origin, strict=True)]
+    primitive = {
+        "mode": 0,  # points
+        "attributes": {column.name: i for i, column in enumerate(columns)},
+        "extensions": {EXTENSION: {**_USUAL, **({"extensions": compression} if compression else {})}},
+    }
+    root = {
+        "asset": {"version": "2.0", "generator": "kissgs"},
+        "extensionsUsed": [EXTENSION, *compression],
+        **({"extensionsRequired": [EXTENSION, *compression]} if compression else {}),
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, **({} if splats.origin == WORLD else {"translation": translation})}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": sum(view["byteLength"] for view in views)}],
+    }
+    text = json.dumps(root, separators=(",", ":")).encode("ascii")
+    return text + b" " * (-len(text) % 4)
 
 
 FORMAT = Codec(

@@ -17,7 +17,7 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.conventions import OPACITY_OF_BYTE, SH0_OF_BYTE, log_scales
-from kissgs.io.files import SceneFile, open_scene_file, refuse_more_than
+from kissgs.io.files import SceneFile, open_scene_file, refuse_degree, refuse_more_than
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
 
 MAIN_BYTES, SECTION_BYTES = 4096, 1024
@@ -143,8 +143,7 @@ def _read_section_header(opened: SceneFile, level: int, index: int, offset: int)
     where = f"{opened.name}, section {index + 1}"
     fields = _SECTION.unpack_from(opened.read(MAIN_BYTES + index * SECTION_BYTES, SECTION_BYTES))
     count, most, bucket_size, buckets, block_size, centre_bytes, middle, _, full, partial, degree = fields
-    if degree > 3:
-        raise UnsupportedError(f"{where}: it has SH degree {degree}; export the scene with degree 3 or lower")
+    refuse_degree(degree, where)
     if count > most:
         raise InvalidSceneError(f"{where}: it declares {count:,} Gaussians with room for {most:,}; export it again")
     if level == 0:

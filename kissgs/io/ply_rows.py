@@ -16,7 +16,7 @@ import numpy as np
 
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.io.files import SceneFile, open_scene_file
+from kissgs.io.files import SceneFile, open_scene_file, refuse_degree
 
 # PLY headers: opening a file, parsing its header, and the SH degree that the header declares.
 
@@ -82,13 +82,12 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Parsed header; ``nbytes`` and ``lines`` are its size, after which the body begins; ``newline`` ends its lines."""
+    """Parsed header; ``nbytes`` and ``lines`` are its size, after which the body begins."""
 
     encoding: Encoding
     elements: dict[str, Element]
     nbytes: int
     lines: int
-    newline: bytes
     antialiased: bool
     """Whether a comment says that the scene was trained with antialiasing."""
 
@@ -121,8 +120,8 @@ def sh_degree(element: Element, name: str) -> int:
     if count % 3 == 0 and count // 3 in SH_REST_COUNTS:
         return SH_REST_COUNTS.index(count // 3)
     degree = round((count / 3 + 1) ** 0.5) - 1
-    if degree > 3 and 3 * ((degree + 1) ** 2 - 1) == count:
-        raise UnsupportedError(f"{name} has SH degree {degree}; export it with degree 3 or lower")
+    if 3 * ((degree + 1) ** 2 - 1) == count:
+        refuse_degree(degree, name)
     raise InvalidSceneError(f"{name} has {count} f_rest properties; SH degrees 0 to 3 have 0, 9, 24 or 45")
 
 
@@ -131,13 +130,12 @@ def _read_header(opened: SceneFile) -> Header:
     start = file.read(64)
     mark = len(codecs.BOM_UTF8) if start.startswith(codecs.BOM_UTF8) else 0
     _recognise(start[mark:], name)
-    newline = b"\r" if re.match(rb"ply[ \t]*\r(?!\n)", start[mark:]) else b"\n"
     file.seek(mark)
     encoding: Encoding | None = None
     counts: dict[str, int] = {}
     properties: dict[str, dict[str, Property]] = {}
     antialiased = False
-    for number, words in _header_lines(file, newline, name):
+    for number, words in _header_lines(file, name):
         where = f"{name}, header line {number}"
         match words:
             case ["ply"] if number == 1:
@@ -167,7 +165,7 @@ def _read_header(opened: SceneFile) -> Header:
                 if encoding is None:
                     raise InvalidSceneError(f"{name} has no format line in its header; export the scene again")
                 elements = {key: Element(key, counts[key], tuple(properties[key].values())) for key in counts}
-                return Header(encoding, elements, file.tell(), number, newline, antialiased)
+                return Header(encoding, elements, file.tell(), number, antialiased)
             case _:
                 raise InvalidSceneError(f"{where}: {_quote(' '.join(words))} is not a line of a PLY header")
     raise InvalidSceneError(f"{name} has no end_header line; it is cut short or not a PLY file")
@@ -192,34 +190,24 @@ def _recognise(head: bytes, name: str) -> None:
     for magic, hint in _LOOKALIKES.items():
         if start.startswith(magic):
             raise InvalidSceneError(f"{name} is not a PLY file: {hint}")
-    if not re.match(rb"ply[ \t]*[\r\n]", head):
+    if not re.match(rb"ply[ \t]*\r?\n", head):
         raise InvalidSceneError(
             f"{name} is not a PLY file: its first line is not 'ply', and no other format is recognised; a .splat needs "
             "this ending"
         )
 
 
-def _header_lines(file: io.BufferedIOBase, newline: bytes, name: str) -> Iterator[tuple[int, list[str]]]:
+def _header_lines(file: io.BufferedIOBase, name: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the lines as words, numbered from 1; an incomplete last line ends the iteration."""
     left = MAX_HEADER_BYTES
     for number in itertools.count(1):
-        line = _line(file, newline, left + 1)
+        line = file.readline(left + 1)
         left -= len(line)
         if left < 0:
             raise InvalidSceneError(f"{name} has no end_header line within {MAX_HEADER_BYTES} bytes; it is damaged")
-        if not line.endswith(newline) and line.strip() != b"end_header":
+        if not line.endswith(b"\n") and line.strip() != b"end_header":
             return
         yield number, line.decode("utf-8", errors="replace").split()
-
-
-def _line(file: io.BufferedIOBase, newline: bytes, most: int) -> bytes:
-    """Return the next line, at most ``most`` bytes of it; ``readline`` does not know a carriage return alone."""
-    if newline == b"\n":
-        return file.readline(most)
-    line = bytearray()
-    while len(line) < most and not line.endswith(newline) and (byte := file.read(1)):
-        line += byte
-    return bytes(line)
 
 
 def _count(word: str, where: str) -> int:
@@ -346,7 +334,7 @@ def _numbered_lines(ply: PlyFile, width: int) -> Iterator[list[tuple[int, str]]]
     number = ply.header.lines
     rest = b""
     while block := ply.file.read(BLOCK_BYTES):
-        *complete, rest = (rest + block).split(ply.header.newline)
+        *complete, rest = (rest + block).split(b"\n")
         if len(rest) > BLOCK_BYTES:
             raise InvalidSceneError(f"{ply.name}, line {number + 1}: longer than {BLOCK_BYTES} bytes; it is damaged")
         yield [(number + i, text) for i, line in enumerate(complete, 1) if (text := line.decode("latin-1").strip())]

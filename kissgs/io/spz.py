@@ -31,7 +31,7 @@ from kissgs.io.conventions import (
     to_bytes,
     to_codes,
 )
-from kissgs.io.files import BinaryWriter, SceneFile, listed, open_scene_file, refuse_more_than
+from kissgs.io.files import BinaryWriter, SceneFile, listed, open_scene_file, refuse_degree, refuse_more_than
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
 
 # Decompression: gzip and zstd, bounded by what the header needs.
@@ -314,8 +314,8 @@ def _read_header(opened: SceneFile) -> SpzInfo:
             f"{opened.name} is .spz of version {version}{' in gzip' if gzipped else ''}; versions 1 to 3 in gzip and 4 "
             "without are read"
         )
-    if degree >= len(_COEFFICIENTS):
-        raise UnsupportedError(f"{opened.name} has SH degree {degree}; export it with degree 3 or lower")
+    if degree >= len(_COEFFICIENTS):  # 4 is read without its highest band
+        refuse_degree(degree, opened.name)
     if flags & _SPARK_TREE:
         raise UnsupportedError(
             f"{opened.name} holds Spark's levels of detail, coarse Gaussians among the fine ones; export it without"

@@ -288,27 +288,26 @@ class Search:
             self._search_all_gaussians(tunes=False)
             left = limited.plan(photographs=True, aims=self.aims).containers
             self.plan = replace(self.plan, containers=min(self.plan.containers, left))
+        last = last_number(len(path.whole))
         if limited is None and not self.goal.by_size:
-            first = self._point_near_the_limit(path, first)
+            failing = self._first_that_fails(path, first)
+            if failing > first:
+                first = last = failing - 1
         if not self._whole_searched or self.plan.containers > 1:
-            self._along_path(path, first)
+            self._along_path(path, first, last)
         if self.best is None and not self.aims:
             self._search_all_gaussians()
 
-    def _point_near_the_limit(self, path: TrainingPath, number: int) -> int:
-        """Train along the path, from point ``number`` on while the goal is met before encoding; return the nearest one.
+    def _first_that_fails(self, path: TrainingPath, number: int) -> int:
+        """Train along the path from point ``number`` on, up to the first that misses the goal before any encoding.
 
         Photographs may show more than the scene does: training then makes it better than it was, and a container of
-        point ``number`` would use up little of what may be lost. Far from the limit, several points are pruned at once.
+        point ``number`` would use up little of what may be lost.
         """
-        last, rooms = last_number(len(path.whole)), dict[int, float]()
-        while True:
-            found = self._try_unencoded(self._train_to(path, number).splats)
-            room = rooms[number] = self.goal.log2_room(found)
-            if number == last or not 0 <= room < math.inf:
-                return min(rooms, key=lambda n: abs(rooms[n]))
-            number += min(max(int(room), 1), PRUNABLE_POINTS, last - number)
-            self._prune_to(path, number - 1)
+        last = last_number(len(path.whole))
+        while number < last and self.goal.margin(self._try_unencoded(self._train_to(path, number).splats)) >= 0:
+            number += 1
+        return number
 
     def _recovers(self, path: TrainingPath) -> bool:
         """Train up to the first point, and return whether fine-tuning can be expected to recover what is still lost.
@@ -331,7 +330,7 @@ class Search:
         self._search_all_gaussians(tunes=False, most=min(ENCODES, most) if trains else most)
         whole, fits = self.best, self.goal.by_size and self.attempts[0].bytes <= self.target_size
         if whole is None and self.target_size > self._overhead:
-            self._along_path(path, self.number_for_size)
+            self._along_path(path, self.number_for_size, last_number(len(path.whole)))
         elif whole is not None and not fits and (trains or not (self.trains or self.goal.by_size)):
             allowed = self._loss(whole.made) if self.goal.by_size else math.inf
 
@@ -484,8 +483,8 @@ class Search:
         with suppress(NoFurtherError):
             LambdaCurve(self.goal, encode_at, scene.settings, most, tuned=tuned, sh_degree=degree).search(rd_lambda)
 
-    def _along_path(self, path: TrainingPath, first: int) -> None:
-        """Make trained containers of points of the path, the first one at point ``first``."""
+    def _along_path(self, path: TrainingPath, first: int, last: int) -> None:
+        """Make trained containers of points of the path up to ``last``, the first one at point ``first``."""
 
         def encode_at(number: int, log2_lambda: float | None) -> Attempt:
             self._progress.note = "; last: ".join(
@@ -499,7 +498,7 @@ class Search:
         if self.plan.containers == 0:  # there is no time for training
             self._prune_to(path, max(first, 1))
         with suppress(NoFurtherError):
-            along_path(self.goal, encode_at, first, last_number(len(path.whole)), self.plan.containers, near)
+            along_path(self.goal, encode_at, first, last, self.plan.containers, near)
         if self.goal.by_size and self.best is None and len(path.points) > 1:  # lambda alone makes it small enough
             self._along_lambda(self._untrained(path, path.points[-1]), most=self.encode_settings.max_encodes)
 

@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from kissgs.core.errors import KissgsError
+from kissgs.core.progress import Progress
+from kissgs.runners.contract import MEMORY_LIMIT
 
 EVENT_SECONDS = 0.25
 """Minimum seconds between progress events of a stage."""
@@ -41,23 +43,26 @@ def main() -> None:
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     send = _sender()
     _limit_resources(task["memory_limit"])
+    send({"outcome": _outcome(task, Throttle(send))})
+    os._exit(0)  # without waiting for threads of libraries
+
+
+def _outcome(task: dict[str, Any], progress: Progress) -> dict[str, Any]:
+    """Run the task; return the fields of its outcome."""
     try:
         module, _, name = task["function"].partition(":")
         function = getattr(importlib.import_module(module), name)
-        send({"done": function(task["arguments"], Throttle(send))})
+        return {"kind": "done", "result": function(task["arguments"], progress)}
     except KissgsError as error:
-        if isinstance(error.__cause__, MemoryError):  # that of the limit, whatever could not be allocated
-            send({"out_of_memory": True})
-        else:
-            send({"error": {"code": error.code, "message": str(error)}})
+        if not isinstance(error.__cause__, MemoryError):
+            return {"kind": "error", "code": error.code, "message": str(error)}
     except MemoryError:
-        send({"out_of_memory": True})
+        pass
     except Exception as error:  # noqa: BLE001  a bug, reported by standard error and the exit status
         if not _lacks_memory(error, task["memory_limit"]):
             traceback.print_exc()
             os._exit(1)
-        send({"out_of_memory": True})
-    os._exit(0)  # without waiting for threads of libraries
+    return {"kind": "error", "code": MEMORY_LIMIT}  # that of the limit, whatever could not be allocated
 
 
 def _lacks_memory(error: Exception, limit: int | None) -> bool:

@@ -38,69 +38,43 @@ from kissgs.runners.contract import (
     report,
 )
 
-# ``temporary_folder``: a folder of one item on the disk of the machine that runs it.
-#
-#     TEMP/kissgs-item-TOKEN.lock    locked by the process that made it, as long as it lives
-#     TEMP/kissgs-item-TOKEN/        the current folder of the item's process, made once the lock is held
-#
-# TEMP is the system's folder for temporary files (``TMPDIR``). Whoever starts the item's process removes both when that
-# has ended. If it is killed itself, they stay, and the next item that starts on the machine removes them: a lock that
-# can be taken has no owner.
-
-PREFIX, LOCK = "kissgs-item-", ".lock"
+PREFIX = "kissgs-item-"
+"""Beginning of the names of temporary folders of items."""
 
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Make an empty folder, and remove it with all that is in it; remove former ones whose owners were killed."""
+    """Make an empty folder, and remove it with all that is in it; remove former ones whose makers were killed.
+
+    Its maker has it locked as long as it lives: a folder that can be locked is left by a process that was killed.
+    """
     place = Path(tempfile.gettempdir())
-    _remove_remains(place)
-    with _new_lock(place) as lock:
-        folder = Path(lock.name).with_suffix("")
-        try:
-            folder.mkdir(mode=0o700)
-            yield folder
-        finally:
-            _remove(folder)
-
-
-def _new_lock(place: Path) -> IO[bytes]:
-    """Return a new file that is locked. Before it is, another process may take it for remains and remove it."""
+    for left in place.glob(f"{PREFIX}*"):
+        with contextlib.suppress(OSError), _opened(left) as descriptor:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(left, ignore_errors=True)
     while True:
-        lock = tempfile.NamedTemporaryFile(prefix=PREFIX, suffix=LOCK, dir=place, delete=False)  # noqa: SIM115
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        except OSError:
-            lock.close()
-            Path(lock.name).unlink(missing_ok=True)
-            raise
-        if Path(lock.name).exists():
-            return lock
-        lock.close()
+        folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=place))
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(OSError):  # removed before it is locked; or no locks on this file system
+                fcntl.flock(stack.enter_context(_opened(folder)), fcntl.LOCK_EX)
+            if not folder.exists():
+                continue
+            try:
+                yield folder
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
+            return
 
 
-def _remove_remains(place: Path) -> None:
-    """Remove folders of this user that nobody has locked."""
-    with contextlib.suppress(OSError):
-        for path in place.glob(f"{PREFIX}*{LOCK}"):
-            with contextlib.suppress(OSError):
-                _remove_if_unlocked(path)
-
-
-def _remove_if_unlocked(path: Path) -> None:
-    if path.is_symlink() or path.stat().st_uid != os.geteuid():
-        return
-    with path.open("rb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        _remove(path.with_suffix(""))
-
-
-def _remove(folder: Path) -> None:
-    """Remove a folder, and then its lock: what cannot be removed now, the next item can try to remove."""
-    shutil.rmtree(folder, ignore_errors=True)
-    with contextlib.suppress(OSError):
-        if not folder.exists():
-            folder.with_suffix(LOCK).unlink(missing_ok=True)
+@contextlib.contextmanager
+def _opened(folder: Path) -> Iterator[int]:
+    """Open a folder that is no link."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
 
 
 # ``ItemProcess``: start of an item's process, its progress events, its limits and its outcome.
@@ -268,14 +242,7 @@ class ItemProcess:
 def _events_of(process: subprocess.Popen[bytes]) -> Iterator[ProgressEvent | Outcome]:
     assert process.stdout is not None  # noqa: S101
     for event in json_lines(process.stdout):
-        if "stage" in event:
-            yield event["stage"], event["fraction"], event["note"]
-        elif "done" in event:
-            yield Outcome("done", event["done"])
-        elif "error" in event:
-            yield Outcome("error", code=event["error"]["code"], message=event["error"]["message"])
-        else:
-            yield Outcome("error", code=MEMORY_LIMIT)
+        yield Outcome(**event["outcome"]) if "outcome" in event else (event["stage"], event["fraction"], event["note"])
 
 
 def json_lines(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:

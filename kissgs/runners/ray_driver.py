@@ -18,7 +18,7 @@ import socket
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
@@ -28,7 +28,7 @@ from ray.exceptions import RayError, RayTaskError, TaskCancelledError
 
 from kissgs._version import __version__
 from kissgs.core.errors import OutputError, RunnerError
-from kissgs.runners import file_transfer
+from kissgs.runners import ray_node
 from kissgs.runners.contract import INTERNAL, LOST, NODE_UNUSABLE, Outcome, WorkItem
 
 CONNECT_SECONDS = 5.0
@@ -179,7 +179,7 @@ class Driver:
         self._generators: dict[str, Any] = {}
         self._cancelled = set[str]()
         self._sends_files = False  # until a node has not seen a folder
-        self._function = ray.remote(run_on_node)  # once, because each call stores one more in the cluster
+        self._function = ray.remote(ray_node.run_on_node)  # once, because each call stores one more in the cluster
 
     async def run(self) -> None:
         """Handle messages from standard input until that closes; then cancel all items."""
@@ -279,7 +279,7 @@ class Driver:
                 if "unseen" in event:
                     return None
                 if "file" in event:
-                    await asyncio.to_thread(file_transfer.receive, Path(item.folder or ""), event)
+                    await asyncio.to_thread(ray_node.receive, Path(item.folder or ""), event)
                     continue
                 if "outcome" in event:
                     return Outcome(**{**event["outcome"], "node": node})
@@ -304,67 +304,13 @@ class Driver:
 def _stored_files(item: WorkItem) -> dict[str, list[Any]]:
     """Store an item's files as blocks in Ray's object store; return references to them by name."""
     folder = Path(item.folder or "")
-    return {name: [ray.put(block) for block in file_transfer.blocks_of(folder / name)] for name in item.files}
+    return {name: [ray.put(block) for block in ray_node.blocks_of(folder / name)] for name in item.files}
 
 
 def _unusable_files(error: OSError) -> Outcome:
     reason = (error.strerror or str(error)).lower()
     message = f"the files of the work cannot be read or written: {reason}"
     return Outcome("error", code=OutputError.code, message=message)
-
-
-def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]] | None) -> Iterator[dict[str, Any]]:
-    """Run an item in a process on a node, and yield its events; ``files`` are references to blocks of its files.
-
-    ``version`` is that of kissgs where it was submitted. Ray sends the code of functions of the main module: this one
-    imports what it uses, once the node has turned out to have that version.
-    """
-    import contextlib
-    import time
-    from dataclasses import asdict, replace
-    from pathlib import Path
-
-    import ray
-
-    from kissgs._version import __version__
-    from kissgs.runners import file_transfer
-    from kissgs.runners.contract import Outcome, WorkItem
-    from kissgs.runners.process import ItemProcess, temporary_folder
-
-    node = ray.util.get_node_ip_address()
-    if __version__ != version:
-        message = f"the node {node} has kissgs {__version__}, and this machine {version}; install one version"
-        yield {"outcome": asdict(Outcome("error", code=NODE_UNUSABLE, message=message))}
-        return
-    item, before, folder = WorkItem.from_dict(values), None, Path()
-    with contextlib.ExitStack() as stack:
-        if item.files and not file_transfer.is_seen(item.folder):
-            if files is None:
-                yield {"unseen": True}
-                return
-            folder = stack.enter_context(temporary_folder())
-            for name, blocks in files.items():
-                with (folder / name).open("wb") as file:
-                    for block in blocks:
-                        file.write(ray.get(block))
-            item, before = replace(item, folder=str(folder)), file_transfer.times_of(folder)
-        yield {"node": node}
-        process, looked, outcome = ItemProcess(item), time.monotonic(), None
-        try:
-            for event in process.events():
-                if isinstance(event, Outcome):
-                    outcome = event
-                    break
-                yield {"progress": list(event)}
-                if before is not None and time.monotonic() - looked > file_transfer.CHECKPOINT_SECONDS:
-                    yield from file_transfer.changed(folder, before, complete=False)
-                    looked = time.monotonic()
-        finally:
-            process.kill()
-        if before is not None and outcome is not None:
-            yield from file_transfer.changed(folder, before, complete=outcome.kind == "done")
-        if outcome is not None:
-            yield {"outcome": asdict(outcome)}
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""SOG files -> ``Splats``: one lookup table per channel, smallest-three rotations."""
+"""SOG files -> ``Splats``; and the formats of single containers and of streamed scenes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,31 +10,53 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, UInt8
 from kissgs.core.errors import InvalidContainerError
-from kissgs.core.positions import signed_exp
+from kissgs.core.positions import recorded, signed_exp
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
-from kissgs.core.splats import MAX_GAUSSIANS, Splats, empty_splats
-from kissgs.io.containers import Source, open_source
+from kissgs.core.splats import Splats, empty_splats
+from kissgs.formats import LOD_NAME
+from kissgs.io.containers import META_NAME, Source, open_source, stored_size
 from kissgs.io.conventions import insert_largest, look_up, steps
 from kissgs.io.files import refuse_more_than
 from kissgs.io.images import decode_plane, decode_png, is_png, probe_png, probe_webp
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions, SceneSource, titled
+from kissgs.io.streamed import Container, StreamedFormat
 from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, MAX_SH_ENTRIES, Rest, SogLayout, read_layout
 
 _FREE_PIXELS = 1 << 20
 """Pixels that images may have beyond four per Gaussian: encoders may round sides up to powers of two."""
 
 
+def describe(path: Path | bytes, level: int) -> Facts:
+    """Return the facts of a SOG container."""
+    with open_source(path) as files:
+        layout = read_layout(files)
+        parts = {name: stored_size(files, name) for name in (META_NAME, *layout.images)}
+    return Facts(
+        title=titled("SOG container", f"version {layout.version}", layout.model, layout.generator),
+        count=layout.count,
+        sh_degree=layout.sh_degree,
+        parts=parts,
+        ranges=layout.value_ranges(),
+        notes=layout.notes,
+        details={
+            **recorded(layout.origin),
+            "version": layout.version,
+            "antialiased": layout.antialiased,
+            "model": layout.model,
+            "generator": layout.generator,
+            "codebook_entries": layout.rest.entries if layout.rest else 0,
+        },
+    )
+
+
 def decode(
-    source: Path | bytes | Mapping[str, bytes],
-    *,
-    max_gaussians: int = MAX_GAUSSIANS,
-    threads: int = 0,
-    progress: Progress = silent,
+    source: SceneSource, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
 ) -> Splats:
     """Decode a container of version 1 or 2."""
     with open_source(source) as files, Workers(threads) as pool:
         layout = read_layout(files)
-        refuse_more_than(max_gaussians, layout.count, "the container")
+        refuse_more_than(reading.max_compressed, layout.count, "the container")
         progress("decode", 0.0)
         splats = empty_splats(layout.count, layout.rest.coefficients if layout.rest else 0)
         decode_files(files, layout, splats, pool)
@@ -175,3 +197,27 @@ def _check_levels(name: str, levels: UInt8[np.ndarray, "..."], table: Float32[np
     missing = np.isnan(table)
     if missing.any() and missing[levels].any():
         raise InvalidContainerError(f"{name} uses a level for which its codebook has no number; export the scene again")
+
+
+FORMAT = Codec(info=describe, read=decode)
+
+
+def _opened(files: Source, name: str) -> Container:
+    """Read the container of a metadata file."""
+    layout, folder = read_layout(files, name), name[: name.rfind("/") + 1]
+
+    def stored() -> tuple[str, int]:
+        return folder or META_NAME, sum(stored_size(files, folder + each) for each in (META_NAME, *layout.images))
+
+    return Container(
+        count=layout.count,
+        sh_degree=layout.sh_degree,
+        antialiased=layout.antialiased,
+        notes=layout.notes,
+        ranges=layout.value_ranges,
+        stored=stored,
+        decode=lambda out, pool: decode_files(files, layout, out, pool, folder),
+    )
+
+
+STREAMED = StreamedFormat("streamed SOG scene", LOD_NAME, None, _opened)

@@ -7,7 +7,7 @@ its activation of opacities and scales and their inverse.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,30 +15,76 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, UInt8, UInt16
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.positions import signed_exp
+from kissgs.core.positions import recorded, signed_exp
 from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
-from kissgs.core.splats import MAX_GAUSSIANS, SH_REST_COUNTS, Splats, empty_splats
-from kissgs.io.containers import Source, open_source
+from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
+from kissgs.formats import LEVELS_NAME
+from kissgs.io.containers import Source, ZipSource, open_source, stored_size
 from kissgs.io.conventions import ROWS, steps
+from kissgs.io.files import refuse_more_than
 from kissgs.io.images import decode_plane
-from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout, read_layout
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions, SceneSource, titled
+from kissgs.io.streamed import Container, StreamedFormat
+from kissgs.sogxt import container
+from kissgs.sogxt.container import FILES, PLANES
+from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout, read_layout, read_provenance
 
 CHANNELS_OF_PLAIN = {"quaternions": 4, "scales": 3, "f_dc": 3, "opacities": 1}
 """Number of channels of the attributes that are one image of 8-bit levels each."""
 
 
+MAX_PLANE_BYTES = 1 << 30
+"""Largest size of the mask, bytes."""
+
+MAX_FILE_BYTES = 1 << 28
+"""Largest size of a zip in a streamed scene, bytes; one of 400,000 Gaussians takes about 5 MB."""
+
+
+def describe(path: Path | bytes, level: int) -> Facts:
+    """Return the facts of a SOG-XT container; the mask is decoded if the metadata does not state the count."""
+    with open_source(path) as files:
+        layout, made = read_layout(files), read_provenance(files)
+        present = files.names()
+        missing = [name for name in PLANES if name not in present]
+        if missing:
+            name = "the container" if isinstance(path, bytes) else path
+            raise InvalidContainerError(f"{name} is incomplete: missing {', '.join(missing)}")
+        parts = {name: files.size(name) for name in FILES if name in present}
+        count = layout.count
+        if count is None:
+            name, side = "active_mask.webp", layout.grid_side
+            mask = decode_plane(files.read(name, MAX_PLANE_BYTES), name, width=side, height=side, channels=1)
+            count = int(np.count_nonzero(mask))
+    origin = f"kissgs {made.version} from {made.source_count:,} Gaussians" if made else "unknown"
+    grid, codebook = layout.grid_side, layout.codebook_side
+    return Facts(
+        title=titled("SOG-XT container", "antialiased" if layout.antialiased else ""),
+        count=count,
+        sh_degree=layout.sh_degree,
+        parts=parts,
+        ranges=layout.value_ranges(),
+        changed=made.changed if made else {},
+        details={
+            **recorded(layout.origin),
+            "grid_side": grid,
+            "codebook_side": codebook,
+            "version": made.version if made else None,
+            "source_count": made.source_count if made else None,
+            "antialiased": layout.antialiased,
+            "settings": made.settings if made else {},
+        },
+        lines=(f"grid {grid} x {grid}, codebook {codebook} x {codebook}; encoder: {origin}",),
+    )
+
+
 def decode(
-    source: Path | bytes | Mapping[str, bytes],
-    *,
-    max_gaussians: int = MAX_GAUSSIANS,
-    threads: int = 0,
-    progress: Progress = silent,
+    source: SceneSource, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
 ) -> Splats:
     """Decode a container in the order of its grid; quaternions are as stored, of length about 1."""
     with open_source(source) as files, Workers(threads) as pool:
         progress("decode", 0.0)
-        planes = _Planes(files, read_layout(files), max_gaussians)
+        planes = _Planes(files, read_layout(files), reading.max_compressed)
         planes.load(pool)
         progress("decode", 0.5)
         splats = planes.look_up(pool)
@@ -67,19 +113,14 @@ class _Planes:
 
     def __init__(self, files: Source, layout: Layout, max_gaussians: int) -> None:
         self.files, self.layout, self.max_gaussians = files, layout, max_gaussians
-        # Padding is less than half of any grid that follows the size rule, except for the smallest.
-        self.refuse_more_than(2 * max_gaussians + 128, layout.grid_side**2, "cells")
-        self.refuse_more_than(max_gaussians, layout.count or 0, "Gaussians")
+        if layout.grid_side**2 > 2 * max_gaussians + 128:  # padding is less than half of any grid but the smallest
+            raise UnsupportedError(
+                f"the container has {layout.grid_side**2:,} cells, too many for a limit of {max_gaussians:,} "
+                "Gaussians: raise it (--max-gaussians) if you trust the file"
+            )
+        refuse_more_than(max_gaussians, layout.count or 0, "the container")
         self.coefficients = SH_REST_COUNTS[layout.sh_degree]
         self.plain: dict[str, tuple[UInt8[np.ndarray, "cells C"], _Lookup]] = {}
-
-    def refuse_more_than(self, limit: int, found: int, what: str) -> None:
-        """Raise UnsupportedError if ``found`` is above ``limit``."""
-        if found > limit:
-            raise UnsupportedError(
-                f"the container has {found} {what}; with a limit of {self.max_gaussians} Gaussians, at most {limit} "
-                "are read: raise the limit (--max-gaussians) if you trust the container"
-            )
 
     def load(self, pool: Workers) -> None:
         """Decode all images in parallel, the slowest first."""
@@ -152,7 +193,7 @@ class _Planes:
         declared = self.layout.count
         if declared not in (None, count):
             raise InvalidContainerError(f"active_mask.webp marks {count} Gaussians; the metadata declares {declared}")
-        self.refuse_more_than(self.max_gaussians, count, "Gaussians")
+        refuse_more_than(self.max_gaussians, count, "the container")
         # No cell indices are needed if all padding is at the end.
         cells = None if mask[:count].all() else np.flatnonzero(mask)
         splats = empty_splats(count, self.coefficients) if out is None else out
@@ -201,3 +242,28 @@ def _table(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> Float64[np.n
     first, last = int(image.min()), int(image.max())
     position = (np.arange(last + 1, dtype=np.float64) - first) / max(last - first, 1)
     return np.asarray(low[:, None] + np.maximum(position, 0) * (high - low)[:, None])
+
+
+FORMAT = Codec(info=describe, read=decode)
+
+
+def _opened(files: Source, name: str) -> Container:
+    """Read the metadata of a zip, whose bytes are not kept until its images are decoded."""
+
+    def opened() -> Source:
+        return ZipSource(io.BytesIO(files.read(name, MAX_FILE_BYTES)), name)
+
+    layout = read_layout(opened())
+    if layout.count is None:
+        raise InvalidContainerError(f"{name} does not state its number of Gaussians; compress the scene again")
+    return Container(
+        count=layout.count,
+        sh_degree=layout.sh_degree,
+        antialiased=layout.antialiased,
+        ranges=layout.value_ranges,
+        stored=lambda: (name, stored_size(files, name)),
+        decode=lambda out, pool: decode_files(opened(), layout, out, pool),
+    )
+
+
+STREAMED = StreamedFormat("streamed SOG-XT scene", LEVELS_NAME, container.FORMAT, _opened)

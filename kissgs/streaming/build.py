@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -12,15 +11,18 @@ from typing import Any
 
 import numpy as np
 
+from kissgs._version import __version__
+from kissgs.cameras.captures.transforms_json import camera_as_dict, read_cameras
+from kissgs.cameras.views import black
 from kissgs.cameras.virtual.samples import MAX_VIEWS, default_view_count, sensitivity_cameras
 from kissgs.core.array_types import Float32
-from kissgs.core.positions import STREAMED_REMEDY, WORLD, Cuts, cuts_without_coarse, visible_sizes
+from kissgs.core.positions import STREAMED_REMEDY, WORLD, Cuts, cuts_without_coarse, recorded, visible_sizes
 from kissgs.core.progress import Context, Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, clean, concatenate, sampled_rows
 from kissgs.formats import ContainerName
-from kissgs.io.files import atomic_file
 from kissgs.pipeline.containers import MODELS, write_files
+from kissgs.pipeline.encoding import VIEW_UNCERTAINTY
 from kissgs.pipeline.scene_files import reading_notes
 from kissgs.planning.planner import plan_encoding, visible_gaussians
 from kissgs.rendering.camera import Camera
@@ -33,12 +35,10 @@ from kissgs.streaming.layout import (
     OUT,
     ContainerFile,
     Layout,
-    Leaf,
     chunk_file,
     environment_file,
     leaves_file,
     level_file,
-    manifest,
     read_counts,
     read_leaves,
     rows_file,
@@ -92,9 +92,6 @@ def file_settings(settings: EncodeSettings, level: int, sh_degree: int) -> Encod
 #
 # All cameras see the whole scene: the Gaussians of the file as they are, those of other chunks from a coarse level.
 
-VIEW_UNCERTAINTY = 0.55
-"""Default of the setting ``view_uncertainty``, as for all virtual cameras."""
-
 VIEWS_PER_CHUNK, MOST_VIEWS = 2, 1024
 """Least number of cameras per chunk, because a large scene needs more than the default, which falls with its size; and
 the largest number of all cameras, whose choice would take hours."""
@@ -106,29 +103,10 @@ REACH = 1.3
 """Size of the image in which a sampled Gaussian counts as seen, in units of the image's."""
 
 
-def cameras_json(cameras: WeightedCameras) -> dict[str, Any]:
-    """Return the cameras as JSON; :func:`cameras_of` reads it."""
-    return {
-        "background": cameras.background.tolist(),
-        "cameras": [
-            {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "size": [camera.width, camera.height]}
-            for camera in cameras.cameras
-        ],
-    }
-
-
-def cameras_of(document: dict[str, Any]) -> WeightedCameras:
-    """Return cameras of equal weight from their JSON."""
-    cameras = [
-        Camera(np.array(camera["viewmat"]), np.array(camera["K"]), *camera["size"]) for camera in document["cameras"]
-    ]
-    return WeightedCameras(cameras, [1.0] * len(cameras), np.array(document["background"], np.float32))
-
-
 def measure_file(
     splats: Splats,
     others: Splats,
-    cameras: WeightedCameras,
+    cameras: Sequence[Camera],
     level: int,
     settings: EncodeSettings,
     threads: int,
@@ -139,21 +117,21 @@ def measure_file(
     A level of half the Gaussians is meant for images of half the size.
     """
     size = max(MIN_SIZE, settings.sensitivity_view_size >> level)
-    shown = [_shown(camera, splats) for camera in cameras.cameras]
+    shown = [_shown(camera, splats) for camera in cameras]
     best = sorted(np.argsort(np.negative(shown), kind="stable")[:MAX_VIEWS])  # else each file would take more and more
-    seeing = [cameras.cameras[n].at_most(size) for n in best if shown[n] > 0]
+    seeing = [cameras[n].at_most(size) for n in best if shown[n] > 0]
     if not seeing:
         return Sensitivity.none(len(splats), splats.sh_degree)
-    uncertainty = VIEW_UNCERTAINTY if settings.view_uncertainty is None else settings.view_uncertainty
+    uncertainty = VIEW_UNCERTAINTY[False] if settings.view_uncertainty is None else settings.view_uncertainty
     found = measure_sensitivity(
         concatenate([splats, others]),
-        WeightedCameras(seeing, [1.0] * len(seeing), cameras.background),
+        WeightedCameras(seeing, [1.0] * len(seeing), black()),
         view_uncertainty=uncertainty,
         threads=threads,
         progress=progress,
     )
     own = _rows(found, slice(len(splats)))
-    share = np.float32(len(seeing) / len(cameras.cameras))  # the mean is over the images of all cameras
+    share = np.float32(len(seeing) / len(cameras))  # the mean is over the images of all cameras
     for values in (own.position_hessian, own.shape_hessian, own.color_weight, own.prior):
         values *= share
     return own
@@ -276,10 +254,11 @@ def leaf_size(total: int, chunks: int, levels: int) -> int:
 def make_levels(work: Path, layout: Layout, chunk: int, threads: int, progress: Progress = silent) -> None:
     """Merge a chunk into its levels, one file of rows each; ``progress`` receives "merge"."""
     rows = read_rows(chunk_file(work, chunk), layout.sh_degree, layout.counts[chunk])
-    made = chunk_levels(from_rows(rows, antialiased=layout.antialiased), layout.levels, layout.leaf, threads, progress)
-    for level, splats in enumerate(made.levels):
-        write_rows(level_file(work, chunk, level), to_rows(splats))
-    write_json(leaves_file(work, chunk), {"counts": made.counts, "bounds": made.bounds.tolist(), "errors": made.errors})
+    splats = from_rows(rows, antialiased=layout.antialiased)
+    levels, leaves = chunk_levels(splats, layout.levels, layout.leaf, threads, progress)
+    for level, merged in enumerate(levels):
+        write_rows(level_file(work, chunk, level), to_rows(merged))
+    write_json(leaves_file(work, chunk), leaves)
     chunk_file(work, chunk).unlink(missing_ok=True)
 
 
@@ -293,7 +272,7 @@ def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: 
     views = settings.sensitivity_views or max(default_view_count(total), least)
     size = settings.sensitivity_view_size
     cameras = sensitivity_cameras(coarsest, None, Context(threads), count=views, size=size)
-    write_json(work / CAMERAS, cameras_json(cameras))
+    write_json(work / CAMERAS, [camera_as_dict(camera) for camera in cameras.cameras])
 
 
 def make_file(
@@ -313,7 +292,7 @@ def make_file(
         sensitivity = None
         if settings.rate_distortion:
             others = _others(work, layout, file)
-            cameras = cameras_of(json.loads((work / CAMERAS).read_bytes()))
+            cameras = [view.camera for view in read_cameras(work / CAMERAS)]
             sensitivity = measure_file(splats, others, cameras, file.level, settings, threads, progress)
             del others
         context = Context(threads, progress=progress)
@@ -375,28 +354,53 @@ def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -
 
 
 def make_manifest(work: Path, layout: Layout) -> None:
-    """Write the manifest of all files."""
-    lods: dict[tuple[int, int], dict[int, tuple[int, int, int]]] = {}
-    filenames: list[str] = []
+    """Write the manifest: a tree over space, whose leaves name their rows in the files of each level."""
+    lods: dict[tuple[int, int], dict[int, dict[str, int]]] = {}
+    filenames, totals = list[str](), [0] * layout.levels
+    leaves_of = {chunk: read_leaves(work, chunk) for chunk in layout.filled}
     for file in layout.files():
-        counts = read_counts(work, file.name)["counts"]
-        leaves_of_file = [
-            (chunk, leaf) for chunk in file.chunks for leaf in range(len(read_leaves(work, chunk)["bounds"]))
-        ]
         offset = 0
-        for leaf_of_chunk, count in zip(leaves_of_file, counts, strict=True):
+        own = [(chunk, leaf) for chunk in file.chunks for leaf in range(len(leaves_of[chunk]["bounds"]))]
+        for leaf_of_chunk, count in zip(own, read_counts(work, file.name)["counts"], strict=True):
             if count:
-                lods.setdefault(leaf_of_chunk, {})[file.level] = (len(filenames), offset, count)
+                rows = {"file": len(filenames), "offset": offset, "count": count}
+                lods.setdefault(leaf_of_chunk, {})[file.level] = rows
             offset += count
-        if any(counts):
+        if offset:
             filenames.append(layout.entry(file.name))
+        totals[file.level] += offset
     leaves = []
-    for chunk in layout.filled:
-        own = read_leaves(work, chunk)
-        for leaf, (bounds, errors) in enumerate(zip(own["bounds"], own["errors"], strict=True)):
+    for chunk, own_leaves in leaves_of.items():
+        for leaf, (corners, errors) in enumerate(zip(own_leaves["bounds"], own_leaves["errors"], strict=True)):
             if (chunk, leaf) in lods:  # some Gaussian of it is visible
-                leaves.append(Leaf(np.array(bounds), dict(sorted(lods[chunk, leaf].items())), errors))
-    environment = layout.entry(ENVIRONMENT) if (work / OUT / layout.path(ENVIRONMENT)).exists() else None
-    containers = FORMAT if layout.container == "sogxt" else None
-    with atomic_file(work / OUT / layout.manifest, overwrite=True) as out:
-        out.write(manifest(leaves, layout.levels, filenames, environment, containers, layout.origin))
+                low, high = ([float(f"{value:.7g}") for value in corner] for corner in corners)
+                levels = {str(level): rows for level, rows in sorted(lods[chunk, leaf].items())}
+                leaves.append({"bound": {"min": low, "max": high}, "lods": levels, "errors": errors})
+    has_environment = (work / OUT / layout.path(ENVIRONMENT)).exists()
+    document = {
+        "version": 1,
+        **({"format": FORMAT} if layout.container == "sogxt" else {}),
+        "asset": {"generator": f"kissgs {__version__}"},
+        **({"kissgs": own_origin} if (own_origin := recorded(layout.origin)) else {}),
+        "count": totals[0],
+        "counts": totals,
+        "lodLevels": layout.levels,
+        "lodErrors": True,
+        **({"environment": layout.entry(ENVIRONMENT)} if has_environment else {}),
+        "filenames": filenames,
+        "tree": _node(leaves),
+    }
+    write_json(work / OUT / layout.manifest, document)
+
+
+def _node(leaves: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return a leaf, or a node with two halves of the leaves."""
+    if len(leaves) == 1:
+        return leaves[0]
+    middle = len(leaves) // 2
+    children = [_node(leaves[:middle]), _node(leaves[middle:])]
+    low, high = (
+        [pick(pair) for pair in zip(*(child["bound"][end] for child in children), strict=True)]
+        for end, pick in (("min", min), ("max", max))
+    )
+    return {"bound": {"min": low, "max": high}, "children": children}

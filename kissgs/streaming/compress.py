@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,23 +23,10 @@ from kissgs.io.files import reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_level, stored_bytes
-from kissgs.runners import Runner
-from kissgs.settings import Settings
+from kissgs.runners import Resources, Runner, WorkItem, error_of
+from kissgs.settings import EncodeSettings, Settings
 from kissgs.streaming import build
 from kissgs.streaming.build import Blocks
-from kissgs.streaming.items import (
-    Item,
-    check_destination,
-    check_space,
-    claimed,
-    explaining_full_disks,
-    finish,
-    megabytes,
-    needed_bytes,
-    read_json,
-    remove,
-    run_all,
-)
 from kissgs.streaming.layout import (
     CAMERAS,
     ENVIRONMENT,
@@ -46,9 +34,22 @@ from kissgs.streaming.layout import (
     PARTITION,
     Layout,
     keep_layout,
+    leaves_file,
     read_layout,
+    rows_file,
     work_folder,
     write_json,
+)
+from kissgs.streaming.levels import row_bytes
+from kissgs.streaming.work_folder import (
+    check_destination,
+    check_space,
+    claimed,
+    finish,
+    megabytes,
+    needed_bytes,
+    read_json,
+    remove,
 )
 
 # ``with_time_left``: progress events of the work items of a streamed scene, with an estimate of the time left.
@@ -93,9 +94,6 @@ def duration(seconds: float) -> str:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
-
-WORK_LAYOUT = 4
-"""Version of the files in the work folder; another one's are not continued."""
 
 REPORT = "report.json"
 """File of the work folder: the report, once everything is made."""
@@ -180,7 +178,7 @@ def compress_streamed(
     _check_settings(settings)
     if read_json(work / REPORT) is None:
         check_destination(manifest, source, overwrite=overwrite)
-    with claimed(work, {"container": container, **_identity(source, settings, reading)}), explaining_full_disks(work):
+    with claimed(work, {"container": container, **_identity(source, settings, reading)}):
         if (found := read_json(work / REPORT)) is None:
             layout = _partition(work, source, container, settings, reading, threads, progress)
             found = asdict(_make(work, layout, settings, runner, threads, progress))
@@ -196,30 +194,97 @@ def _make(
     encode = settings.encode
     report = with_time_left(progress, encode.rate_distortion)
 
-    def run(stage: str, items: list[Item]) -> None:
-        left = [item for item in items if not item.done]
-        done = 1 - len(left) / len(items)
+    def run(stage: str, key: str, values: Sequence[int | str]) -> None:
+        own_threads = threads if runner is None else max(1, threads)
+        shared = {"work": str(work.absolute()), "settings": encode.model_dump(mode="json"), "threads": own_threads}
+        items = [item for value in values if not _is_made(item := {**shared, key: value})]
+        done = 1 - len(items) / len(values)
 
         def part(fraction: float) -> None:
             report(stage, done + fraction * (1 - done))
 
-        if runner is not None:
-            run_all(runner, left, layout, threads, part)
+        if runner is not None and items:
+            _run_all(runner, items, layout, part)
             return
-        for at, item in enumerate(left):
-            part(at / len(left))
-            context = Context(progress=lambda _, now, note="", at=at: part((at + now) / len(left)))
-            item.run(threads, context.stage(stage).progress)
+        for at, item in enumerate(items):
+            part(at / len(items))
+            context = Context(progress=lambda _, now, note="", at=at: part((at + now) / len(items)))
+            run_item(item, context.stage(stage).progress)
 
-    item = partial(Item, str(work.absolute()), encode.model_dump(mode="json"))
-    run("merge", [item(chunk=chunk) for chunk in layout.filled])
+    run("merge", "chunk", layout.filled)
     if encode.rate_distortion and not (work / CAMERAS).exists():
         report("cameras", 0.0)
         build.make_cameras(work, layout, encode, threads)
-    run("images", [item(file=file.name) for file in layout.all_files()])
+    run("images", "file", [file.name for file in layout.all_files()])
     report("images", 1.0)
     build.make_manifest(work, layout)
     return _report(work, layout)
+
+
+# Work items: the levels of a chunk ("chunk"), or a container of the result ("file"). Those of a step do not depend on
+# each other. One that is run twice, because its node was given up, writes the same bytes again.
+
+PROCESS_BYTES = 500_000_000
+"""Memory of an item for libraries, bytes."""
+
+MEMORY_RATIO = 5
+"""Memory of an item for each byte of the Gaussians of its file as float32."""
+
+POLL_SECONDS = 0.5
+"""Seconds between reports of progress, which may also stop the work."""
+
+
+def _is_made(item: dict[str, Any]) -> bool:
+    work = Path(item["work"])
+    return (leaves_file(work, item["chunk"]) if "chunk" in item else rows_file(work, item["file"])).exists()
+
+
+def run_item(item: dict[str, Any], progress: Progress) -> dict[str, Any]:
+    """Run an item, here or on a node, unless it is made.
+
+    A node that was given up may still be at work: what it completes meanwhile, it takes the input of.
+    """
+    work, threads = Path(item["work"]), item["threads"]
+    if read_json(work / PARTITION) is None:
+        raise UnsupportedError(
+            f"the machine {socket.gethostname()} does not see {work}; "
+            "--ray needs storage that all machines see at the same path"
+        )
+    layout, settings = read_layout(work), EncodeSettings.model_validate(item["settings"])
+    if _is_made(item):
+        return {}
+    try:
+        if "chunk" in item:
+            build.make_levels(work, layout, item["chunk"], threads, progress)
+        else:
+            file = next(each for each in layout.all_files() if each.name == item["file"])
+            build.make_file(work, layout, settings, file, threads, progress)
+    except OutputError:
+        if not _is_made(item):
+            raise
+    return {}
+
+
+def _run_all(runner: Runner, items: list[dict[str, Any]], layout: Layout, report: Callable[[float], None]) -> None:
+    """Run items and wait for them; if one fails, or the caller is stopped, the others are cancelled."""
+    memory = PROCESS_BYTES + MEMORY_RATIO * max(layout.counts) * row_bytes(layout.sh_degree)
+    requested = Resources(cpus=items[0]["threads"], memory=memory)
+    if refusal := runner.refusal(requested):
+        raise UnsupportedError(f"{refusal}; choose another number with --threads")
+    handles = [runner.submit(WorkItem(f"{__name__}:run_item", item, requested)) for item in items]
+    waiting = {handle.outcome for handle in handles}
+    try:
+        while waiting:
+            report(1 - len(waiting) / len(items))
+            done, waiting = wait(waiting, POLL_SECONDS, FIRST_COMPLETED)
+            for each in done:
+                if each.result().kind != "done":
+                    raise error_of(each.result())
+    except BaseException:
+        for handle in handles:
+            runner.cancel(handle.id)
+        wait([handle.outcome for handle in handles])
+        raise
 
 
 def _check_settings(settings: Settings) -> None:
@@ -262,7 +327,6 @@ def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[st
         raise InvalidSceneError(f"cannot read {source}: {reason_of(error)}") from error
     return {
         "version": __version__,
-        "layout": WORK_LAYOUT,
         "source": path,
         "bytes": status.st_size,
         "modified_ns": status.st_mtime_ns,

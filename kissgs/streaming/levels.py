@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,11 +56,8 @@ def from_rows(rows: Float32[np.ndarray, "N F"], *, antialiased: bool) -> Splats:
 
 def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
     """Append rows to a file."""
-    try:
-        with path.open("ab") as file:
-            file.write(np.ascontiguousarray(rows).data)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
+    with _explained("write", path), path.open("ab") as file:
+        file.write(np.ascontiguousarray(rows).data)
 
 
 def write_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
@@ -69,23 +68,25 @@ def write_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
 
 def sync(path: Path) -> None:
     """Wait until a file is on the disk."""
-    try:
-        with path.open("ab") as file:
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
+    with _explained("write", path), path.open("ab") as file:
+        os.fsync(file.fileno())
 
 
 def read_rows(path: Path, sh_degree: int, count: int) -> Float32[np.ndarray, "N F"]:
     """Read a file of ``count`` rows."""
-    try:
-        values = np.fromfile(path, np.float32)
-        size = path.stat().st_size
-    except OSError as error:
-        raise OutputError(f"cannot read {path}: {reason_of(error)}") from error
+    with _explained("read", path):
+        values, size = np.fromfile(path, np.float32), path.stat().st_size
     if size != count * row_bytes(sh_degree):
         raise OutputError(f"{path} is not complete; delete {path.parent} and start again")
     return values.reshape(count, row_bytes(sh_degree) // 4)
+
+
+@contextlib.contextmanager
+def _explained(what: str, path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"cannot {what} {path}: {reason_of(error)}") from error
 
 
 def halvings(count: int, most: int) -> int:
@@ -160,18 +161,13 @@ MERGING = 0.7
 """Share of merging in the time for the levels of a chunk; the rest measures their errors."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ChunkLevels:
-    """The levels of a chunk."""
+def chunk_levels(
+    chunk: Splats, levels: int, leaf: int, threads: int, progress: Progress = silent
+) -> tuple[list[Splats], dict[str, Any]]:
+    """Split a chunk into leaves and merge each to half its Gaussians for every further level.
 
-    levels: list[Splats]
-    counts: list[list[int]]
-    bounds: Float64[np.ndarray, "leaves 2 3"]
-    errors: list[list[float]]
-
-
-def chunk_levels(chunk: Splats, levels: int, leaf: int, threads: int, progress: Progress = silent) -> ChunkLevels:
-    """Split a chunk into leaves and merge each to half its Gaussians for every further level."""
+    Returned are the levels, and the counts by level, the bounds and the errors of the leaves, as JSON.
+    """
     order, edges = leaf_groups(chunk.means, leaf)
     with Workers(threads) as pool:
         leaves = pool.map(
@@ -180,12 +176,9 @@ def chunk_levels(chunk: Splats, levels: int, leaf: int, threads: int, progress: 
             lambda fraction: progress("merge", MERGING * fraction),
         )
         errors = pool.map(level_errors, leaves, lambda fraction: progress("merge", MERGING + (1 - MERGING) * fraction))
-    return ChunkLevels(
-        [concatenate([own[level] for own in leaves]) for level in range(levels)],
-        [[len(own[level]) for own in leaves] for level in range(levels)],
-        np.stack([bounds(concatenate(own)) for own in leaves]),
-        errors,
-    )
+    counts = [[len(own[level]) for own in leaves] for level in range(levels)]
+    stated = {"counts": counts, "bounds": [bounds(concatenate(own)).tolist() for own in leaves], "errors": errors}
+    return [concatenate([own[level] for own in leaves]) for level in range(levels)], stated
 
 
 def _leaf_levels(leaf: Splats, levels: int) -> list[Splats]:

@@ -191,6 +191,7 @@ def test_every_preset_accepts_views(folder: Path, tmp_path: Path, preset: str) -
 
 
 @pytest.mark.parametrize("preset", ["fast", "paper"])
+@pytest.mark.quick(1)
 def test_views_do_not_change_the_bytes_of_presets_that_render_no_images(folder: Path, preset: str) -> None:
     settings = kissgs.Settings.from_preset(preset)
     views = kissgs.load_views(folder / "capture")

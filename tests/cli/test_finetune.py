@@ -18,6 +18,7 @@ OPTIONS = [word for name, value in CHANGES.items() for word in ("--set", f"{name
 
 
 @pytest.mark.parametrize("container", ["sogxt", "sog"])
+@pytest.mark.quick(1)
 def test_output_and_report_are_those_of_the_library(folder: Path, tmp_path: Path, container: str) -> None:
     target = tmp_path / ("b.zip" if container == "sogxt" else "b.sog")
     words = ["compress", "--finetune", "6", folder / "a.ply", "-o", target, *OPTIONS]

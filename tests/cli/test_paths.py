@@ -113,6 +113,7 @@ def test_invalid_paths_give_one_line(kind: str, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["too long", "a folder that is too long", "within a file", "missing/inner"])
+@pytest.mark.quick(2)
 def test_the_error_names_the_input(kind: str, folder: Path) -> None:
     """Regression: the error named the output, whose path is derived from the input."""
     for words in ("compress BAD", "compress BAD other.ply -o out/", "decompress BAD", "render BAD"):
@@ -130,7 +131,7 @@ def test_a_name_that_is_too_long_with_another_ending(folder: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", ["a\0b", "loop", "\0.zip", "a" * 300])
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_the_library_raises_its_own_errors(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     kept = "loop/x" if name == "loop" else name  # a link is replaced, wherever it leads

@@ -222,7 +222,7 @@ def test_the_clock_of_the_progress_bar_runs_through_all_stages(
 
 
 @pytest.mark.parametrize("torch", ["", "import sys; sys.modules['torch'] = None; "], ids=["torch", "no torch"])
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_warmup_compiles_all_kernels(torch: str, tmp_path: Path) -> None:
     """A kernel compiles at its first call, so that one that is not loaded here is compiled later."""
     home = Path(kissgs.__file__).parents[1]

@@ -1,11 +1,16 @@
 """Kernels are compiled by the first process or loaded from the cache, and never again while a command works."""
 
+import ast
 import os
 import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import numba
+import pytest
+
+import kissgs
 
 PROGRAM = """
 import importlib, pkgutil, sys, tempfile
@@ -38,6 +43,26 @@ kissgs.compact(scene, settings=merged)
 """
 
 
+def decorators_of(node):
+    """Return the names of a function's decorators."""
+    return {name.id for each in getattr(node, "decorator_list", []) for name in ast.walk(each) if hasattr(name, "id")}
+
+
+def test_functions_without_a_signature_are_called_by_kernels_alone():
+    """Kernels compile nothing but their signature, and are cached. Oracle: the syntax trees of the modules."""
+    texts = [path.read_text(encoding="utf-8") for path in Path(kissgs.__file__).parent.rglob("*.py")]
+    trees = [ast.parse(text) for text in texts if "njit" in text]
+    bare = 0
+    for tree in trees:
+        names = {node.name for node in tree.body if "njit" in decorators_of(node)}
+        bare += len(names)
+        for node in tree.body:
+            if not decorators_of(node) & {"compiled", "njit"}:
+                assert names.isdisjoint(name.id for name in ast.walk(node) if isinstance(name, ast.Name)), node.lineno
+    assert bare > 5
+
+
+@pytest.mark.quick(0)
 def test_no_kernel_is_compiled_while_a_scene_is_compressed():
     """Regression: one without a signature was compiled by every process, not only by the first with an empty cache."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
@@ -62,6 +87,7 @@ print(hashlib.sha256(gradient.tobytes()).hexdigest())
 """
 
 
+@pytest.mark.quick(0)
 def test_results_do_not_depend_on_whether_kernels_come_from_the_cache(tmp_path):
     """Regression: the process that compiled the kernels of SSIM rounded its gradient in another way than later ones."""
     paths = os.pathsep.join(path for path in sys.path if path)

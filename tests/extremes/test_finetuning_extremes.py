@@ -50,7 +50,7 @@ def test_worlds_of_any_size(size):
     ("count", "degree", "container"),
     [(1, 0, "sog"), (0, 2, "sogxt"), (1, 3, "sogxt"), (2, 1, "sog"), (7, 1, "sogxt"), (8, 2, "sog"), (9, 3, "sogxt")],
 )
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_few_gaussians_of_any_degree(count, degree, container):
     result = check(cloud(9, degree, seed=count).select(np.arange(count)), container=container, steps=5)
     assert len(result.order) <= count

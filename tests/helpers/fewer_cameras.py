@@ -1,4 +1,4 @@
-"""Fewer camera candidates, for faster tests."""
+"""Fewer camera candidates and smaller images, for faster tests."""
 
 from kissgs.cameras.virtual import candidates, select
 
@@ -9,3 +9,16 @@ def try_fewer(patch, azimuths=8, radii=(1.1, 2.6)):
     for module in (candidates, select):
         patch.setattr(module, "INSIDE_DIRECTIONS", 4)
         patch.setattr(module, "ORBIT_RADII", radii)
+
+
+def evaluate_smaller(patch, *, searches):
+    """Reduce the images of evaluations, and where ``searches`` also those that a search compares, and their number."""
+    from kissgs.evaluation import cameras
+
+    patch.setattr(cameras, "WIDTH", 96)
+    patch.setattr(cameras, "HEIGHT", 72)
+    if searches:
+        from kissgs.compaction import budget
+
+        patch.setattr(budget, "COUNT", 8)
+        patch.setattr(budget, "SIDE", 96)

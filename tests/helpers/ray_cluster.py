@@ -27,7 +27,7 @@ from pathlib import Path
 
 class Patch(MetaPathFinder):
     def find_spec(self, name, path, target=None):
-        if name != "kissgs.runners.file_transfer":
+        if name != "kissgs.runners.ray_node":
             return None
         spec = PathFinder.find_spec(name, path)
         run = spec.loader.exec_module

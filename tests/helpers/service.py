@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import copy
+import functools
 import io
 import json
 import logging
@@ -34,6 +35,7 @@ from service.jobs.container import ServiceContainer
 ROOT = Path(__file__).parents[2]
 
 
+@functools.cache
 def scene_bytes(gaussians=300, degree=1, seed=0):
     file = io.BytesIO()
     write_ply(file, kissgs.sample_scene(gaussians, sh_degree=degree, seed=seed))

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import kissgs
 from helpers.reference_sog import sog_files, sog_folder, streamed_files
 from kissgs import Settings
+from kissgs.sog.decode import STREAMED as SOG_FORMAT
 from kissgs.sog.decode import decode as decode_sog
-from kissgs.sog.scenes import STREAMED as SOG_FORMAT
+from kissgs.sogxt.decode import STREAMED as SOGXT_FORMAT
 from kissgs.sogxt.decode import decode as decode_sogxt
-from kissgs.sogxt.scenes import STREAMED as SOGXT_FORMAT
 from kissgs.streaming import build
 
 ALL = Settings.research("fast", prune_invisible=False)

@@ -40,6 +40,12 @@ def scene_of(count, degree=0, seed=0, **replaced):
 
 
 @functools.cache
+def levels_of(data):
+    """Return the pixels of an image, which many tests compare with."""
+    return pillow(data)
+
+
+@functools.cache
 def container(preset="fast", degree=3, count=65):
     """Return a container as files by name."""
     settings = kissgs.Settings.research(preset, sensitivity_views=4, sensitivity_view_size=48)
@@ -101,7 +107,7 @@ def assert_scene(answer, files):
     """Assert that a result equals that of kissgs and Pillow; return the largest difference of floats, ulps."""
     assert "error" not in answer, answer["error"]
     meta = json.loads(files["meta.json"])
-    images = {name: pillow(files[name]) for name in IMAGES}
+    images = {name: levels_of(files[name]) for name in IMAGES}
     mask = images["active_mask.webp"][:, :, 0].ravel() > 0
     cells = np.flatnonzero(mask)
     side = meta["shN"]["centroidSide"]

@@ -26,8 +26,7 @@ from helpers.reference_spz import spz_bytes
 from helpers.splat_transform import convert, needs_splat_transform
 
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
-from kissgs.io.gltf import read_gltf
-from kissgs.io.gltf_document import write_glb, write_spz_glb
+from kissgs.io.gltf import read_gltf, write_glb, write_spz_glb
 from kissgs.io.ksplat import read_ksplat
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.io.scene_format import ReadOptions

@@ -142,7 +142,7 @@ IN_SOG = {
 
 @pytest.mark.parametrize(("files", "name", "data"), IN_SOG.values(), ids=IN_SOG)
 def test_damaged_files_of_sog(files, name, data):
-    check_all(data, lambda damaged: decode_sog({**files, name: damaged}, max_gaussians=100_000, threads=1))
+    check_all(data, lambda damaged: decode_sog({**files, name: damaged}, LIMITED, threads=1))
 
 
 def test_damage_inside_png():

@@ -65,10 +65,6 @@ def test_json_with_a_buffer_inside_or_beside(tmp_path):
         (tmp_path / "scene.gltf").write_text(json.dumps(root))
         with pytest.raises(UnsupportedError, match=r"names a buffer outside its folder; put the file beside it"):
             read_gltf(tmp_path / "scene.gltf")
-    (tmp_path / "Schlo\u0308\u00df.bin").write_bytes(buffer)
-    root["buffers"][0]["uri"] = "Schl\u00f6\u00df.bin"  # as archives of macOS change names
-    (tmp_path / "scene.gltf").write_text(json.dumps(root))
-    assert len(read_gltf(tmp_path / "scene.gltf")) == 20
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -149,77 +145,25 @@ def test_several_primitives_and_nodes():
     root, buffer = document(attributes(scene))
     root["meshes"].append({"primitives": [{"attributes": {}}]})  # another mesh, without Gaussians
     root["meshes"][0]["primitives"] *= 2
-    hidden = {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}
-    root["nodes"] = [{"mesh": 0}, {"mesh": 1}, {"mesh": 0}, hidden]
-    root["scenes"] = [{"nodes": [0, 1, 2, 3]}]
+    root["nodes"] = [{"mesh": 0}, {"mesh": 1}, {"mesh": 0}]
+    root["scenes"] = [{"nodes": [0, 1, 2]}]
     root["animations"] = [{}]
     root["meshes"][0]["primitives"][0]["attributes"]["_LABEL"] = 0
     found = read_gltf(glb_bytes(root, buffer))
     assert len(found) == 16
-    assert found.notes == ("left out: animations, _LABEL, meshes without Gaussians, hidden nodes",)
+    assert found.notes == ("left out: animations, _LABEL, meshes without Gaussians",)
     np.testing.assert_allclose(found.means, np.tile(scene.means, (4, 1)), atol=1e-6)
     with pytest.raises(UnsupportedError, match=r"has 16 Gaussians; the limit is 15"):
         read_gltf(glb_bytes(root, buffer), ReadOptions(max_gaussians=15))
 
 
-def instanced(root, buffer, **columns):
-    """Add EXT_mesh_gpu_instancing to the first node; columns are rows of floats, or of normalised bytes as ints."""
-    attributes = {}
-    for name, rows in columns.items():
-        code = "f" if isinstance(rows[0][0], float) else "b"
-        data = b"".join(struct.pack(f"<{len(row)}{code}", *row) for row in rows)
-        root["bufferViews"].append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)})
-        accessor = {"componentType": 5126 if code == "f" else 5120, "count": len(rows), "type": f"VEC{len(rows[0])}"}
-        accessor |= {"bufferView": len(root["bufferViews"]) - 1, "normalized": code == "b"}
-        root["accessors"].append(accessor)
-        attributes[name], buffer = len(root["accessors"]) - 1, buffer + data
-    root["buffers"][0]["byteLength"] = len(buffer)
-    root["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
-    return root, buffer
-
-
-def test_what_is_drawn_otherwise_is_named():
+def test_what_is_left_out_is_named():
     root, buffer = document(attributes(made_scene(4, 0, extremes=False)))
     root["scenes"].append({"nodes": [0]})
     root["asset"] = {"version": "2.1"}
     root["extensionsUsed"] = [NAME, "CESIUM_RTC", "KHR_materials_unlit"]
-    splatting(root)["projection"] = "orthographic"
     found = read_gltf(glb_bytes(root, buffer))
-    assert found.notes == ("left out: extension CESIUM_RTC, other scenes, projection 'orthographic'",)
-
-
-@pytest.mark.parametrize("required", [True, False])
-def test_instances_are_nodes_below_their_node(required):
-    """Expected is what a file with a child node for each instance gives."""
-    scene = made_scene(5, 1, extremes=False)
-    root, buffer = document(attributes(scene))
-    root["extensionsRequired"] = ["EXT_mesh_gpu_instancing"] * required
-    outer = {"translation": [1, 2, 3], "rotation": [0, 0, np.sin(0.3), np.cos(0.3)]}
-    root["nodes"] = [{"mesh": 0} | outer]
-    wanted = copy.deepcopy(root)
-    turns = ([0, 127, 0, 0], [0, 0, 90, 90])
-    found = read_gltf(glb_bytes(*instanced(root, buffer, TRANSLATION=[[0.0] * 3, [5.0, 0.0, 0.0]], ROTATION=turns,
-                                           SCALE=[[2.0] * 3, [0.5] * 3], _ID=[[7.0, 0.0, 0.0]] * 2)))  # fmt: skip
-    children = [
-        {"mesh": 0, "rotation": [0, 1, 0, 0], "scale": [2] * 3},
-        {"mesh": 0, "translation": [5, 0, 0], "rotation": [0, 0, 0.5**0.5, 0.5**0.5], "scale": [0.5] * 3},
-    ]
-    wanted["nodes"] = [outer | {"children": [1, 2]}, *children]
-    wanted["extensionsRequired"] = []
-    assert_alike(found, read_gltf(glb_bytes(wanted, buffer)), rtol=1e-5, atol=1e-5)
-
-
-def test_instances_are_bounded():
-    root, buffer = document(attributes(SCENE))
-    with pytest.raises(UnsupportedError, match=r"shows a mesh 1,001 times; 1,000 instances are read"):
-        describe(glb_bytes(*instanced(root, buffer, TRANSLATION=[[0.0] * 3] * 1001)))
-    root["nodes"] *= 300
-    root["scenes"][0]["nodes"] = list(range(300))
-    for primitives in (root["meshes"][0]["primitives"], []):
-        root["meshes"][0]["primitives"] = primitives
-        data = glb_bytes(*instanced(copy.deepcopy(root), buffer, TRANSLATION=[[0.0] * 3] * 1000))
-        with pytest.raises(InvalidSceneError, match=r"show more than 1,000 primitives"):
-            describe(data)
+    assert found.notes == ("left out: extension CESIUM_RTC, other scenes",)
 
 
 def test_quantised_positions():
@@ -264,52 +208,45 @@ def splatting(root):
 
 PLAIN = glb_bytes(ROOT, BUFFER)
 CHANGES = {
-    "requires the extension 'VENDOR_unknown', which is not read; export it without": changed(
+    "needs the extension 'VENDOR_unknown', which is not read; export it without": changed(
         lambda r: r.update(extensionsRequired=[NAME, "VENDOR_unknown"])
     ),
-    "is not valid glTF: extensionsRequired is not a list of names": changed(lambda r: r.update(extensionsRequired=[1])),
-    "is compressed by 'KHR_meshopt_compression'; export it without": changed(
+    "is not valid glTF: extensionsRequired is not a list": changed(lambda r: r.update(extensionsRequired={})),
+    "needs the extension 'KHR_meshopt_compression', which": changed(
         lambda r: r.update(extensionsRequired=["KHR_meshopt_compression"])
     ),
-    "is compressed by 'EXT_meshopt_compression'; export it without": changed(meshopt),
-    "is compressed by 'EXT_meshopt_compression'; export": changed(optional_meshopt),
-    "is compressed by 'KHR_draco_mesh_compression'; export it without or": changed(
+    "buffers[1] has no data": changed(meshopt),
+    "needs the extension 'EXT_meshopt_compression', which": changed(optional_meshopt),
+    "needs the extension 'KHR_draco_mesh_compression', which": changed(
         lambda r: primitive(r)["extensions"].update(KHR_draco_mesh_compression={"bufferView": 0})
     ),
     "is glTF of version '1.0'; export it as glTF 2.0": changed(lambda r: r.update(asset={"version": "1.0"})),
-    "is glTF of version '2.1'; export it as glTF 2.0": changed(
-        lambda r: r.update(asset={"version": "2.0", "minVersion": "2.1"})
-    ),
-    "shows none of its Gaussians: no visible node of its scene": changed(lambda r: r["scenes"][0].update(nodes=[])),
-    "is compressed by 'KHR_draco_mesh_compression'; export it without": changed(
-        lambda r: r.update(extensionsRequired=["KHR_draco_mesh_compression"])
-    ),
-    "the attributes of EXT_mesh_gpu_instancing have different counts": changed(
+    "has no Gaussians: no mesh of its scene uses KHR": changed(lambda r: r["scenes"][0].update(nodes=[])),
+    "needs the extension 'EXT_mesh_gpu_instancing', which": changed(
         lambda r: r["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}})
+    ),
+    "needs the extension 'KHR_node_visibility', which": changed(
+        lambda r: r["nodes"][0].update(extensions={"KHR_node_visibility": {"visible": False}})
     ),
     "read as glTF, is not readable JSON; export the scene again": b"{",
     "has more than 262,144 values": b'{"nodes": [' + b"0," * 262_144 + b"0]}",
     "is cut short: it needs": PLAIN[:-1],
     "is GLB of version 1; version 2 is read": PLAIN[:4] + b"\1" + PLAIN[5:],
     "is not valid GLB: its first chunk is not JSON; export it again": PLAIN[:16] + b"BIN\0" + PLAIN[20:],
-    "has no Gaussians: none of its meshes uses KHR_gaussian_splatting": changed(
+    "has no Gaussians: no mesh of its scene uses KHR_gaussian_splatting": changed(
         lambda r: primitive(r).pop("extensions")
     ),
-    "has the kernel 'cube'; only 'ellipse' is read": changed(lambda r: splatting(r).update(kernel="cube")),
-    "has the colour space 'lin_rec709_display'": changed(
-        lambda r: splatting(r).update(colorSpace="lin_rec709_display")
-    ),
-    "is compressed by 'X'; export it without or with .spz": changed(
-        lambda r: splatting(r).update(extensions={"X": {}})
-    ),
+    "has the kernel 'cube'; export it with 'ellipse'": changed(lambda r: splatting(r).update(kernel="cube")),
+    "has the colorSpace 'lin_rec709_display'": changed(lambda r: splatting(r).update(colorSpace="lin_rec709_display")),
+    "needs the extension 'X', which is not read": changed(lambda r: splatting(r).update(extensions={"X": {}})),
     "a primitive has no POSITION": changed(lambda r: primitive(r)["attributes"].pop("POSITION")),
     "a primitive has no KHR_gaussian_splatting:SCALE": changed(
         lambda r: primitive(r)["attributes"].pop(f"{NAME}:SCALE")
     ),
-    "it lacks KHR_gaussian_splatting:SH_DEGREE_1_COEF_2": changed(
+    "a primitive has no KHR_gaussian_splatting:SH_DEGREE_1_COEF_2": changed(
         lambda r: primitive(r)["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_2")
     ),
-    "has an SH degree above 3; export it with degree 3 or lower": changed(
+    "has SH degree 4; export it with degree 3 or lower": changed(
         lambda r: primitive(r)["attributes"].update({f"{NAME}:SH_DEGREE_4_COEF_0": 0})
     ),
     "has 3 values for 4 Gaussians": changed(lambda r: r["accessors"][1].update(count=3)),

@@ -17,7 +17,7 @@ from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import silent
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.formats import FORMATS
-from kissgs.io import conventions, gltf_document
+from kissgs.io import conventions, gltf
 from kissgs.io.conventions import morton_order
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS
 from kissgs.io.splat import ROW
@@ -299,9 +299,9 @@ def test_a_naive_parser_finds_the_scene_in_glb(count, degree):
 @pytest.mark.parametrize("ending", [".glb", ".spz.glb"])
 def test_glb_ends_at_4_gib(ending, monkeypatch):
     size = len(written(made_scene(5, 1), ending)[0])
-    monkeypatch.setattr(gltf_document, "_MAX_BYTES", size)
+    monkeypatch.setattr(gltf, "MAX_GLB_BYTES", size)
     assert struct.unpack_from("<I", written(made_scene(5, 1), ending)[0], 8) == (size,)
-    monkeypatch.setattr(gltf_document, "_MAX_BYTES", size - 1)
+    monkeypatch.setattr(gltf, "MAX_GLB_BYTES", size - 1)
     with pytest.raises(UnsupportedError, match=r"^5 Gaussians take [\d,]+ bytes, and \.glb ends at 4 GiB; write"):
         written(made_scene(5, 1), ending)
 

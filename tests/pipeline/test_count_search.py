@@ -45,33 +45,29 @@ def test_the_note_of_a_search_precedes_that_of_its_work():
     assert [note for _, _, note in events] == ["", "try 2", "try 2; loss 0.2"]
 
 
-@pytest.mark.parametrize("allowed", [0.1, 1.0])  # 256 levels per value already lose 0.07 dB here
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"max_psnr_drop": 0.1},  # 256 levels per value already lose 0.07 dB here
+        {"max_psnr_drop": 1.0},
+        {"max_ssim_drop": 0.01},
+        {"max_ssim_drop": 0.01, "max_psnr_drop": 0.15},
+    ],
+)
 @pytest.mark.quick(1)
-def test_a_drop_is_met(allowed):
-    chosen = Settings.research("balanced", max_psnr_drop=allowed, **FEW_VIEWS)
-    found = kissgs.compress(SCENE, settings=chosen, evaluate=True)
-    assert drop_of(found.report.evaluation) < 2 * allowed  # from other cameras
-    (drop,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
-    assert drop <= allowed
-    tried = [(trial.drop, trial.bytes) for trial in found.report.trials]
-    assert all(size >= len(found.to_zip()) for lost, size in tried if lost <= allowed)
-    nearest = max(lost for lost, _ in tried if lost <= allowed)  # the smallest may lose a little less
-    assert nearest > allowed - 0.02 or len(tried) == chosen.encode.max_encodes
-
-
-@pytest.mark.parametrize("limits", [{"max_ssim_drop": 0.01}, {"max_ssim_drop": 0.01, "max_psnr_drop": 0.15}])
-@pytest.mark.quick(1)
-def test_a_drop_of_ssim_is_met(limits):
+def test_a_drop_is_met(limits):
     chosen = Settings.research("balanced", **limits, **FEW_VIEWS)
     found = kissgs.compress(SCENE, settings=chosen, evaluate=True)
-    assert 1 - found.report.evaluation.mean.candidate.ssim < 2 * 0.01  # from other cameras
-    allowed_psnr = limits.get("max_psnr_drop", math.inf)
-    met = [trial for trial in found.report.trials if trial.ssim_drop <= 0.01 and trial.drop <= allowed_psnr]
+    psnr, ssim = limits.get("max_psnr_drop", math.inf), limits.get("max_ssim_drop", math.inf)
+    assert drop_of(found.report.evaluation) < 2 * psnr  # from other cameras
+    assert 1 - found.report.evaluation.mean.candidate.ssim < 2 * ssim
+    met = [trial for trial in found.report.trials if trial.drop <= psnr and (trial.ssim_drop or 0) <= ssim]
     (kept,) = {trial for trial in met if trial.bytes == len(found.to_zip())}
     assert kept.bytes == min(trial.bytes for trial in met)
-    near = kept.ssim_drop > 0.95 * 0.01 or kept.drop > allowed_psnr - 0.02
+    # the smallest may lose a little less than another
+    near = max(trial.drop for trial in met) > psnr - 0.02 or (kept.ssim_drop or 0) > 0.95 * ssim
     assert near or len(found.report.trials) == chosen.encode.max_encodes
-    assert f"SSIM drop {kept.ssim_drop:.3g}" in kept.summary()
+    assert ("SSIM drop" in kept.summary()) == ("max_ssim_drop" in limits)
 
 
 def capture_with_photographs(scene, tmp_path):
@@ -98,13 +94,9 @@ def test_a_drop_is_measured_to_photographs_if_there_are_any(tmp_path, goal, most
 
 
 def test_an_unreachable_drop_is_refused():
-    with pytest.raises(
-        UnsupportedError,
-        match=r"^max_ssim_drop 1e-09 cannot be met: the finest container found loses 0\.\d+ of SSIM; allow",
-    ):
-        kissgs.compress(SCENE, settings=Settings.research("balanced", max_psnr_drop=9, max_ssim_drop=1e-9, **FEW_VIEWS))
+    chosen = Settings.research("balanced", max_psnr_drop=1e-9, max_encodes=3, **FEW_VIEWS)
     with pytest.raises(UnsupportedError, match=r"max_psnr_drop 1e-09 dB cannot be met: .* loses \d\.\d+ dB; allow"):
-        kissgs.compress(SCENE, settings=Settings.research("balanced", max_psnr_drop=1e-9, **FEW_VIEWS))
+        kissgs.compress(SCENE, settings=chosen)
 
 
 @pytest.mark.quick(0)
@@ -164,25 +156,7 @@ def test_a_count_is_reported_by_the_loss_that_decides():
     assert CountTrial(50_000, 0.123).summary() == "50,000 Gaussians lose 0.123 dB"
 
 
-@pytest.mark.quick(0)
-def test_the_result_does_not_depend_on_threads():
-    one, other = (kissgs.compress(SCENE, settings=settings(target_size="13kB"), threads=n) for n in (1, 2))
-    assert one.files == other.files
-    assert [(trial.count, trial.bytes) for trial in one.report.trials] == [
-        (trial.count, trial.bytes) for trial in other.report.trials
-    ]
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 7])
-@pytest.mark.quick(2)
-def test_scenes_of_few_gaussians(count):
-    few = SCENE.select(range(count))
-    found = kissgs.compress(few, settings=settings(target_size="9kB"))
-    assert len(kissgs.decompress(found.files)) <= count
-
-
-@pytest.mark.parametrize("count", [1, 2, 3])
-@pytest.mark.quick(1)
+@pytest.mark.parametrize("count", [1, 3])
 def test_a_stopped_search_returns_its_best(count):
     """Stopped while the ``count``-th container is made: the best before it, or StopSearch if none meets the goal."""
     made, stopped = 0, []
@@ -194,19 +168,15 @@ def test_a_stopped_search_returns_its_best(count):
             stopped.append(stage)
             raise kissgs.StopSearch
 
-    chosen = Settings.research("balanced", max_psnr_drop=0.3, **FEW_VIEWS)
-    whole = kissgs.compress(SCENE, settings=chosen)
-    if count > len(whole.report.trials):
-        return
-    before = whole.report.trials[: count - 1]
-    good = [trial for trial in before if trial.drop <= 0.3]
-    if good:
-        found = kissgs.compress(SCENE, settings=chosen, progress=stop)
-        assert found.report.trials == before
-        assert len(found.to_zip()) == min(trial.bytes for trial in good)
-    else:
+    chosen = Settings.research("balanced", max_psnr_drop=0.6, **FEW_VIEWS)
+    if count == 1:
         with pytest.raises(kissgs.StopSearch):
             kissgs.compress(SCENE, settings=chosen, progress=stop)
+        return
+    found = kissgs.compress(SCENE, settings=chosen, progress=stop)
+    assert stopped
+    assert len(found.report.trials) == count - 1
+    assert len(found.to_zip()) == min(trial.bytes for trial in found.report.trials if trial.drop <= 0.6)
 
 
 @pytest.mark.parametrize(

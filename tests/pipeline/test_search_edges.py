@@ -75,29 +75,27 @@ def test_a_folder_meets_a_target_size(tmp_path):
     assert found.report.file_bytes == written
 
 
-@pytest.mark.parametrize(
-    ("goal", "message"), [({"target_size": 1}, "target_size 1 byte cannot"), ({"target_size": 99}, "99 bytes cannot")]
-)
-def test_an_empty_scene_takes_bytes_too(goal, message):
-    with pytest.raises(UnsupportedError, match=message):
-        kissgs.compress(SCENE.select([]), settings=settings(**goal))
+def test_an_empty_scene_takes_bytes_too():
+    for size, message in ((1, "target_size 1 byte cannot"), (99, "99 bytes cannot")):
+        with pytest.raises(UnsupportedError, match=message):
+            kissgs.compress(SCENE.select([]), settings=settings(target_size=size))
     assert len(kissgs.compress(SCENE.select([]), settings=settings(target_size=9000)).to_zip()) <= 9000
     assert len(kissgs.compress(SCENE.select([]), settings=settings(psnr=99.0)).order) == 0
 
 
-@pytest.mark.parametrize("goal", [{"psnr": 30.0}, {"max_psnr_drop": 2.0}])
-def test_no_goal_is_met_if_an_object_is_lost(goal):
+def test_no_goal_is_met_if_an_object_is_lost():
     """One of two objects is missing: the mean over views hid that, as views of the other object lose nothing."""
     away = Splats(**{name: getattr(SCENE, name) + np.float32(1000 * (name == "means")) for name in ATTRIBUTES})
     both = Splats(**{name: np.concatenate([getattr(SCENE, name), getattr(away, name)]) for name in ATTRIBUTES})
     one = encode(SCENE, Settings.research("fast", quality_offset_db=12).encode, Context(1))
     found = SearchEvaluation(both, None)(kissgs.decompress(one.files))
-    limits = Goal.of(settings(**goal).encode)
-    attempt = limits.measured(Attempt(len(SCENE), None, 0), found)
-    assert limits.margin(attempt) < 0
-    assert attempt.worst < 20
-    assert f"worst view {attempt.worst:.1f} dB" in attempt.summary()
-    assert {"worst", "fifth_percentile"} <= set(attempt.as_dict())
+    for goal in ({"psnr": 30.0}, {"max_psnr_drop": 2.0}):
+        limits = Goal.of(settings(**goal).encode)
+        attempt = limits.measured(Attempt(len(SCENE), None, 0), found)
+        assert limits.margin(attempt) < 0
+        assert attempt.worst < 20
+        assert f"worst view {attempt.worst:.1f} dB" in attempt.summary()
+        assert {"worst", "fifth_percentile"} <= set(attempt.as_dict())
 
 
 @pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.3}, {"max_psnr_drop": 0.2, "max_encodes": 3}, {"psnr": 36.0}])

@@ -24,12 +24,10 @@ def test_a_target_size_is_met(share):
     assert len(found.to_zip()) in [trial.bytes for trial in found.report.trials]
 
 
-@pytest.mark.parametrize("change", [-2.5, 2.0])
+@pytest.mark.parametrize("wanted", [38.0, 33.0])
 @pytest.mark.quick(1)
-def test_a_psnr_is_met(change):
+def test_a_psnr_is_met(wanted):
     """The search has other cameras than the evaluation, so that their PSNR may differ."""
-    plain = kissgs.compress(SCENE, settings=Settings.research("balanced", **MORE_VIEWS), evaluate=True)
-    wanted = plain.report.evaluation.mean.candidate_vs_reference.psnr + change
     settings = Settings.research("balanced", psnr=wanted, **MORE_VIEWS)
     found = kissgs.compress(SCENE, settings=settings, evaluate=True)
     made = max((trial for trial in found.report.trials if trial.bytes == len(found.to_zip())), key=lambda t: t.psnr)
@@ -40,29 +38,9 @@ def test_a_psnr_is_met(change):
     assert made.worst <= made.fifth_percentile <= made.psnr
     assert abs(found.report.evaluation.mean.candidate_vs_reference.psnr - wanted) < 1.5
     assert found.report.evaluation.mean.candidate_vs_reference.psnr not in [trial.psnr for trial in found.report.trials]
-    assert (len(found.to_zip()) > len(plain.to_zip())) == (change > 0)
-
-
-@pytest.mark.quick(0)
-def test_the_reported_lambda_and_codebook_reproduce_the_container():
-    found = kissgs.compress(SCENE, settings=Settings.research("small", target_size="40 kB", **FEW_VIEWS))
-    made = found.report.settings["encode"]
-    same = {
-        "rd_lambda": found.report.rd_lambda,
-        **{name: made[name] for name in ("gaussians_per_codebook_entry", "sh_codebook_size")},
-    }
-    again = kissgs.compress(SCENE, settings=Settings.research("small", **same, **FEW_VIEWS))
-    assert again.files == found.files
 
 
 FIXED = kissgs.sample_scene(4000, sh_degree=3, seed=4)
-
-
-@pytest.mark.quick(0)
-def test_a_size_is_met_between_two_sides_of_the_codebook():
-    """Sides are multiples of 8; one step of the side is some kB for this scene."""
-    found = kissgs.compress(FIXED, settings=Settings.research("balanced", target_size=61_500, **UNTRAINED))
-    assert 0.97 * 61_500 <= len(found.to_zip()) <= 61_500
 
 
 @pytest.mark.quick(0)
@@ -142,16 +120,6 @@ def test_unreachable_goals_are_refused_and_nothing_is_written(tmp_path, goal, me
     with pytest.raises(UnsupportedError, match=message):
         kissgs.compress(SCENE, tmp_path / "a.zip", settings=Settings.research("balanced", **goal, **FEW_VIEWS))
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("count", [0, 1, 7])
-@pytest.mark.quick(1)
-def test_goals_of_scenes_of_few_gaussians(count):
-    few = SCENE.select(range(count))
-    for goal in ({"psnr": 20}, {"target_size": "9kB"}):
-        found = kissgs.compress(few, settings=Settings.research("balanced", **goal, **FEW_VIEWS))
-        assert len(found.to_zip()) < 9000
-        assert len(kissgs.decompress(found.files)) <= count
 
 
 @pytest.mark.parametrize(

@@ -250,18 +250,6 @@ class Clusters:
         return (weights * np.square(vectors - weights @ vectors / max(weights.sum(), 1e-9)).sum(axis=1)).sum()
 
 
-def test_members_means_totals_and_errors():
-    given = Clusters()
-    assert (given.members == np.argsort(given.labels, kind="stable")).all()
-    for k in range(12):
-        own = given.labels == k
-        np.testing.assert_allclose(given.totals[k], given.weights[own].sum(dtype=np.float64), rtol=1e-6)
-        lost = (given.weights * given.distances.astype(np.float64))[own].sum()
-        np.testing.assert_allclose(given.errors[k], lost, rtol=1e-6)
-        wanted = np.average(given.table[given.rows[own]], axis=0, weights=given.weights[own]) if own.any() else 9
-        np.testing.assert_allclose(given.centroids[k], wanted, atol=1e-6)
-
-
 @pytest.mark.parametrize(("count", "listed", "searched"), [(60, 8, 3), (4, 4, 9)])
 def test_near_centroids_are_the_nearest_of_the_lists_searched(count, listed, searched):
     rng = np.random.default_rng(3)

@@ -54,20 +54,6 @@ def test_no_single_move_makes_the_result_better(count):
     assert all(cost(pixels, bits, other) >= best for other in moved(order))
 
 
-def test_near_pixels_are_those_of_the_fewest_bits_within_reach():
-    rng = np.random.default_rng(0)
-    pixels, bits = rng.integers(0, 256, (60, 3)).astype(np.uint8), symmetric_bits(rng, 3)
-    curves = np.stack([rng.permutation(60) for _ in range(2)]).astype(np.int32)
-    near = np.empty((60, 5), np.int32)
-    kernels.near_pixels(pixels, bits, curves, 4, near)
-    places = np.argsort(curves, axis=1)
-    for n in range(60):
-        within = np.flatnonzero((np.abs(places - places[:, n : n + 1]) <= 4).any(axis=0))
-        wanted = sorted(cost(pixels, bits, np.array([n, m])) for m in within if m != n)[:5]
-        assert [cost(pixels, bits, np.array([n, m])) for m in near[n]] == wanted
-        assert len({*near[n], n}) == 6
-
-
 def levels_along_a_curve(count, rng):
     means = np.cumsum(rng.integers(-900, 900, (count, 3)), axis=0).astype(np.uint16)
     means = means[hilbert_order(means)]

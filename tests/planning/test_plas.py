@@ -91,28 +91,6 @@ def test_groups_of_four_get_the_cheapest_of_24_permutations(seed, channels):
     np.testing.assert_allclose(2 * (score[1] - score[0]), gained, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("side", "size", "shift"), [(16, 8, (0, 0)), (16, 8, (5, 11)), (24, 10, (9, 3)), (8, 8, (7, 1))]
-)
-def test_blocks_report_what_they_gain_and_leave_the_strip_alone(side, size, shift):
-    """A tiling shifted on the torus; what does not fill a block stays. The sum of squared distances is recomputed."""
-    rng = np.random.default_rng(side + size)
-    items, target = (rng.random((side * side, 3), np.float32) for _ in range(2))
-    placed = rng.permutation(side * side).astype(np.int32)
-    before = placed.copy()
-    per_row = side // size
-    tiling = np.array([side, *shift, size, 0, per_row**2])
-    gained = kernels.plas_blocks(items, placed, target, tiling, np.uint64(3), 1e-4)
-    costs = [np.square(items[order].astype(np.float64) - target).sum() for order in (before, placed)]
-    np.testing.assert_allclose(gained, costs[0] - costs[1], rtol=1e-4)
-    assert gained > 0
-    rows, columns = np.divmod(np.arange(side * side), side)
-    reach = per_row * size
-    inside = ((rows - shift[0]) % side < reach) & ((columns - shift[1]) % side < reach)
-    assert (placed[~inside] == before[~inside]).all()
-    assert sorted(placed) == list(range(side * side))
-
-
 def blurred(image, radius):
     """Mean over a square, by looking up every pixel: sideways modulo the width, up and down as in a mirror."""
     height, width, _ = image.shape

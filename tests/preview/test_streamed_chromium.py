@@ -133,6 +133,7 @@ def test_a_phone_and_another_scene_afterwards(server, opened):
     tab.fact("Gaussians", "100")
 
 
+@pytest.mark.quick(0)  # in tests/web/test_streamed_preview.py, without the page
 def test_a_small_budget(server, opened):
     """Nothing of the finest level is loaded from afar; near one end, some of its files are."""
     server.gate.set()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import reference_float64
+from helpers.fewer_cameras import try_fewer
 from helpers.random_sensitivity import packed_hessian
 from helpers.reference_harmonics import real_harmonics
 from helpers.render_scenes import blobs, camera, one, together
@@ -43,8 +44,8 @@ def rotated(quat, axis, angle):
     )
 
 
-def differences(splats, view, n):
-    """Return derivatives of the image by shape (logit, log-scales, rotations about own axes) and by position."""
+def derivatives(splats, view, n, changes):
+    """Return derivatives of the image by changes of one attribute each: its name and the change by a step."""
     params = reference_float64.tensors(splats)
 
     def image(name, change):
@@ -61,12 +62,18 @@ def differences(splats, view, n):
         coarse, fine = (difference_quotient(name, change, step) for step in (1e-5, 2e-6))
         return np.where(np.abs(coarse - fine) < 1e-4, fine, 0).reshape(-1)
 
-    axes = np.eye(3)
-    shape = [derivative("opacities", lambda value, s: value + s)]
-    shape += [derivative("scales", lambda value, s, axis=axis: value + s * axis) for axis in axes]
-    shape += [derivative("quats", lambda value, s, axis=axis: rotated(value, axis, s)) for axis in range(3)]
-    position = [derivative("means", lambda value, s, axis=axis: value + s * axis) for axis in axes]
-    return np.array(shape), np.array(position)
+    return np.array([derivative(name, change) for name, change in changes])
+
+
+AXES = np.eye(3)
+SHAPE = [
+    ("opacities", lambda value, s: value + s),
+    *(("scales", lambda value, s, axis=axis: value + s * axis) for axis in AXES),
+    *(("quats", lambda value, s, axis=axis: rotated(value, axis, s)) for axis in range(3)),
+]
+"""Logit, log-scales, rotations about own axes."""
+
+POSITION = [("means", lambda value, s, axis=axis: value + s * axis) for axis in AXES]
 
 
 def needles(scale):
@@ -96,7 +103,7 @@ def test_shape_hessians_agree_with_derivatives_of_the_image(name):
     found, tolerance = measure_sensitivity(splats, weighted(view)), 3e-3 if splats.antialiased else 2e-3
     assert (found.color_weight > 0).sum() > 2
     for n in range(len(splats)):
-        shape, _ = differences(splats, view, n)
+        shape = derivatives(splats, view, n, SHAPE)
         expected = packed_hessian(shape @ shape.T / (3 * view.width * view.height))
         np.testing.assert_allclose(
             found.shape_hessian[n], expected, rtol=tolerance, atol=tolerance * np.abs(expected).max()
@@ -108,7 +115,7 @@ def test_position_hessians_of_small_gaussians_agree_with_derivatives():
     splats, view = clean(blobs(6, 0, seed=0, log_scale=-3.5))[0], camera(60, 45, seed=0)
     found = measure_sensitivity(splats, weighted(view))
     for n in range(len(splats)):
-        _, position = differences(splats, view, n)
+        position = derivatives(splats, view, n, POSITION)
         expected = np.diag(position @ position.T) / (3 * view.width * view.height)
         np.testing.assert_allclose(found.position_hessian[n], expected, rtol=0.03, atol=0.03 * np.abs(expected).max())
 
@@ -398,7 +405,8 @@ def test_the_sensitivity_of_another_scene_is_refused():
             replace(valid, **{name: value}).check(splats)
 
 
-def test_sensitivity_cameras_of_a_capture_are_its_training_cameras_and_some_around_the_scene():
+def test_sensitivity_cameras_of_a_capture_are_its_training_cameras_and_some_around_the_scene(monkeypatch):
+    try_fewer(monkeypatch)
     splats = clean(blobs(300, seed=2))[0]
     views = [kissgs.View(f"{n}", camera(120, 80, seed=n)) for n in range(9)]
     capture = kissgs.Views(tuple(views[1:]), tuple(views[:1]), BACKGROUND, "a capture")

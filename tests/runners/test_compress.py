@@ -1,13 +1,9 @@
 """``kissgs compress --ray``. Oracle: the files and reports of the command without it."""
 
-import contextlib
 import json
-import math
 import os
-import resource
 import signal
 import subprocess
-from pathlib import Path
 
 import pytest
 from helpers.command_line import KISSGS, failure, run
@@ -29,16 +25,6 @@ def scenes(tmp_path_factory):
         with (folder / f"{name}.ply").open("wb") as file:
             write_ply(file, kissgs.sample_scene(count, sh_degree=2, seed=seed))
     return folder
-
-
-@pytest.fixture(scope="module")
-def whole(scenes, tmp_path_factory):
-    """CPU seconds of a process that compresses c.ply."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    target = tmp_path_factory.mktemp("whole") / "c.zip"
-    subprocess.run([KISSGS, "compress", scenes / "c.ply", "-p", "fast", "-o", target, "-q"], check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def comparable(report):
@@ -80,50 +66,10 @@ def test_a_folder_is_written_shown_and_replaced_only_if_allowed(whole_cluster, s
     assert [path.name for path in tmp_path.iterdir()] == ["a.container"]
 
 
-@pytest.mark.quick(0)
-@pytest.mark.parametrize("moment", [0, 4, 8])
-def test_a_node_is_killed_at_any_moment(whole_cluster, scenes, whole, tmp_path, moment):
-    inputs = [scenes / "b.ply", scenes / "c.ply"]
-    words = [KISSGS, "compress", *inputs, "-p", "fast", "-o", f"{tmp_path}/out/", "-q", "--ray", whole_cluster.address]
-    with subprocess.Popen(words) as command:
-        pid = working(whole_cluster)
-        wait_until(lambda: cpu_seconds(pid) >= moment / 10 * whole)
-        whole_cluster.kill_node_of(pid)
-        assert command.wait(300) == 0
-    for scene in inputs:
-        expected = kissgs.compress(scene, settings=kissgs.Settings.from_preset("fast")).to_zip()
-        assert (tmp_path / "out" / f"{scene.stem}.zip").read_bytes() == expected
-    assert len(list((tmp_path / "out").iterdir())) == 2
-
-
-@pytest.mark.quick(0)
-@pytest.mark.parametrize("moment", [0, 4, 8])
-def test_the_command_is_killed_at_any_moment_and_repeated(whole_cluster, scenes, whole, tmp_path, moment):
-    words = [KISSGS, "compress", scenes / "c.ply", "-p", "fast", "-o", tmp_path, "-q", "--ray", whole_cluster.address]
-    with subprocess.Popen(words) as command:
-        pid = working(whole_cluster)
-        wait_until(lambda: cpu_seconds(pid) >= moment / 10 * whole)
-        command.kill()
-    wait_until(lambda: not is_alive(pid))
-    assert subprocess.run([*words, "--force"], check=False).returncode == 0
-    expected = kissgs.compress(scenes / "c.ply", settings=kissgs.Settings.from_preset("fast")).to_zip()
-    assert (tmp_path / "c.zip").read_bytes() == expected
-    assert [path.name for path in tmp_path.iterdir()] == ["c.zip"]
-
-
 def working(cluster):
     """Wait for the process of an item; return its id."""
     wait_until(cluster.items)
     return cluster.items()[0]
-
-
-def cpu_seconds(pid):
-    """Return the CPU seconds that a process has used; infinity if it has ended."""
-    with contextlib.suppress(OSError):
-        state, *fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        if state != "Z":
-            return sum(map(int, fields[10:12])) / os.sysconf("SC_CLK_TCK")
-    return math.inf
 
 
 def test_ctrl_c_ends_all_items_and_leaves_nothing(whole_cluster, scenes, tmp_path):

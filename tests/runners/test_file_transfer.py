@@ -7,8 +7,8 @@ import shutil
 import pytest
 from helpers.running import item, wait_until
 
-from kissgs.runners import file_transfer
-from kissgs.runners.file_transfer import changed, receive, times_of
+ray_node = pytest.importorskip("kissgs.runners.ray_node")  # which needs Ray
+changed, receive, times_of = ray_node.changed, ray_node.receive, ray_node.times_of
 
 BLOCK = 10
 
@@ -19,7 +19,7 @@ def contents(folder):
 
 @pytest.fixture
 def folders(tmp_path, monkeypatch):
-    monkeypatch.setattr(file_transfer, "BLOCK_BYTES", BLOCK)
+    monkeypatch.setattr(ray_node, "BLOCK_BYTES", BLOCK)
     for name in ("there", "here"):
         (tmp_path / name).mkdir()
     return tmp_path / "there", tmp_path / "here"

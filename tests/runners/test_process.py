@@ -50,6 +50,7 @@ LIMITED = pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits 
         ("another error", 0.3, "internal"),
     ],
 )
+@pytest.mark.quick(3)
 def test_an_error_with_several_reasons_is_a_lack_of_memory_where_most_is_used(message, share, code):
     work = item("fail_with", message=message, bytes=int(share * 400 * MB), memory_limit=400 * MB)
     *_, outcome = ItemProcess(work).events()
@@ -58,6 +59,7 @@ def test_an_error_with_several_reasons_is_a_lack_of_memory_where_most_is_used(me
 
 @LIMITED
 @pytest.mark.parametrize("left", [2, 14, 30, 60])
+@pytest.mark.quick(2)
 def test_libraries_that_lack_memory_end_the_work(left):
     """OpenBLAS of scipy, which numba loads, waited forever."""
     work = item("load_kernels", left=left * MB, memory_limit=400 * MB, seconds=30)

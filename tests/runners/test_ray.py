@@ -36,6 +36,7 @@ def test_an_item_that_loses_all_of_its_nodes_is_lost(whole_cluster, ray_runner, 
     assert "was lost" in outcome.message
 
 
+@pytest.mark.quick(0)
 def test_a_killed_worker_of_ray_takes_its_item_along(whole_cluster, ray_runner, tmp_path):
     starts, output = tmp_path / "starts", tmp_path / "output"
     handle = ray_runner.submit(item("write_slowly", starts=str(starts), output=str(output), text="x"))
@@ -47,6 +48,7 @@ def test_a_killed_worker_of_ray_takes_its_item_along(whole_cluster, ray_runner, 
     assert not is_alive(first)
 
 
+@pytest.mark.quick(0)
 def test_items_end_with_whoever_submitted_them_and_run_again(ray_cluster, ray_runner, tmp_path):
     starts, output = tmp_path / "starts", tmp_path / "output"
     with subprocess.Popen([sys.executable, "-c", DRIVER, ray_cluster.address, starts, output]) as killed:
@@ -82,6 +84,7 @@ def test_a_lost_connection_is_an_outcome_and_is_made_again_until_the_end(ray_clu
     assert runner.health_problem() == "the runner is closed"
 
 
+@pytest.mark.quick(0)
 def test_a_waiting_item_is_cancelled_before_it_starts(whole_cluster, ray_runner, tmp_path):
     pids = [tmp_path / str(n) for n in range(3)]
     handles = [ray_runner.submit(item("count", numbers=1, seconds_between=600, pid=str(pid))) for pid in pids[:2]]
@@ -94,6 +97,7 @@ def test_a_waiting_item_is_cancelled_before_it_starts(whole_cluster, ray_runner,
     assert not pids[2].exists()
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("request_of_each", [Resources(1), Resources(0.25, int(0.6 * NODE_MEMORY))])
 def test_no_more_items_run_than_their_requests_allow(whole_cluster, ray_runner, tmp_path, request_of_each):
     work = item("record", request_of_each, times=str(tmp_path), seconds_between=0.4)
@@ -145,7 +149,7 @@ def test_ray_is_not_installed(monkeypatch):
 
 
 def test_a_node_with_another_version(ray_cluster):
-    from kissgs.runners.ray_driver import run_on_node
+    from kissgs.runners.ray_node import run_on_node
 
     (event,) = run_on_node(asdict(item("count", numbers=1)), "0.0.0", None)
     assert (event["outcome"]["kind"], event["outcome"]["code"]) == ("error", "node-unusable")

@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import signal
-import time
 from pathlib import Path
 
 import pytest
@@ -142,17 +141,6 @@ def test_a_service_that_ends_runs_its_jobs_again(service, number):
     (pid,) = processes_of(service, job)
     service.kill(number)
     wait_until(lambda: not is_alive(pid), seconds=30)
-    service.restart()
-    assert result_of(service, job) == compressed(MEDIUM)
-    wait_until_nothing_is_left(service)
-
-
-@pytest.mark.quick(0)
-@pytest.mark.parametrize("moment", [0, 4, 8])
-def test_a_service_is_killed_at_any_moment(service, moment):
-    job = service.submit(MEDIUM, FAST)
-    time.sleep(0.15 * moment)
-    service.kill(signal.SIGKILL)
     service.restart()
     assert result_of(service, job) == compressed(MEDIUM)
     wait_until_nothing_is_left(service)

@@ -39,6 +39,7 @@ def test_a_runner_makes_the_same_bytes(runner, scene, tmp_path, preset, name):
     assert {"merge", "images"} <= stages
 
 
+@pytest.mark.quick(0)
 def test_stopped_work_cancels_its_items_and_goes_on_elsewhere(local_runner, scene, tmp_path):
     target = tmp_path / "city" / "lod-meta.json"
 

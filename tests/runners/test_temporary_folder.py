@@ -37,7 +37,7 @@ def test_an_item_works_in_a_folder_of_its_own_that_is_gone_at_its_end(temporary)
     process = ItemProcess(item("leave_a_file", text="scene"))
     (_, during), (outcome, after) = [(event, sorted(temporary.iterdir())) for event in process.events()]
     assert (outcome.kind, after) == ("done", [])
-    assert during == [Path(outcome.result["folder"]), Path(f"{outcome.result['folder']}.lock")]
+    assert during == [Path(outcome.result["folder"])]
 
 
 def test_a_killed_item_leaves_nothing(temporary):
@@ -62,7 +62,7 @@ def test_what_a_killed_supervisor_leaves_is_removed_by_the_next_item(temporary, 
     assert list(temporary.iterdir()) == []
 
 
-@pytest.mark.parametrize("function", ["fcntl.flock", "os.mkdir", "shutil.rmtree"])
+@pytest.mark.parametrize("function", ["fcntl.flock", "shutil.rmtree"])
 def test_what_is_left_by_a_kill_at_any_step_is_removed(temporary, function):
     """Regression: a process killed before it had locked its folder left that for ever."""
     code = f"""
@@ -76,11 +76,11 @@ with temporary_folder() as folder:
     assert killed.returncode == -signal.SIGKILL
     assert list(temporary.iterdir())
     with temporary_folder() as folder:
-        assert sorted(temporary.iterdir()) == [folder, folder.with_suffix(".lock")]
+        assert list(temporary.iterdir()) == [folder]
 
 
 def test_a_folder_that_is_being_made_survives_the_removal_of_remains(temporary, monkeypatch):
-    """The other process looks for remains when the lock is there, but not taken yet."""
+    """The other process looks for remains when the folder is there, but not locked yet."""
     lock, others = fcntl.flock, []
 
     def slow(file, how):
@@ -97,22 +97,20 @@ def test_a_folder_that_is_being_made_survives_the_removal_of_remains(temporary, 
     assert list(temporary.iterdir()) == []
 
 
-def test_folders_of_others_and_links_stay(temporary, tmp_path):
-    (tmp_path / "precious.lock").touch()
+def test_links_and_other_files_stay(temporary, tmp_path):
     (tmp_path / "precious").mkdir()
-    (temporary / "kissgs-item-link.lock").symlink_to(tmp_path / "precious.lock")
     (temporary / "kissgs-item-link").symlink_to(tmp_path / "precious")
-    (temporary / "kissgs-item-without-a-lock").mkdir()
+    (temporary / "kissgs-item-file").touch()
     with temporary_folder():
         assert (tmp_path / "precious").is_dir()
-        assert len(list(temporary.iterdir())) == 5
+        assert len(list(temporary.iterdir())) == 3
 
 
 def test_no_folder_can_be_made(temporary, monkeypatch):
     def refuse(*words, **options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "mkdir", refuse)
+    monkeypatch.setattr(tempfile, "mkdtemp", refuse)
     (outcome,) = ItemProcess(item("count", numbers=1)).events()
     assert (outcome.kind, outcome.code) == ("lost", "not-started")
     assert "could not start a process: no space left on device" in outcome.message

@@ -15,6 +15,7 @@ from PIL import Image
 from kissgs.core.errors import InvalidContainerError, KissgsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.io.ply import read_ply
+from kissgs.io.scene_format import ReadOptions
 from kissgs.sog.decode import decode
 
 
@@ -216,7 +217,7 @@ def test_more_gaussians_than_the_limit_take_no_memory():
 
     def refused():
         with pytest.raises(UnsupportedError, match=r"has 16,000,000 Gaussians; the limit is 1,000"):
-            decode(files, max_gaussians=1000)
+            decode(files, ReadOptions(max_gaussians=1000))
 
     assert takes_less_than(1e6, refused)
 

@@ -9,7 +9,7 @@ from helpers.splat_transform import convert, needs_splat_transform
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.io.scene_format import ReadOptions
-from kissgs.sog.scenes import STREAMED
+from kissgs.sog.decode import STREAMED
 
 
 @needs_splat_transform

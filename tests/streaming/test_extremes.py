@@ -10,7 +10,6 @@ from helpers.streamed_scenes import FAST, TARGETS, small_sizes
 
 import kissgs
 from kissgs.core.errors import InvalidSceneError
-from kissgs.core.splats import Splats
 from kissgs.streaming.compress import compress_streamed
 
 
@@ -64,12 +63,3 @@ def test_few_gaussians(count, degree, manifest, tmp_path):
         return
     assert compress_streamed(tmp_path / "scene.ply", target, settings=FAST).counts[0] == count
     assert len(kissgs.load(target)) == count
-
-
-def test_gaussians_at_one_place(tmp_path):
-    """No cut separates them, so that one chunk has all."""
-    values = {"means": np.zeros((40, 3)), "quats": np.tile([1.0, 0, 0, 0], (40, 1)), "scales": np.full((40, 3), -3.0)}
-    values |= {"opacities": np.ones(40), "sh0": np.zeros((40, 3)), "shN": np.zeros((40, 0, 3))}
-    kissgs.save(Splats(**{name: value.astype(np.float32) for name, value in values.items()}), tmp_path / "scene.ply")
-    target = tmp_path / "city" / "lod-meta.json"
-    assert compress_streamed(tmp_path / "scene.ply", target, settings=FAST).counts[0] == 40

@@ -9,8 +9,9 @@ import pytest
 from helpers.training_scenes import around, cloud, targets_of
 from PIL import Image
 
-from kissgs.cameras.views import View
+from kissgs.cameras.views import View, Views, black
 from kissgs.rendering.rasterizer import render
+from kissgs.training.supervision import evaluation_only
 
 
 def test_without_photographs_the_targets_are_renderings_before_the_background_of_each_view():
@@ -113,3 +114,8 @@ def test_local_extents_are_positive_and_limited():
     assert (extents > 0).all()
     assert extents[-1] == 2.0
     assert found.local_extents(points[:0], 2.0).shape == (0,)
+
+
+def test_at_most_16_views_evaluate_evenly_chosen():
+    names = [view.name for view in evaluation_only(Views((), around(20), black(), "a capture")).test]
+    assert (len(names), names[0], names[-1]) == (16, "view0", "view19")

@@ -175,6 +175,7 @@ def test_images_of_a_coarse_rendering_are_requested_first(do, site):
 
 
 @pytest.mark.parametrize("wait", [0, 0.5], ids=["at once", "later"])
+@pytest.mark.quick(1)
 def test_workers_that_cannot_be_loaded(do, site, large, wait):
     """The page's own thread decodes if a bundler omitted the file or a policy forbids it, also after a delay."""
     site.files["/web_decoder/worker.js"] = None

@@ -35,6 +35,7 @@ def fewer(monkeypatch):
 
 
 @places
+@pytest.mark.quick(2)
 def test_cameras_are_the_same_for_any_number_of_threads(place):
     one, many = (cameras_of(place, box((0.5, 1.5, 0.3), 1000, 0.1), threads=threads) for threads in (1, 3))
     for first, second in zip(one, many, strict=True):

@@ -1,11 +1,20 @@
-"""Files of an item whose folder its node does not see, in blocks that are small beside Ray's object store."""
+"""Ray task that runs an item on a node; and files of an item whose folder its node does not see."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import time
 from collections.abc import Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+
+import ray
+
+from kissgs._version import __version__
+from kissgs.runners.contract import NODE_UNUSABLE, Outcome, WorkItem
+from kissgs.runners.process import ItemProcess, temporary_folder
 
 BLOCK_BYTES = 8 << 20
 """Bytes of a block; the object store of a small cluster has 80 MB."""
@@ -15,6 +24,43 @@ CHECKPOINT_SECONDS = 30.0
 
 Times = dict[str, int]
 """Times of the last change of files, by their names relative to a folder, ns."""
+
+
+def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]] | None) -> Iterator[dict[str, Any]]:
+    """Run an item in a process on a node, and yield its events.
+
+    ``version`` is that of kissgs where it was submitted; ``files`` are references to blocks of its files.
+    """
+    node = ray.util.get_node_ip_address()
+    if __version__ != version:
+        message = f"the node {node} has kissgs {__version__}, and this machine {version}; install one version"
+        yield {"outcome": asdict(Outcome("error", code=NODE_UNUSABLE, message=message))}
+        return
+    item, before, folder = WorkItem.from_dict(values), None, Path()
+    with contextlib.ExitStack() as stack:
+        if item.files and not is_seen(item.folder):
+            if files is None:
+                yield {"unseen": True}
+                return
+            folder = stack.enter_context(temporary_folder())
+            for name, blocks in files.items():
+                with (folder / name).open("wb") as file:
+                    for block in blocks:
+                        file.write(ray.get(block))
+            item, before = replace(item, folder=str(folder)), times_of(folder)
+        yield {"node": node}
+        process, looked = ItemProcess(item), time.monotonic()
+        stack.callback(process.kill)
+        for event in process.events():
+            if isinstance(event, Outcome):
+                if before is not None:
+                    yield from changed(folder, before, complete=event.kind == "done")
+                yield {"outcome": asdict(event)}
+                continue
+            yield {"progress": list(event)}
+            if before is not None and time.monotonic() - looked > CHECKPOINT_SECONDS:
+                yield from changed(folder, before, complete=False)
+                looked = time.monotonic()
 
 
 def is_seen(folder: str | None) -> bool:
@@ -42,14 +88,14 @@ def changed(folder: Path, before: Times, *, complete: bool) -> Iterator[dict[str
     Files in folders of the folder may be incomplete, and are left out, unless ``complete``. Of each file, the last
     event has ``last``: only then is it to be seen at its destination.
     """
-    for name, time in sorted(times_of(folder).items()):
-        if time != before.get(name) and (complete or "/" not in name):
+    for name, modified in sorted(times_of(folder).items()):
+        if modified != before.get(name) and (complete or "/" not in name):
             offset = 0
             for block in blocks_of(folder / name):
                 yield {"file": name, "offset": offset, "block": block, "last": False}
                 offset += len(block)
             yield {"file": name, "offset": offset, "block": b"", "last": True}
-            before[name] = time
+            before[name] = modified
 
 
 def receive(folder: Path, event: dict[str, Any]) -> None:
