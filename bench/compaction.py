@@ -17,8 +17,8 @@ from bench.common import arguments, fraction, head, row, run, training_views
 from kissgs import Splats, load
 from kissgs.cli.options import chosen
 from kissgs.compaction.merging import merge_gaussians
-from kissgs.compaction.popspa import Popspa, evaluate_scene
-from kissgs.compaction.scene_training import highest_indices
+from kissgs.compaction.popspa import Popspa
+from kissgs.compaction.scoring import highest_indices
 from kissgs.training.supervision import SCORING_STRIDE, supervision_views, training_targets
 
 
@@ -81,10 +81,11 @@ def main() -> None:
     strategies = [name for name in given.strategies if settings.trains or STRATEGIES[name][0] == "none"]
     trained = any(STRATEGIES[name][0] != "none" for name in strategies)
     targets = training_targets(scene, supervised) if trained else None
+    original = Popspa(scene, settings, supervised)
     head("strategy", "Gaussians", "PSNR", "SSIM", "bytes by `fast`", "seconds", "CPU s")
 
     def report(name: str, found: Splats, seconds: float, cpu_seconds: float) -> None:
-        metrics, size = evaluate_scene(found, scene, supervised)
+        metrics, size = original.evaluate(found)
         quality = f"{metrics.psnr:.2f}", f"{metrics.ssim:.4f}"
         row(name, len(found), *quality, size, f"{seconds:.1f}", f"{cpu_seconds:.1f}")
 
@@ -97,7 +98,7 @@ def main() -> None:
             count = max(1, round(len(scene) * ratio))
             wall, cpu = time.perf_counter(), time.process_time()
             reduced = scene if start is None else start(scene, count)
-            found = Popspa(reduced, own, supervised, reference=scene, targets=targets)(count)
+            found = Popspa(reduced, own, supervised, targets=targets)(count)
             report(name, found.splats, time.perf_counter() - wall, time.process_time() - cpu)
 
 

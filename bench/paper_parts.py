@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt8
+from kissgs.core.progress import Context
 from kissgs.core.resources import blas_workers
 from kissgs.core.splats import Splats
 from kissgs.io.planes import compress_images
@@ -64,8 +65,9 @@ LeaveOut = Callable[[EncodedParts, EncodeSettings, int], EncodedParts]
 
 def encode_parts(splats: Splats, settings: EncodeSettings, threads: int) -> EncodedParts:
     """Encode a scene with uniform planning; ``threads``: 0 means one per processor."""
-    plan = plan_encoding(splats, settings, threads=threads)
-    files = write_files(plan, settings, threads=threads).files
+    context = Context(threads)
+    plan = plan_encoding(splats, settings, context)
+    files = write_files(plan, settings, context).files
     decoded = decode(files, threads=threads)
     exact = _in_forms_of(splats.select(plan.grid.cells[plan.grid.mask]), decoded)
     other_files = {name: files[name] for name in METADATA}

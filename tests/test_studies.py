@@ -16,6 +16,7 @@ from bench import paper_parts
 from bench.common import at_quality_offset, bytes_at, saving
 from bench.external import measure_external
 from bench.rendering import resampled
+from kissgs.core.progress import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import encode
@@ -76,7 +77,7 @@ def test_an_external_codec_is_measured_without_this_process(tmp_path: Path) -> N
 def test_parts_of_the_paper_that_only_save_bytes_change_nothing_else() -> None:
     scene, settings = kissgs.sample_scene(200, sh_degree=1), kissgs.Settings.from_preset("paper").encode
     whole = paper_parts.encode_parts(scene, settings, 1)
-    assert whole.size(settings, 1) == len(zip_bytes(encode(scene, settings, threads=1).files))
+    assert whole.size(settings, 1) == len(zip_bytes(encode(scene, settings, Context(1)).files))
     for leave_out in (paper_parts.webp, paper_parts.scene_order, paper_parts.codebook_order, paper_parts.label_pairs):
         parts = leave_out(whole, settings, 1)
         assert parts.size(settings, 1) != whole.size(settings, 1)

@@ -27,13 +27,13 @@ from kissgs.cameras.virtual.select import (
 )
 from kissgs.core.array_types import Bool, Float64, Int, UInt8
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.progress import Progress, load_kernels, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, load_kernels
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.constants import NEAR
 from kissgs.rendering.images import Label, contact_sheet, reframed, render_all
-from kissgs.rendering.rasterizer import BLACK, Colour, Device
+from kissgs.rendering.rasterizer import BLACK, Colour
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,12 +139,10 @@ LOOK_AROUND_PITCH = 6
 """Downward pitch of cameras that look around from one position, degrees."""
 
 
-def find_orbit(
-    splats: Splats, *, width: int = 640, height: int = 480, threads: int = 0, progress: Progress = silent
-) -> Orbit:
+def find_orbit(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: int = 640, height: int = 480) -> Orbit:
     """Return the orbit with the longest arc of good views; only the images' aspect ratio matters."""
-    with Workers(threads) as pool:
-        candidates = score_candidates(splats, (width, height), pool, progress)
+    with Workers(context.threads) as pool:
+        candidates = score_candidates(splats, (width, height), pool, context.progress)
         bounds = candidates.bounds
         min_score = candidates.scores.max() - SCORE_MARGIN
         if candidates.kind == "object":
@@ -158,7 +156,7 @@ def find_orbit(
         ]
         best = circles[max(range(len(circles)), key=lambda n: ranks[n])]
         fine_scores = _scores([best], FINE_STEPS, candidates)[0]
-    progress("cameras", 1.0)
+    context.progress("cameras", 1.0)
     return _with_arc(best, fine_scores, min_score)
 
 
@@ -284,20 +282,18 @@ class RenderJob:
     """(width, height) of each image, pixels; None for the camera's size, else for the default."""
     background: Colour | None = None
     """RGB, 0 to 1; None for that of the capture, else black."""
-    device: Device = "cpu"
-    threads: int = 0
-    progress: Progress = silent
+    context: Context = DEFAULT_CONTEXT
 
     def single(self, capture: Views | None, which: str | None) -> RenderedImages:
         """Render a single image, by default at the camera's size."""
-        load_kernels(self.progress)
+        load_kernels(self.context.progress)
         if which is not None and is_camera_file(which):
             view, source = view_of_file(which).relative_to(self.splats.origin), "camera file"
         elif capture is not None:
             view, source = pick_view(capture.all, which or "0", capture.source), capture.source
         elif which is None:
             width, height = self.size or IMAGE_SIZE
-            view = best_view(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
+            view = best_view(self.splats, self.context, width=width, height=height)
             source = "best of the virtual cameras"
         else:
             virtual = self._virtual(self.size or IMAGE_SIZE)
@@ -325,7 +321,7 @@ class RenderJob:
 
     def view_sheet(self, capture: Views | None) -> RenderedImages:
         """Render a contact sheet of the capture's views, else of the virtual views, with names and held-out marks."""
-        load_kernels(self.progress)
+        load_kernels(self.context.progress)
         width, height = self.size or CELL_SIZE
         views = self._virtual((width, height)) if capture is None else capture
         if not views.all:
@@ -342,25 +338,18 @@ class RenderJob:
         return [view.relative_to((-x, -y, -z)) for view in views]
 
     def _orbit(self, size: tuple[int, int]) -> Orbit:
-        load_kernels(self.progress)
-        width, height = size
-        return find_orbit(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
+        load_kernels(self.context.progress)
+        return find_orbit(self.splats, self.context, width=size[0], height=size[1])
 
     def _virtual(self, size: tuple[int, int]) -> Views:
-        return virtual_views(self.splats, width=size[0], height=size[1], threads=self.threads, progress=self.progress)
+        threads, progress = self.context.threads, self.context.progress
+        return virtual_views(self.splats, width=size[0], height=size[1], threads=threads, progress=progress)
 
     def _render(self, cameras: Sequence[Camera], capture: Views | None) -> list[UInt8[np.ndarray, "H W 3"]]:
         background = self.background
         if background is None:
             background = BLACK if capture is None else capture.background.tolist()
-        return render_all(
-            self.splats,
-            cameras,
-            background=background,
-            threads=self.threads,
-            device=self.device,
-            progress=self.progress,
-        )
+        return render_all(self.splats, cameras, self.context, background=background)
 
 
 def _numbered(cameras: Sequence[Camera]) -> list[View]:

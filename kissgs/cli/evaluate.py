@@ -58,6 +58,7 @@ def evaluate(
     """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""
     from kissgs.cli.tables import evaluation_table
     from kissgs.core.positions import with_origin
+    from kissgs.core.progress import Context
     from kissgs.evaluation.evaluate import evaluate as measure
     from kissgs.evaluation.html import html_report
     from kissgs.io.files import atomic_file, refuse_existing
@@ -83,7 +84,7 @@ def evaluate(
             progress=progress,
         )
         if html is not None:
-            page = html_report(result, sides[0], sides[1], device=capture.device, threads=threads, progress=progress)
+            page = html_report(result, sides[0], sides[1], Context(threads, capture.device, progress))
             with atomic_file(html, overwrite=force) as file:
                 file.write(page.encode(errors="replace"))  # file names may be invalid UTF-8
     if not common.quiet:

@@ -271,6 +271,7 @@ def render(
     """Render an image of a scene, an orbit around it (animation or contact sheet), or all its views."""
     from kissgs.cameras.captures.transforms_json import camera_as_dict, write_camera
     from kissgs.cameras.render import RenderJob
+    from kissgs.core.progress import Context
     from kissgs.evaluation.evaluate import in_scene_frame
     from kissgs.io.files import refuse_existing
     from kissgs.pipeline.scene_files import load
@@ -289,11 +290,9 @@ def render(
                 splats=load(Path(name), threads=threads, progress=progress, **asdict(common.reading())),
                 size=size,
                 background=background,
-                device=capture.device,
-                threads=threads,
-                progress=progress,
+                context=Context(threads, capture.device, progress),
             )
-            fitting = views and in_scene_frame(job.splats, views, threads=threads, progress=progress)
+            fitting = views and in_scene_frame(job.splats, views, job.context)
             if image.orbit:
                 rendered = (job.animation if suffix == ".webp" else job.orbit_sheet)(image.frames)
             else:

@@ -14,21 +14,21 @@ import numpy as np
 
 from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.samples import random_poses
-from kissgs.compaction.popspa import Popspa, StepLog, TrainingPath, step_log
+from kissgs.compaction.popspa import Popspa, StepLog
 from kissgs.compaction.result import Compacted, CompactionReport, CountTrial
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.progress import Progress, as_stage, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context
 from kissgs.core.root_finding import find_root
 from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import BACKGROUNDS, evaluation_views
 from kissgs.evaluation.evaluate import Rendering, compare_images
 from kissgs.evaluation.results import ESTIMATED_DROP, SEARCH_SEED, Evaluation, drop_of
-from kissgs.rendering.rasterizer import Device, need_cuda
+from kissgs.rendering.rasterizer import need_cuda
 from kissgs.settings import CompactSettings
 from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, evaluation_only, supervision_views
 
 if TYPE_CHECKING:
-    from kissgs.training.supervision import TrainingTargets
+    pass
 
 
 # ``SearchEvaluation``: how far the candidates of a search are from the original scene.
@@ -54,39 +54,37 @@ class SearchEvaluation:
 
     original: Splats
     views: Views | None
-    threads: int = 0
     seconds: float = field(init=False, default=0.0)  # that the latest comparison took
     _poses: Views | None = field(init=False, default=None)
     _drawn: Views | None = field(init=False, default=None)
     _images: dict[int, Rendering] = field(init=False, default_factory=dict)
     _drawn_images: dict[int, Rendering] = field(init=False, default_factory=dict)
 
-    def __call__(self, candidate: Splats, progress: Progress = silent) -> Evaluation:
-        """Evaluate a candidate; reports the stages "cameras", "kernels" and "evaluate"."""
+    @classmethod
+    def of(cls, original: Splats, views: Views | None, supervision: SupervisionViews) -> SearchEvaluation:
+        """Return the evaluation for a compaction: with a capture in the views that it holds out."""
+        return cls(original, None if views is None else supervision.eval_views)
+
+    def __call__(self, candidate: Splats, context: Context = DEFAULT_CONTEXT) -> Evaluation:
+        """Evaluate a candidate, always on the CPU; reports the stages "cameras", "kernels" and "evaluate"."""
         started = time.perf_counter()
-        found = self._evaluation(candidate, progress)
+        found = self._evaluation(candidate, replace(context, device="cpu"))
         self.seconds = time.perf_counter() - started
         return found
 
-    def _evaluation(self, candidate: Splats, progress: Progress) -> Evaluation:
+    def _evaluation(self, candidate: Splats, context: Context) -> Evaluation:
         if self.views is not None:
             pixels = sum(view.camera.width * view.camera.height for view in self.views.test)
             images = self._images if pixels <= KEPT_PIXELS else None
-            return self._compare(candidate, self.views, images, progress)
+            return compare_images(self.original, candidate, self.views, context, reference_images=images)
         if self._poses is None or self._drawn is None:
-            scene, threads = self.original, self.threads
-            poses = random_poses(scene, side=SIDE, count=COUNT, seed=SEARCH_SEED, threads=threads, progress=progress)
-            self._drawn = evaluation_views(scene, seed=SEARCH_SEED, threads=threads, progress=progress)
+            poses = random_poses(self.original, context, side=SIDE, count=COUNT, seed=SEARCH_SEED)
+            self._drawn = evaluation_views(self.original, context, seed=SEARCH_SEED)
             self._poses = replace(poses, train=(), test=_over_backgrounds(poses.train + poses.test))
-        found = self._compare(candidate, self._poses, self._images, progress)
-        return replace(found, surroundings=self._compare(candidate, self._drawn, self._drawn_images, progress))
-
-    def _compare(
-        self, candidate: Splats, views: Views, images: dict[int, Rendering] | None, progress: Progress
-    ) -> Evaluation:
-        return compare_images(
-            self.original, candidate, views, threads=self.threads, reference_images=images, progress=progress
-        )
+        scenes = self.original, candidate
+        found = compare_images(*scenes, self._poses, context, reference_images=self._images)
+        around = compare_images(*scenes, self._drawn, context, reference_images=self._drawn_images)
+        return replace(found, surroundings=around)
 
 
 def _over_backgrounds(views: Sequence[View]) -> tuple[View, ...]:
@@ -116,12 +114,10 @@ def compact_scene(
     splats: Splats,
     settings: CompactSettings,
     views: Views | None = None,
+    context: Context = DEFAULT_CONTEXT,
     *,
     evaluate: bool = False,
     checkpoint: Path | None = None,
-    threads: int = 0,
-    device: Device = "cpu",
-    progress: Progress = silent,
 ) -> Compacted:
     """Reduce the number of Gaussians to the budget of the settings; no more than that are returned unchanged.
 
@@ -139,12 +135,10 @@ def compact_scene(
     count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
     if count >= len(splats):
         return unchanged(splats, "no more than requested")
-    if settings.method == "merge" and not evaluate and settings.max_psnr_drop is None:  # no cameras are needed
-        return _merge(splats, count, threads, progress)
-    compactor = Compactor.of(splats, settings, views, threads=threads, device=device, progress=progress)
+    task = Popspa(splats, settings, chosen_views(splats, settings, views, context), context)
     if settings.max_psnr_drop is None:
-        return compactor(count, evaluate=evaluate, checkpoint=checkpoint)
-    return _search_drop(compactor, settings.max_psnr_drop)
+        return _compacted(task, count, evaluate=evaluate, checkpoint=checkpoint)
+    return _search_drop(task, SearchEvaluation.of(splats, views, task.supervision), settings.max_psnr_drop)
 
 
 def unchanged(splats: Splats, reason: str) -> Compacted:
@@ -157,120 +151,66 @@ def unchanged(splats: Splats, reason: str) -> Compacted:
     return Compacted(splats, np.arange(len(splats)), report)
 
 
-def _merge(
-    splats: Splats,
-    count: int,
-    threads: int,
-    progress: Progress,
-    *,
-    evaluate: bool = False,
-    supervision: SupervisionViews | None = None,
-) -> Compacted:
-    """Return the scene with ``count`` Gaussians by merging; ``supervision`` is needed to evaluate the steps."""
+def _merge(task: Popspa, count: int, *, evaluate: bool) -> Compacted:
+    """Return the scene with ``count`` Gaussians by merging."""
+    progress = task.context.progress
     progress("kernels", 0.0)
     from kissgs.compaction.merging import merge_gaussians  # loads kernels that pruning does not need
 
     progress("kernels", 1.0)
-    log = StepLog(None) if supervision is None else step_log(evaluate, splats, supervision, threads, progress)
-    log.record("input", splats)
-    merged, index = merge_gaussians(splats, count, threads=threads, progress=progress)
+    log = StepLog(task.evaluate if evaluate else None)
+    log.record("input", task.splats)
+    merged, index = merge_gaussians(task.splats, count, task.context)
     log.record("merge", merged)
+    uses_views = evaluate or task.settings.max_psnr_drop is not None
     report = CompactionReport(
-        source_count=len(splats),
+        source_count=len(task.splats),
         count=count,
         target_source="nothing",
         source="",
         steps=tuple(log.steps),
-        note="" if supervision is None else supervision.note,
+        note=task.supervision.note if uses_views else "",
     )
     return Compacted(merged, index, report)
 
 
-@dataclass(slots=True, eq=False)
-class Compactor:
-    """Compacts one scene to any number of counts; views and training targets are prepared once."""
-
-    splats: Splats
-    settings: CompactSettings
-    supervision: SupervisionViews
-    threads: int
-    device: Device
-    progress: Progress
-    compare: SearchEvaluation
-    _targets: TrainingTargets | None = field(init=False, default=None)
-
-    @classmethod
-    def of(
-        cls,
-        splats: Splats,
-        settings: CompactSettings,
-        views: Views | None,
-        *,
-        threads: int = 0,
-        device: Device = "cpu",
-        progress: Progress = silent,
-    ) -> Compactor:
-        """Choose the views."""
-        if settings.trains and find_spec("torch") is None:
-            raise UnsupportedError(
-                "training needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough); the "
-                "preset fast, which only prunes, and the method merge do not need it"
-            )
-        if settings.trains and device == "cuda":
-            need_cuda()
-        if settings.method == "merge":
-            supervision = evaluation_only(views)
-        else:
-            stride = SCORING_STRIDE if settings.trains else 1
-            supervision = supervision_views(
-                splats, views, settings, scoring_stride=stride, threads=threads, progress=progress
-            )
-        compare = SearchEvaluation(splats, None if views is None else supervision.eval_views, threads)
-        return cls(splats, settings, supervision, threads, device, progress, compare)
-
-    def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
-        """Return the scene with exactly ``count`` Gaussians, from 1 to fewer than it has."""
-        if self.settings.method == "merge":
-            return _merge(
-                self.splats, count, self.threads, self.progress, evaluate=evaluate, supervision=self.supervision
-            )
-        if self._targets is None and self.settings.trains:
-            self._targets = self._task().load_targets()
-        return self._task()(count, evaluate=evaluate, checkpoint=checkpoint)
-
-    def path(self, *, keep_states: bool) -> TrainingPath:
-        """Return a training through falling numbers of Gaussians, for the method "prune"."""
-        return TrainingPath(self._task(), keep_states)
-
-    def _task(self) -> Popspa:
-        return Popspa(
-            self.splats,
-            self.settings,
-            self.supervision,
-            targets=self._targets,
-            threads=self.threads,
-            device=self.device,
-            progress=self.progress,
+def chosen_views(splats: Splats, settings: CompactSettings, views: Views | None, context: Context) -> SupervisionViews:
+    """Return the views of a compaction; training that is impossible is refused before any other work."""
+    if settings.trains and find_spec("torch") is None:
+        raise UnsupportedError(
+            "training needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough); the "
+            "preset fast, which only prunes, and the method merge do not need it"
         )
+    if settings.trains and context.device == "cuda":
+        need_cuda()
+    if settings.method == "merge":
+        return evaluation_only(views)
+    return supervision_views(splats, views, settings, context, scoring_stride=SCORING_STRIDE if settings.trains else 1)
 
-    @property
-    def note(self) -> str:
-        """Note that drops of PSNR are estimates; empty if photographs measure them."""
-        return "" if any(view.photo for view in self.supervision.test) else ESTIMATED_DROP
+
+def estimate_note(supervision: SupervisionViews) -> str:
+    """Return the note that drops of PSNR in these views are estimates; empty if photographs measure them."""
+    return "" if any(view.photo for view in supervision.test) else ESTIMATED_DROP
 
 
-def _search_drop(compactor: Compactor, allowed: float) -> Compacted:
+def _compacted(task: Popspa, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
+    """Return the scene with exactly ``count`` Gaussians, from 1 to fewer than it has, by the method of the settings."""
+    if task.settings.method == "merge":
+        return _merge(task, count, evaluate=evaluate)
+    return task(count, evaluate=evaluate, checkpoint=checkpoint)
+
+
+def _search_drop(task: Popspa, compare: SearchEvaluation, allowed: float) -> Compacted:
     """Return the fewest Gaussians that lose at most ``allowed`` decibels; the unchanged scene if there are none."""
-    total, trials = len(compactor.splats), dict[int, float]()
+    total, trials = len(task.splats), dict[int, float]()
     best: Compacted | None = None
 
     def room(log2_share: float) -> float:
         nonlocal best
         count = min(max(1, round(total * 2**log2_share)), total - 1)
         if count not in trials:
-            compacted = compactor(count)
-            evaluation = compactor.compare(compacted.splats, as_stage("evaluate", compactor.progress))
-            trials[count] = drop_of(evaluation)
+            compacted = _compacted(task, count)
+            trials[count] = drop_of(compare(compacted.splats, task.context.stage("evaluate")))
             if trials[count] <= allowed and (best is None or count < len(best.splats)):
                 best = compacted
         return allowed - trials[count]
@@ -282,7 +222,7 @@ def _search_drop(compactor: Compactor, allowed: float) -> Compacted:
         if best is None:
             raise
     if best is None:
-        best = unchanged(compactor.splats, f"and every smaller count that was tried loses more than {allowed:g} dB")
-    note = "; ".join(filter(None, [best.report.note, compactor.note]))
+        best = unchanged(task.splats, f"and every smaller count that was tried loses more than {allowed:g} dB")
+    note = "; ".join(filter(None, [best.report.note, estimate_note(task.supervision)]))
     report = replace(best.report, trials=tuple(CountTrial(count, drop) for count, drop in trials.items()), note=note)
     return replace(best, report=report)

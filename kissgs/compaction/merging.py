@@ -10,7 +10,7 @@ from numba import njit
 
 from kissgs.core.array_types import Bool, Float32, Float64, Int32, Int64
 from kissgs.core.numba_kernels import compiled
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context
 from kissgs.core.resources import Workers
 from kissgs.core.splats import LOG_SCALE_LIMIT, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, Splats
 from kissgs.rendering.cpu.neighbours import SEARCH_LEAF, leaves_of, nearest_neighbours, unique_pairs
@@ -368,7 +368,7 @@ LARGEST_STEP = 0.3
 
 
 def merge_gaussians(
-    splats: Splats, count: int, *, threads: int = 0, progress: Progress = silent
+    splats: Splats, count: int, context: Context = DEFAULT_CONTEXT
 ) -> tuple[Splats, Int64[np.ndarray, " M"]]:
     """Reduce a scene to ``count`` Gaussians by merging.
 
@@ -376,11 +376,11 @@ def merge_gaussians(
     opacity that is nearest to the alpha of both together. Gaussians that are not merged stay exactly as they are.
     Returns the scene, and of each of its Gaussians the index of the heaviest among those it stands for, ascending.
     """
-    with Workers(threads) as pool:
+    with Workers(context.threads) as pool:
         clusters = _Clusters(splats, pool)
         for left in clusters.reduce(count):
-            progress("merge", 1 - np.log(left / count) / np.log(len(splats) / count))
-        progress("merge", 1.0)
+            context.progress("merge", 1 - np.log(left / count) / np.log(len(splats) / count))
+        context.progress("merge", 1.0)
         return clusters.splats()
 
 

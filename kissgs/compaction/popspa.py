@@ -2,44 +2,137 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from kissgs.cameras.views import Views
+from kissgs._version import __version__
+from kissgs.cameras.captures.photos import open_file
+from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
-from kissgs.compaction.scene_training import (
-    Phase,
-    SceneTraining,
-    State,
-    Status,
-    first_pruning_count,
-    stage_progress,
-    training_phases,
-    work_key,
-)
-from kissgs.core.array_types import Int
+from kissgs.compaction.scoring import prune_by_score
+from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import OutputError
-from kissgs.core.progress import Deadline, Progress, as_stage, load_kernels, silent
-from kissgs.core.splats import Splats
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Deadline, Pace, Progress, load_kernels
+from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import ImageMetrics
-from kissgs.rendering.rasterizer import Device
 from kissgs.settings import CompactSettings, Preset, Settings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import encode
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.supervision import SupervisionViews
+from kissgs.training.supervision import SupervisionViews, TrainingTargets, training_targets
 
 if TYPE_CHECKING:
     from kissgs.compaction.regularizers import AdmmSparsifier
-    from kissgs.training.supervision import TrainingTargets
+    from kissgs.training.loop import LrSchedule, Regularizer
+    from kissgs.training.model import GaussianModel
+
+
+# Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.1).
+
+BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
+"""Learning rates of 3DGS by parameter; that of positions is in units of the extent of the cameras around each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """Training steps, and the number of Gaussians that the pruning after them leaves."""
+
+    name: Literal["sparsify", "refine"]
+    steps: int
+    count: int
+
+
+def first_pruning_count(settings: CompactSettings, source_count: int, count: int) -> int:
+    """Return the number of Gaussians that the first pruning leaves, before any training."""
+    fraction = settings.initial_prune_fraction if settings.sparsify_steps else 1.0
+    return round(source_count * (count / source_count) ** fraction)
+
+
+def training_phases(settings: CompactSettings, source_count: int, count: int) -> list[Phase]:
+    """Return all phases of training: one before each further pruning, then refinement; none if nothing is trained.
+
+    The prunings are spread evenly over ``sparsify_steps``, and each keeps the same share of the Gaussians.
+    """
+    phases = []
+    if settings.sparsify_steps:
+        rounds = min(settings.prune_rounds, settings.sparsify_steps)
+        first, fractions = first_pruning_count(settings, source_count, count), np.arange(1, rounds + 1) / rounds
+        counts = np.rint(first * (count / first) ** fractions).astype(int)
+        ends = np.rint(settings.sparsify_steps * np.concatenate([[0], fractions])).astype(int)
+        phases = [Phase("sparsify", int(steps), int(left)) for steps, left in zip(np.diff(ends), counts, strict=True)]
+    if settings.refine_steps:
+        phases.append(Phase("refine", settings.refine_steps, count))
+    return phases
+
+
+def stage_progress(progress: Progress, phases: Sequence[Phase], number: int) -> Progress:
+    """Return a receiver that reports phase ``number`` and the pruning after it as a part of one stage.
+
+    All phases of the same name, and the prunings after them, are one stage of that name.
+    """
+    name = phases[number].name
+    before = sum(phase.steps for phase in phases[:number] if phase.name == name)
+    total = sum(phase.steps for phase in phases if phase.name == name)
+
+    def receive(stage: str, fraction: float, note: str = "") -> None:
+        done = phases[number].steps * (fraction if stage == name else 1.0)
+        progress(name, (before + done) / total, note)
+
+    return receive
+
+
+def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> LrSchedule:
+    """Return learning rates: constant while Gaussians are pruned, falling exponentially during refinement.
+
+    3DGS does the latter for positions only. ``target_source`` is that of the training targets: "photos" or
+    "renderings".
+    """
+    from kissgs.training.loop import exponential_lr
+
+    base = dict(BASE_LR)
+    if target_source == "renderings":
+        base = {name: rate * settings.synthetic_lr_scale for name, rate in base.items()}
+    begin = {name: settings.means_lr_scale if name == "means" else settings.lr_scale for name in base}
+    end = {name: settings.final_means_lr_scale if name == "means" else settings.final_lr_scale for name in base}
+    return exponential_lr(base, begin, end if phase.name == "refine" else begin)
+
+
+# Checkpoint of a compaction: the status beside the state of the training.
+
+State = Mapping[str, np.ndarray]
+"""Arrays of a checkpoint by name."""
+
+STATUS_ENTRY = "status"
+"""Name of the array that holds the status as JSON; part of the file format."""
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Progress of a compaction."""
+
+    phase: int  # the number of phases once all are done
+    done: int  # steps of this phase
+    seconds: float  # since the last recorded step
+    steps: Sequence[CompactionStep]
+
+    def as_state(self) -> State:
+        """Return the status as an array for the checkpoint, see :meth:`from_state`."""
+        return {STATUS_ENTRY: np.frombuffer(json.dumps(asdict(self)).encode(), np.uint8)}
+
+    @classmethod
+    def from_state(cls, state: State) -> Status:
+        """Return the status in a checkpoint."""
+        values = json.loads(state[STATUS_ENTRY].tobytes())
+        return cls(**{**values, "steps": [CompactionStep(**step) for step in values["steps"]]})
 
 
 # ``StepLog``: the steps of a compaction for the report.
@@ -60,19 +153,11 @@ class StepLog:
 
     def record(self, name: str, scene: Splats) -> None:
         """Add the step that has just ended with ``scene``."""
-        seconds = self.seconds
-        metrics, size = (None, None) if self.evaluate is None else self.evaluate(scene)
-        self.steps.append(
-            CompactionStep(
-                name=name,
-                count=len(scene),
-                seconds=seconds,
-                psnr=None if metrics is None else metrics.psnr,
-                ssim=None if metrics is None else metrics.ssim,
-                ms_ssim=None if metrics is None else metrics.ms_ssim,
-                bytes=size,
-            )
-        )
+        step = CompactionStep(name=name, count=len(scene), seconds=self.seconds)
+        if self.evaluate is not None:
+            found, size = self.evaluate(scene)
+            step = replace(step, psnr=found.psnr, ssim=found.ssim, ms_ssim=found.ms_ssim, bytes=size)
+        self.steps.append(step)
         self._started = time.perf_counter()
 
     def restore(self, steps: Sequence[CompactionStep], seconds: float) -> None:
@@ -81,56 +166,18 @@ class StepLog:
         self._started -= seconds
 
 
-# Evaluation of compacted scenes: image quality in views that no training used, and the size of the container.
-
-
-def evaluate_scene(
-    scene: Splats, reference: Splats, supervision: SupervisionViews, threads: int = 0, progress: Progress = silent
-) -> tuple[ImageMetrics, int]:
-    """Return the mean image metrics of a scene, and its bytes as a zip with the preset ``fast``.
-
-    Evaluation views are used if they have photographs, else cameras drawn over all of ``reference``.
-    """
-    as_evaluate = as_stage("evaluate", progress)
-    views = _views(reference, supervision, threads, as_evaluate)
-    evaluation = compare_images(reference, scene, views, threads=threads, progress=as_evaluate)
-    encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=as_evaluate)
-    return evaluation.mean.candidate, len(zip_bytes(encoded.files))
-
-
-def step_log(
-    evaluate: bool, reference: Splats, supervision: SupervisionViews, threads: int, progress: Progress
-) -> StepLog:
-    """Return an empty log, which evaluates each step if ``evaluate``; see :func:`evaluate_scene`."""
-    if not evaluate:
-        return StepLog(None)
-    return StepLog(
-        partial(evaluate_scene, reference=reference, supervision=supervision, threads=threads, progress=progress)
-    )
-
-
-def _views(reference: Splats, supervision: SupervisionViews, threads: int, progress: Progress) -> Views:
-    """Return the evaluation views of a capture with photographs, else cameras drawn over the whole scene."""
-    if any(view.photo is not None for view in supervision.test):
-        return supervision.eval_views
-    return evaluation_views(reference, threads=threads, progress=progress)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Popspa:
     """Compacts one scene by POPSpa.
 
-    On ``device`` "cuda", sums have no fixed order, so that results vary slightly. Scores are computed on the CPU.
+    On the device "cuda", sums have no fixed order, so that results vary slightly. Scores are computed on the CPU.
     """
 
     splats: Splats
     settings: CompactSettings  # their budget is ignored
     supervision: SupervisionViews
-    reference: Splats | None = None  # the original scene, if splats is already pruned
-    targets: TrainingTargets | None = None  # by default loaded or rendered when needed
-    threads: int = 0
-    device: Device = "cpu"
-    progress: Progress = silent
+    context: Context = DEFAULT_CONTEXT
+    targets: TrainingTargets | None = None  # of these views; loaded or rendered when first needed
 
     def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
         """Return the scene with exactly ``count`` Gaussians; ``evaluate`` measures every step.
@@ -138,26 +185,180 @@ class Popspa:
         Training continues from ``checkpoint`` if that exists and belongs to this work, on the CPU with the same result
         as without an interruption. It stays at the end.
         """
-        scenes = (self.splats, self.original)
-        key = ""
-        if checkpoint is not None:
-            key = work_key(scenes, count, self.settings, self.supervision, evaluate, self.device)
-        log = step_log(evaluate, self.original, self.supervision, self.threads, self.progress)
+        if self.settings.trains:
+            self.load_targets()
+        key = "" if checkpoint is None else self._key(count, evaluate)
+        log = StepLog(self.evaluate if evaluate else None)
         compacted = _Run(self, count, Checkpoint(checkpoint, key), log).run()
         return replace(compacted, checkpoint=checkpoint) if self.settings.trains else compacted
 
-    @property
-    def original(self) -> Splats:
-        """The original scene: the reference, or else the scene itself."""
-        return self.reference or self.splats
+    def evaluate(self, scene: Splats) -> tuple[ImageMetrics, int]:
+        """Return the mean image metrics of a scene with fewer Gaussians, and its bytes as a zip by the preset ``fast``.
+
+        Evaluation views are used if they have photographs, else cameras drawn over the whole scene.
+        """
+        context, views = replace(self.context.stage("evaluate"), device="cpu"), self.supervision.eval_views
+        if all(view.photo is None for view in views.test):
+            views = evaluation_views(self.splats, context)
+        evaluation = compare_images(self.splats, scene, views, context)
+        encoded = encode(scene, Settings(preset=Preset.FAST).encode, context)
+        return evaluation.mean.candidate, len(zip_bytes(encoded.files))
 
     def load_targets(self) -> TrainingTargets:
-        """Return the target images, loaded or rendered unless :attr:`targets` are given."""
-        from kissgs.training.supervision import training_targets
+        """Return the target images, which are loaded or rendered once."""
+        if self.targets is None:
+            self.targets = training_targets(self.splats, self.supervision, self.context)
+        return self.targets
 
-        return self.targets or training_targets(
-            self.original, self.supervision, threads=self.threads, device=self.device, progress=self.progress
+    def _key(self, count: int, evaluate: bool) -> str:
+        """Return the key of the work's checkpoint, equal only for equal results."""
+        views, device, settings = self.supervision, self.context.device, self.settings.model_dump_json()
+        text = f"{__version__} {count} {evaluate} {device} {settings} {views.background} "
+        key = hashlib.sha256(f"{text}{views.synthetic} {views.synthetic_per_epoch}".encode())
+        for view in (*views.train, *views.score, *views.test):
+            camera = view.camera
+            key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
+            key.update(f"{camera.dilation} {view.background} {view.undistortion} {view.sampling}".encode())
+            if view.photo is not None:
+                with open_file(view.photo) as (file, _):
+                    key.update(file.read())
+        for name in ATTRIBUTES:
+            key.update(getattr(self.splats, name).tobytes())
+        key.update(b"antialiased" * self.splats.antialiased)
+        return key.hexdigest()
+
+
+# ``SceneTraining``: a scene that is pruned and trained in turn, and its state.
+
+MIN_RELATIVE_EXTENT = 1e-4
+"""Extent of the cameras, in radii of the scene, up to which they count as being at one position: a rotating camera,
+whose extent is 0 except for rounding."""
+
+MOST_STEP_PER_SIZE = 0.025
+"""Largest learning rate of a position, in units of the Gaussian's size: the middle one of its three scales."""
+
+MIN_SCORE = {True: 0.05, False: 0.3}
+"""Lowest score, in units of the score that an unobstructed camera nearby would find: True with a capture, whose cameras
+show what matters, False for virtual views."""
+
+
+@dataclass(slots=True, eq=False)
+class SceneTraining:
+    """Prunes and trains the scene of a task, step by step."""
+
+    task: Popspa
+    index: Int[np.ndarray, " M"] = field(init=False)  # in that scene, of each Gaussian that is left, ascending
+    _model: GaussianModel | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        self.index = np.arange(len(self.task.splats))
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @property
+    def trained(self) -> GaussianModel:
+        """The trainable scene, after :meth:`begin`."""
+        assert self._model is not None  # noqa: S101  callers begin first
+        return self._model
+
+    @property
+    def begun(self) -> bool:
+        """Whether the scene is trainable."""
+        return self._model is not None
+
+    def splats(self) -> Splats:
+        """Return the current scene."""
+        if self._model is not None:
+            return self.trained.splats()
+        source = self.task.splats
+        return source if len(self) == len(source) else source.select(self.index)
+
+    def prune(self, count: int, context: Context) -> None:
+        """Keep the ``count`` Gaussians that images would miss most; reports the stage "score"."""
+        views = self.task.supervision
+        kept = prune_by_score(
+            self.splats(),
+            views.score,
+            views.background,
+            count,
+            context,
+            min_keep_per_scoring=self.task.settings.min_keep_per_scoring,
+            min_score=MIN_SCORE[views.captured],
         )
+        self.index = self.index[kept]
+        if self._model is not None:
+            self._model.keep(kept)
+
+    def begin(self) -> None:
+        """Make the current scene trainable."""
+        from kissgs.training.model import GaussianModel
+
+        self._model = GaussianModel(self.splats(), self.task.context.device, self._position_extents())
+
+    def restore(self, state: State, index: Int[np.ndarray, " M"]) -> None:
+        """Continue from the :meth:`kissgs.training.model.GaussianModel.state` of the Gaussians at ``index``."""
+        from kissgs.training.model import GaussianModel
+
+        self.index, device = index, self.task.context.device
+        self._model = GaussianModel.restored(state, self.task.splats, device, self._position_extents())
+
+    def state(self) -> State:
+        """Return a copy of the state of the training, see :meth:`restore`."""
+        return {name: array.copy() for name, array in self.trained.state().items()}
+
+    def train(
+        self,
+        phase: Phase,
+        number: int,
+        context: Context,
+        *,
+        regularizers: tuple[Regularizer, ...] = (),
+        first: int = 0,
+        after: Callable[[int], None] = lambda done: None,
+    ) -> None:
+        """Train for a phase, in fewer steps where the deadline is near; each ``number`` has another order of images.
+
+        The other arguments are those of :func:`kissgs.training.loop.train`.
+        """
+        from kissgs.training.loop import TrainingPlan, train
+
+        settings, targets = self.task.settings, self.task.load_targets()
+        plan = TrainingPlan(
+            stage=phase.name,
+            pace=Pace(phase.steps, context.deadline),
+            rates=lr_schedule(settings, phase, targets.target_source),
+            ssim_weight=settings.ssim_weight,
+            mse_weight=settings.mse_weight,
+            seed=(settings.seed, number),
+            regularizers=(*self._shape_regularizers(), *regularizers),
+        )
+        train(self.trained, targets, plan, context, first=first, after=after)
+
+    def _shape_regularizers(self) -> tuple[Regularizer, ...]:
+        settings = self.task.settings
+        if not (settings.erank_weight or settings.min_scale_weight):
+            return ()
+        from kissgs.compaction.regularizers import ShapeRegularizer
+
+        return (ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent()),)
+
+    def _camera_extent(self) -> float:
+        """Return the extent of the cameras, world units; the scene's radius if they are nearly at one position."""
+        radius, extent = scene_bounds(self.task.splats).radius, self.task.load_targets().extent
+        return extent if extent > MIN_RELATIVE_EXTENT * radius else radius
+
+    def _position_extents(self) -> Float32[np.ndarray, " M"]:
+        """Return the unit of the position learning rate of each Gaussian, from its position and size in the source.
+
+        The rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size,
+        and positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes.
+        """
+        settings, source = self.task.settings, self.task.splats
+        extents = self.task.load_targets().local_extents(source.means[self.index], self._camera_extent())
+        sizes = np.exp(np.median(source.scales[self.index].astype(np.float64), axis=1))
+        most = BASE_LR["means"] * max(settings.means_lr_scale, settings.final_means_lr_scale)
+        return np.minimum(MOST_STEP_PER_SIZE / most * sizes, extents).astype(np.float32)
 
 
 @dataclass(slots=True, eq=False)
@@ -172,46 +373,44 @@ class _Run:
     checkpoint_note: str = field(init=False, default="")
 
     def __post_init__(self) -> None:
-        task = self.task
-        self.training = SceneTraining(task.splats, task.settings, task.supervision, task.threads, task.device)
+        self.training = SceneTraining(self.task)
 
     def run(self) -> Compacted:
         """Do all steps, or those that remain after the checkpoint."""
         task = self.task
-        load_kernels(task.progress)
+        load_kernels(task.context.progress)
         phases = training_phases(task.settings, len(task.splats), self.count)
         if not phases:
             self._first_pruning(self.count)
             return self._result("nothing")
-        targets = task.load_targets()
-        first, done, state = self._start(targets)
+        first, done, state = self._start()
         for number in range(first, len(phases)):
-            self._train(phases, number, done, state, targets)
+            self._train(phases, number, done, state)
             done, state = 0, {}
         self._save(len(phases), 0, {})
-        return self._result(targets.target_source)
+        return self._result(task.load_targets().target_source)
 
-    def _start(self, targets: TrainingTargets) -> tuple[int, int, State]:
+    def _start(self) -> tuple[int, int, State]:
         """Do the first pruning, or load the checkpoint; return the current phase, its steps done, and the state."""
         task = self.task
         state = self.checkpoint.load()
         if state is not None:
             status = Status.from_state(state)
-            self.training.restore(state, state["index"], targets)
+            self.training.restore(state, state["index"])
             self.log.restore(status.steps, status.seconds)
             return status.phase, status.done, state
         self._first_pruning(first_pruning_count(task.settings, len(task.splats), self.count))
-        self.training.begin(targets)
+        self.training.begin()
         self._save(0, 0, {})  # a file that cannot be written must be reported before the training
         return 0, 0, {}
 
     def _first_pruning(self, count: int) -> None:
         """Prune the input to ``count`` Gaussians."""
         self.log.record("input", self.task.splats)
-        self.training.prune(count, self.task.progress)
+        self.training.prune(count, self.task.context)
         self.log.record("prune", self.training.splats())
 
-    def _train(self, phases: Sequence[Phase], number: int, done: int, state: State, targets: TrainingTargets) -> None:
+    def _train(self, phases: Sequence[Phase], number: int, done: int, state: State) -> None:
         """Train phase ``number`` from step ``done`` on, then prune; ``state`` is that of the checkpoint, or empty."""
         phase, training = phases[number], self.training
         sparsifier = self._sparsifier(phase, state)
@@ -220,19 +419,19 @@ class _Run:
             if self.checkpoint.due:
                 self._save(number, step, {} if sparsifier is None else sparsifier.state())
 
-        progress = stage_progress(self.task.progress, phases, number)
+        progress = stage_progress(self.task.context.progress, phases, number)
+        context = replace(self.task.context, progress=progress, deadline=None)  # a given count takes all steps
         training.train(
             phase,
-            targets,
-            (self.task.settings.seed, number),
+            number,
+            context,
             regularizers=() if sparsifier is None else (sparsifier,),
             first=done,
             after=save_if_due,
-            progress=progress,
         )
         self.log.record(phase.name, training.splats())
         if len(training) > phase.count:
-            training.prune(phase.count, progress)
+            training.prune(phase.count, context)
             self.log.record("prune", training.splats())
 
     def _sparsifier(self, phase: Phase, state: State) -> AdmmSparsifier | None:
@@ -311,7 +510,6 @@ class TrainingPath:
     keep_states: bool = True  # every point, not just the last one, can be refined: that takes three times the memory
     points: list[PathPoint] = field(init=False)  # the whole scene first
     whole: PathPoint = field(init=False)  # without training, also after the first point was trained
-    _loaded: TrainingTargets | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         self.whole = PathPoint(0, self.task.splats, np.arange(len(self.task.splats)))
@@ -322,9 +520,9 @@ class TrainingPath:
 
         If a progress receiver raises here or in :meth:`train`, the path stays as it was.
         """
-        load_kernels(self.task.progress)
+        load_kernels(self.task.context.progress)
         training = self._at(self.points[-1])
-        training.prune(count, self.task.progress)
+        training.prune(count, self.task.context)
         return self._add(training, len(self.points))
 
     def train(self, deadline: Deadline | None = None) -> PathPoint:
@@ -336,13 +534,15 @@ class TrainingPath:
         task, point = self.task, self.points[-1]
         if task.settings.sparsify_steps == 0:
             return point
-        steps = POINT_STEPS[self.targets.target_source] * task.settings.sparsify_steps // task.settings.prune_rounds
+        per_point = POINT_STEPS[task.load_targets().target_source]
+        steps = per_point * task.settings.sparsify_steps // task.settings.prune_rounds
         if steps == 0:
             return point
         training = self._at(point)
         if not point.trained:
-            training.begin(self.targets)
-        self._train(training, Phase("sparsify", steps, len(point)), point.number, deadline)
+            training.begin()
+        context = replace(task.context, deadline=deadline)
+        training.train(Phase("sparsify", steps, len(point)), point.number, context)
         self.points.pop()
         return self._add(training, point.number)
 
@@ -355,38 +555,25 @@ class TrainingPath:
         if refine and task.settings.refine_steps:
             training = self._at(point)
             if not point.trained:
-                training.begin(self.targets)
+                training.begin()
             phase = Phase("refine", task.settings.refine_steps, len(point))
-            self._train(training, phase, REFINEMENT + point.number, deadline)
+            training.train(phase, REFINEMENT + point.number, replace(task.context, deadline=deadline))
             splats = training.splats()
         report = CompactionReport(
             source_count=len(task.splats),
             count=len(splats),
-            target_source=self.targets.target_source if point.trained or refine else "nothing",
+            target_source=task.load_targets().target_source if point.trained or refine else "nothing",
             source=task.supervision.source,
             steps=(),
             note=task.supervision.note,
         )
         return Compacted(splats, point.index, report)
 
-    def _train(self, training: SceneTraining, phase: Phase, number: int, deadline: Deadline | None = None) -> None:
-        task = self.task
-        seed = (task.settings.seed, number)
-        training.train(phase, self.targets, seed, deadline=deadline, progress=task.progress)
-
-    @property
-    def targets(self) -> TrainingTargets:
-        """Target images of the training, which are loaded or rendered when they are first needed."""
-        if self._loaded is None:
-            self._loaded = self.task.load_targets()
-        return self._loaded
-
     def _at(self, point: PathPoint) -> SceneTraining:
-        task = self.task
-        training = SceneTraining(task.splats, task.settings, task.supervision, task.threads, task.device)
+        training = SceneTraining(self.task)
         training.index = point.index
         if point.state is not None:
-            training.restore(point.state, point.index, self.targets)
+            training.restore(point.state, point.index)
         return training
 
     def _add(self, training: SceneTraining, number: int) -> PathPoint:

@@ -1,11 +1,11 @@
-"""Progress events of long work, and the time until which it shall be finished."""
+"""``Context`` of long work: its threads and device, the receiver of its progress events, and its deadline."""
 
 from __future__ import annotations
 
 import time
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol, runtime_checkable
 
 from kissgs.core.errors import StopSearch
 
@@ -35,15 +35,6 @@ def silent(stage: str, fraction: float, note: str = "") -> None:
     """Ignore every event; the default receiver."""
 
 
-def as_stage(stage: str, progress: Progress) -> Progress:
-    """Return a receiver that reports all events as ``stage``; inner stages of other names count as fraction 0."""
-
-    def receive(inner: str, fraction: float, note: str = "") -> None:
-        progress(stage, fraction if inner == stage else 0.0)
-
-    return receive
-
-
 def ignore_stop_search(progress: Progress) -> Progress:
     """Return a receiver that ignores :class:`StopSearch`: once the search is over, the work is completed."""
 
@@ -54,20 +45,16 @@ def ignore_stop_search(progress: Progress) -> Progress:
     return receive
 
 
+@dataclass(slots=True, eq=False)
 class SearchNote:
-    """Receiver that puts the state of a search before the notes of the events.
+    """Receiver that puts the state of a search before the notes of the events."""
 
-    Attributes:
-        note: state of the search; changed by it.
-    """
-
-    def __init__(self, progress: Progress) -> None:
-        self.note = ""
-        self._progress = progress
+    progress: Progress
+    note: str = ""  # the state, changed by the search
 
     def __call__(self, stage: str, fraction: float, note: str = "") -> None:
         """See :class:`Progress`."""
-        self._progress(stage, fraction, "; ".join(filter(None, [self.note, note])))
+        self.progress(stage, fraction, "; ".join(filter(None, [self.note, note])))
 
 
 # ``Deadline``: the time until which work shall be finished, and ``Pace``: the steps that fit in until then.
@@ -78,13 +65,9 @@ SETTLING_STEPS = 3
 
 @dataclass(frozen=True, slots=True)
 class Deadline:
-    """Time until which work shall be finished.
+    """Time until which work shall be finished."""
 
-    Attributes:
-        end: that time on the clock of :func:`time.perf_counter`, seconds.
-    """
-
-    end: float
+    end: float  # on the clock of :func:`time.perf_counter`, seconds
 
     @classmethod
     def after(cls, seconds: float) -> Deadline:
@@ -102,15 +85,12 @@ class Deadline:
 
 
 class Pace:
-    """Number of steps of equal work: as many as requested, or fewer if that many do not fit in before a deadline.
-
-    Attributes:
-        steps: the number of all steps, as far as is known now.
-    """
+    """Number of steps of equal work: as many as requested, or fewer if that many do not fit in before a deadline."""
 
     def __init__(self, steps: int, deadline: Deadline | None = None) -> None:
         """Prepare for ``steps`` steps, of which as many are made as ``deadline`` allows."""
         self.steps = steps
+        """The number of all steps, as far as is known now."""
         self._requested, self._deadline = steps, deadline
         self._settled: tuple[int, float] | None = None
 
@@ -126,6 +106,33 @@ class Pace:
             per_step = (now - self._settled[1]) / (done - self._settled[0])
         fitting = max(left, 0.0) / per_step if per_step > 0 else (0.0 if left <= 0 else self._requested)
         self.steps = min(done + int(min(fitting, self._requested)), self._requested)
+
+
+# ``Context``: what all functions of long work receive.
+
+Device = Literal["cpu", "cuda"]
+"""Device of training and of the rasteriser for images."""
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """Threads, device, receiver of progress events and deadline of some work."""
+
+    threads: int = 0  # 0 means one per processor; no result depends on it
+    device: Device = "cpu"
+    progress: Progress = silent
+    deadline: Deadline | None = None  # until then training makes as many steps as fit in; None for all steps
+
+    def stage(self, name: str) -> Context:
+        """Return the context for a part of stage ``name``; other stages in it count as fraction 0."""
+
+        def receive(stage: str, fraction: float, note: str = "") -> None:
+            self.progress(name, fraction if stage == name else 0.0)
+
+        return replace(self, progress=receive)
+
+
+DEFAULT_CONTEXT = Context()
 
 
 def load_kernels(progress: Progress = silent) -> None:

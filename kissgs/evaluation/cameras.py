@@ -11,7 +11,7 @@ import numpy as np
 from kissgs.cameras.views import Vec3, View, Views, camera_at, log_uniform, random_direction
 from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Progress
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.evaluation.scene_parts import (
@@ -154,7 +154,7 @@ MAX_INSIDE_SHARE, MAX_SINGLE_SHARE = 0.5, 0.3
 """Largest shares of an image that Gaussians around the camera, and that a single Gaussian, may cover."""
 
 
-def evaluation_views(splats: Splats, *, seed: int = 0, threads: int = 0, progress: Progress = silent) -> Views:
+def evaluation_views(splats: Splats, context: Context = DEFAULT_CONTEXT, *, seed: int = 0) -> Views:
     """Draw evaluation cameras over a whole scene; all of them are test views.
 
     Four kinds alternate, see :data:`KINDS`. A camera is drawn again only if its image is empty, or mostly covered by
@@ -166,10 +166,10 @@ def evaluation_views(splats: Splats, *, seed: int = 0, threads: int = 0, progres
     rng, counts = np.random.Generator(np.random.PCG64(seed)), prominence(splats)
     sampler = _PoseSampler.of(splats, counts)
     parts = Parts(base_colors_only(splats), *find_parts(splats, counts))
-    with Workers(threads) as pool:
-        drawn, shares = _draw_views(sampler, parts, rng, pool, progress)
+    with Workers(context.threads) as pool:
+        drawn, shares = _draw_views(sampler, parts, rng, pool, context.progress)
         added = parts.cameras_for(parts.overlooked(shares, drawn, pool)[:MAX_ADDED], rng, pool)
-    progress("cameras", 1.0)
+    context.progress("cameras", 1.0)
     digits = len(str(len(drawn) + len(added) - 1))
     views = [replace(view, name=f"{n:0{digits}} {view.name}") for n, view in enumerate([*drawn, *added])]
     return Views((), tuple(views), _grey(0.5), f"drawn over the whole scene, seed {seed}", origin=splats.origin)

@@ -15,14 +15,14 @@ from kissgs.cameras.views import Similarity, View, Views
 from kissgs.core.array_types import Float32, Shaped
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 from kissgs.core.positions import Origin, with_origin
-from kissgs.core.progress import Progress, load_kernels, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Device, Progress, load_kernels, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison
 from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.metrics import Flip, Lpips, ms_ssim, psnr, ssim
-from kissgs.rendering.rasterizer import Device, drawn_opacities, render
+from kissgs.rendering.rasterizer import drawn_opacities, render
 
 # Whether a capture belongs to a scene: renderings are compared with some photographs, since a capture of another scene,
 # or one whose cameras have other coordinates, would let an encoder remove what matters.
@@ -73,7 +73,7 @@ class _Fit:
         return f"{self.quality:.1f} dB to the photographs" if self.seen else "nothing of the scene shown"
 
 
-def in_scene_frame(splats: Splats, views: Views, *, threads: int = 0, progress: Progress = silent) -> Views:
+def in_scene_frame(splats: Splats, views: Views, context: Context = DEFAULT_CONTEXT) -> Views:
     """Return views with cameras in the coordinates of the scene; their note says if there was a choice.
 
     Each of :attr:`Views.similarities` is tried, and the best is kept if it is better than none: the one with the
@@ -81,14 +81,14 @@ def in_scene_frame(splats: Splats, views: Views, *, threads: int = 0, progress: 
     """
     if not views.similarities or not views.all:
         return _moved(views, None, splats.origin)
-    load_kernels(progress)
-    progress("cameras", 0.0)
-    moved, _, note = _best(splats, views, _samples(views), threads)
+    load_kernels(context.progress)
+    context.progress("cameras", 0.0)
+    moved, _, note = _best(splats, views, _samples(views), context.threads)
     return replace(moved, note="; ".join(filter(None, [views.note, note])))
 
 
 def fitting_views(
-    splats: Splats, views: Views, *, force: bool = False, threads: int = 0, progress: Progress = silent
+    splats: Splats, views: Views, context: Context = DEFAULT_CONTEXT, *, force: bool = False
 ) -> tuple[Views, str]:
     """Return views in the coordinates of the scene, as :func:`in_scene_frame` does, and what is odd about them.
 
@@ -96,10 +96,10 @@ def fitting_views(
     """
     if not views.all or not drawn_opacities(splats).any():
         return _moved(views, None, splats.origin), ""
-    load_kernels(progress)
-    progress("cameras", 0.0)
+    load_kernels(context.progress)
+    context.progress("cameras", 0.0)
     samples, source = _samples(views), views.source
-    views, fit, note = _best(splats, views, samples, threads)
+    views, fit, note = _best(splats, views, samples, context.threads)
     problem = _problem(fit, source, samples)
     refused = not fit.seen or (fit.psnr < LEAST_PSNR and fit.psnr_inside < USUAL_PSNR)
     if samples and not force and refused:
@@ -256,17 +256,18 @@ def evaluate(
     reference, candidate = clean(reference)[0], with_origin(clean(candidate)[0], reference.origin)
     measure = _measure(flip, lpips, device)
     given = 0 if views is None else len(_select_split(views, split)[1])  # an empty split is refused before any work
+    context = Context(threads, device, progress)
     if views is not None:
-        views = in_scene_frame(reference, views, threads=threads, progress=progress)
+        views = in_scene_frame(reference, views, context)
     load_kernels(progress)
-    drawn = farther(evaluation_views(reference, seed=seed, threads=threads, progress=progress), distance)
+    drawn = farther(evaluation_views(reference, context, seed=seed), distance)
     total = given + len(drawn.test)
 
     def compared(views: Views, split: Split, before: int, count: int) -> Evaluation:
         def advance(stage: str, fraction: float, note: str = "", /) -> None:
             progress(stage, (before + fraction * count) / total)
 
-        found = _compare_views(reference, candidate, views, split, measure, device, threads, progress=advance)
+        found = _compare_views(reference, candidate, views, split, measure, replace(context, progress=advance))
         return replace(found, shown=share_shown(reference, [each.view.camera for each in found.views], threads=threads))
 
     evaluation = None if views is None else compared(views, split, 0, given)
@@ -279,11 +280,9 @@ def compare_images(
     reference: Splats,
     candidate: Splats,
     views: Views,
+    context: Context = DEFAULT_CONTEXT,
     *,
-    device: Device = "cpu",
-    threads: int = 0,
     reference_images: dict[int, Rendering] | None = None,
-    progress: Progress = silent,
 ) -> Evaluation:
     """Compare two scenes from these views alone: the test views, or the training views if there are none.
 
@@ -291,13 +290,11 @@ def compare_images(
     candidates with one reference.
     """
     reference, candidate = clean(reference)[0], clean(candidate)[0]
-    if device == "cpu":
-        load_kernels(progress)
-    measure = _measure(False, False, device)
-    evaluation = _compare_views(
-        reference, candidate, views, "test", measure, device, threads, reference_images, progress=progress
-    )
-    progress("evaluate", 1.0)
+    if context.device == "cpu":
+        load_kernels(context.progress)
+    measure = _measure(False, False, context.device)
+    evaluation = _compare_views(reference, candidate, views, "test", measure, context, reference_images)
+    context.progress("evaluate", 1.0)
     return evaluation
 
 
@@ -307,25 +304,22 @@ def _compare_views(
     views: Views,
     split: Split,
     measure: Measure,
-    device: Device,
-    threads: int,
+    context: Context,
     reference_images: dict[int, Rendering] | None = None,
-    *,
-    progress: Progress,
 ) -> Evaluation:
     """Compare two clean scenes view by view."""
     used, chosen = _select_split(views, split)
     photographed = _have_photos(chosen)
     compared, blank = [], len(reference) > 0
     for done, view in enumerate(chosen):
-        progress("evaluate", done / len(chosen))
+        context.progress("evaluate", done / len(chosen))
         background = background_of(view, views.background)
         image = (reference_images or {}).get(done)
         if image is None:
-            image = render_clamped(reference, view.camera, background, device, threads)
+            image = render_clamped(reference, view.camera, background, context)
         if reference_images is not None:
             reference_images[done] = image
-        other = render_clamped(candidate, view.camera, background, device, threads)
+        other = render_clamped(candidate, view.camera, background, context)
         blank = blank and bool((image == np.clip(background, 0, 1)).all())
         comparison = _compare(image, other, view.load_photo() if photographed else None, measure)
         compared.append(ViewComparison(view=view, comparison=comparison, origin=reference.origin))
@@ -346,11 +340,10 @@ def background_of(view: View, default: Float32[np.ndarray, "3"]) -> Float32[np.n
     return default if view.background is None else view.background
 
 
-def render_clamped(
-    splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], device: Device, threads: int
-) -> Rendering:
+def render_clamped(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], context: Context) -> Rendering:
     """Return a rendering with its values clamped to [0, 1]."""
-    image, _ = render(splats, camera, background=background.tolist(), threads=threads, device=device)
+    colour = background.tolist()
+    image, _ = render(splats, camera, background=colour, threads=context.threads, device=context.device)
     return np.clip(image, 0, 1)
 
 

@@ -15,12 +15,11 @@ import numpy as np
 from PIL import Image
 
 from kissgs.core.array_types import Float32, Float64, UInt8
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
 from kissgs.evaluation.evaluate import background_of, render_clamped
 from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison, format_metric
 from kissgs.rendering.images import to_bytes
-from kissgs.rendering.rasterizer import Device
 
 # Error maps: differences of two images per pixel, as colours, and the crop with the largest error.
 
@@ -185,10 +184,7 @@ def html_report(
     evaluation: Evaluation,
     reference: ReportScene,
     candidate: ReportScene,
-    *,
-    device: Device = "cpu",
-    threads: int = 0,
-    progress: Progress = silent,
+    context: Context = DEFAULT_CONTEXT,
 ) -> str:
     """Return an evaluation as one HTML page with images of the worst views, then of the worst surroundings."""
     shown = _worst_first(evaluation)[:MAX_VIEWS]
@@ -199,14 +195,14 @@ def html_report(
     lowest = min((compared for _, _, compared in entries), key=lambda compared: compared.ranking_psnr)
     full, sections = full_scale(lowest.comparison.candidate_vs_reference.psnr), []
     for done, (anchor, group, compared) in enumerate(entries):
-        progress("html", done / len(entries))
+        context.progress("html", done / len(entries))
         view, background = compared.view, background_of(compared.view, group.background)
         renderings = [
-            render_clamped(scene.splats, view.camera, background, device, threads) for scene in (reference, candidate)
+            render_clamped(scene.splats, view.camera, background, context) for scene in (reference, candidate)
         ]
         photo = view.load_photo() if group.against == "photos" else None
         sections.append(_section(anchor, compared, renderings, photo, full))
-    progress("html", 1.0)
+    context.progress("html", 1.0)
     images = "Their images are" if len(shown) == len(evaluation.views) else f"Images of the worst {len(shown)} are"
     summary = f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}. {images} below, the "
     summary += "worst first."

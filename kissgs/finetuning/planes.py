@@ -14,13 +14,13 @@ from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, Int64
 from kissgs.core.numba_kernels import compiled
+from kissgs.core.progress import Device
 from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.quantize import MEANS_TOP, SIZE, ByteTables, Quantized, short_values, table_field
 from kissgs.planning.rd_fields import CAPTURED
 from kissgs.planning.sh_codebook import COEFFICIENTS
-from kissgs.rendering.rasterizer import Device
 
 # Numba kernels of fine-tuning: one pass over the levels in place of a dozen operations with arrays in float64.
 

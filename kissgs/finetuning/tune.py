@@ -14,9 +14,8 @@ import numpy as np
 import torch
 
 from kissgs._version import __version__
-from kissgs.cameras.views import Views
 from kissgs.core.errors import OutputError
-from kissgs.core.progress import Deadline, Pace, Progress, as_stage, silent
+from kissgs.core.progress import Context, Pace
 from kissgs.core.splats import ATTRIBUTES, MAX_GAUSSIANS, Splats, clean
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
@@ -28,14 +27,13 @@ from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
 from kissgs.planning.rate_distortion import implied_lambda
 from kissgs.planning.rd_criterion import Costs
-from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import FinetuneSettings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
-from kissgs.training.supervision import SupervisionViews, TrainingTargets, supervision_views, training_targets
+from kissgs.training.supervision import SupervisionViews, TrainingTargets
 
 SENSITIVITY_VIEWS = 64
 """Approximate number of training cameras from which costs are measured, if the plan has none."""
@@ -60,8 +58,8 @@ MOST_STEPS = {"photos": 1, "renderings": 2}
 """Most steps before a deadline, in units of the usual number, by the targets: more steps fit the photographs that train
 better, and those that are held out worse."""
 
-Write = Callable[[EncodingPlan, int, Progress], Encoded]
-"""Writes a plan that was fine-tuned in a number of steps; the third argument receives progress."""
+Write = Callable[[EncodingPlan, int, Context], Encoded]
+"""Writes a plan that was fine-tuned in a number of steps."""
 
 
 Decode = Callable[..., Splats]
@@ -75,43 +73,11 @@ class Tuner:
     original: Splats  # the original scene, clean; its renderings are the targets if there are no photographs
     settings: FinetuneSettings
     supervision: SupervisionViews
-    targets: TrainingTargets
-    device: Device
-    threads: int
-    progress: Progress  # receives the stage "finetune", and then those of writing
+    targets: TrainingTargets  # of the supervision's training views
+    context: Context  # its receiver gets the stage "finetune", and then those of writing
     container: ContainerModel = EVEN_LEVELS
     decode: Decode = decode_sogxt
-    deadline: Deadline | None = (
-        None  # until then training makes as many steps as fit in; None for those of the settings
-    )
     ending_seconds: float = 0.0  # expected time of what comes after the training; measured by the first container
-
-    @classmethod
-    def of(
-        cls,
-        original: Splats,
-        settings: FinetuneSettings,
-        views: Views | None,
-        *,
-        device: Device = "cpu",
-        threads: int = 0,
-        progress: Progress = silent,
-        container: ContainerModel = EVEN_LEVELS,
-        decode: Decode = decode_sogxt,
-        deadline: Deadline | None = None,
-        prepared: tuple[SupervisionViews, TrainingTargets] | None = None,
-    ) -> Tuner:
-        """Prepare the targets: photographs of ``views``, or renderings of the original from virtual cameras.
-
-        ``prepared`` are views and targets that exist already for these settings.
-        """
-        if prepared is None:
-            views_by_role = supervision_views(
-                original, views, settings, scoring_stride=0, threads=threads, progress=progress
-            )
-            targets = training_targets(original, views_by_role, threads=threads, device=device, progress=progress)
-            prepared = views_by_role, targets
-        return cls(original, settings, *prepared, device, threads, progress, container, decode, deadline)
 
     def __call__(
         self,
@@ -127,7 +93,7 @@ class Tuner:
         ``checkpoint`` exists and belongs to this work, training continues from it.
         """
         started = time.perf_counter()
-        as_finetune = as_stage("finetune", self.progress)
+        as_finetune = self.context.stage("finetune")
         before, first, rd_lambda = None, None, start.rd_lambda
         if plan is not None:
             before = write(plan, 0, as_finetune)
@@ -138,16 +104,16 @@ class Tuner:
             container = before or write(start, 0, as_finetune)
             rd_lambda = implied_lambda(self._coding_error(container, scene, as_finetune), int(start.grid.mask.sum()))
         pace = Pace(self.settings.steps)
-        if self.deadline is not None:
+        if self.context.deadline is not None:
             most = MOST_STEPS[self.targets.target_source] * self.settings.steps
-            pace = Pace(most, self.deadline.earlier(self.ending_seconds))
+            pace = Pace(most, self.context.deadline.earlier(self.ending_seconds))
             pace.update(0)
         if before is not None and first is not None and pace.steps == 0:
             return before, self._report(0, first, first, started, kept=False, notes=[NO_TIME])
         tuned, checkpoint_note = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, pace, checkpoint)
         trained = time.perf_counter()
-        after = write(tuned, pace.steps, self.progress)
-        second = self._evaluate(after, self._report_images_done)
+        after = write(tuned, pace.steps, self.context)
+        second = self._evaluate(after, replace(self.context, progress=self._report_images_done))
         self.ending_seconds = time.perf_counter() - trained
         kept = first is None or second.cost(rd_lambda) < first.cost(rd_lambda)
         notes = ["" if kept else NOT_KEPT, checkpoint_note]
@@ -171,38 +137,31 @@ class Tuner:
         )
 
     def _report_images_done(self, stage: str, fraction: float, note: str = "") -> None:
-        self.progress("images", 1.0)
+        self.context.progress("images", 1.0)
 
-    def _evaluate(self, encoded: Encoded, progress: Progress) -> _Result:
-        evaluation = self._compare(self.original, encoded, progress)
+    def _evaluate(self, encoded: Encoded, context: Context) -> _Result:
+        evaluation = self._compare(self.original, encoded, context)
         return _Result(
             bytes=len(zip_bytes(encoded.files)),
             psnr=evaluation.mean.candidate.psnr,
             error=float(np.mean([_squared_error(view.comparison.candidate.psnr) for view in evaluation.views])),
         )
 
-    def _coding_error(self, encoded: Encoded, scene: Splats, progress: Progress) -> float:
+    def _coding_error(self, encoded: Encoded, scene: Splats, context: Context) -> float:
         """Return the mean squared error of a container's renderings relative to those of the encoded scene."""
-        views = self._compare(scene, encoded, progress).views
+        views = self._compare(scene, encoded, context).views
         return float(np.mean([_squared_error(view.comparison.candidate_vs_reference.psnr) for view in views]))
 
-    def _compare(self, reference: Splats, encoded: Encoded, progress: Progress) -> Evaluation:
+    def _compare(self, reference: Splats, encoded: Encoded, context: Context) -> Evaluation:
         reading = ReadOptions(max_gaussians=max(len(reference), MAX_GAUSSIANS))
-        decoded = self.decode(encoded.files, reading, threads=self.threads)
-        return compare_images(
-            reference,
-            decoded,
-            self.supervision.eval_views,
-            device=self.device,
-            threads=self.threads,
-            progress=progress,
-        )
+        decoded = self.decode(encoded.files, reading, threads=context.threads)
+        return compare_images(reference, decoded, self.supervision.eval_views, context)
 
     def _train(
         self, plan: EncodingPlan, sh_degree: int, rd_lambda: float, pace: Pace, path: Path | None
     ) -> tuple[EncodingPlan, str]:
         """Return the fine-tuned plan, and a note if the checkpoint could not be saved."""
-        settings, scene = self.settings, QuantizedScene(plan, sh_degree, self.device, self.container)
+        settings, scene = self.settings, QuantizedScene(plan, sh_degree, self.context.device, self.container)
         checkpoint = Checkpoint(path, "" if path is None else self._key(plan, sh_degree))
         done, checkpoint_note = 0, ""
         loss_per_error = self._loss_per_error(scene)
@@ -232,7 +191,7 @@ class Tuner:
             regularizers=(rate_loss, TotalVariationLoss(scene, settings.tv_weight, pace)),
             batch=settings.batch,
         )
-        train(scene, self.targets, training, first=done, after=after, threads=self.threads, progress=self.progress)
+        train(scene, self.targets, training, self.context, first=done, after=after)
         return scene.plan(), checkpoint_note
 
     def _loss_per_error(self, scene: QuantizedScene) -> float:
@@ -245,7 +204,7 @@ class Tuner:
         with torch.no_grad(), torch_threads(1):  # the sums depend on the number of threads
             parameters = scene.gaussians()
             for n in islice(self.targets.order((settings.seed,)), min(LOSS_VIEWS, len(self.targets))):
-                self.progress("finetune", 0.0)
+                self.context.progress("finetune", 0.0)
                 loss, error = image_loss(
                     parameters,
                     self.targets,
@@ -253,7 +212,7 @@ class Tuner:
                     ssim_weight=settings.ssim_weight,
                     mse_weight=0.0,
                     antialiased=scene.antialiased,
-                    threads=self.threads,
+                    threads=self.context.threads,
                 )
                 losses.append(float(loss))
                 errors.append(error)
@@ -271,15 +230,15 @@ class Tuner:
             splats,
             WeightedCameras(targets.cameras[::stride], weights[::stride], self.supervision.background),
             view_uncertainty=VIEW_UNCERTAINTY,
-            threads=self.threads,
-            progress=as_stage("finetune", self.progress),
+            threads=self.context.threads,
+            progress=self.context.stage("finetune").progress,
         )
         return Costs.of(sensitivity, splats)
 
     def _key(self, plan: EncodingPlan, sh_degree: int) -> str:
         """Return the key of the work's checkpoint: equal only for equal results."""
-        targets = self.targets
-        settings = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {plan.rd_lambda} "
+        targets, device = self.targets, self.context.device
+        settings = f"{__version__} {device} {sh_degree} {self.settings.model_dump_json()} {plan.rd_lambda} "
         key = hashlib.sha256(f"{settings}{targets.synthetic} {targets.synthetic_per_epoch}".encode())
         for name, field in plan.fields.items():
             key.update(f"{name} {field.level_offset} {field.levels.shape} {field.table.shape}".encode())

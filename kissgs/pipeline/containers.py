@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned
 from kissgs.formats import ContainerName
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
@@ -29,25 +29,15 @@ def write_files(
     container: ContainerName,
     plan: EncodingPlan,
     settings: EncodeSettings,
+    context: Context = DEFAULT_CONTEXT,
     *,
     cleaned: Cleaned = NOTHING_CLEANED,
     compacted: int = 0,
     finetune_steps: int = 0,
-    threads: int = 0,
-    progress: Progress = silent,
 ) -> Encoded:
-    """Make the files of a plan for a container.
-
-    The other parameters are those of :func:`kissgs.sogxt.encode.write_files`.
-    """
+    """Make the files of a plan for a container; the counts are for the metadata of SOG-XT."""
     if container == "sog":
-        return sog.write_files(plan, settings, threads=threads, progress=progress)
+        return sog.write_files(plan, settings, context)
     return sogxt.write_files(
-        plan,
-        settings,
-        cleaned=cleaned,
-        compacted=compacted,
-        finetune_steps=finetune_steps,
-        threads=threads,
-        progress=progress,
+        plan, settings, context, cleaned=cleaned, compacted=compacted, finetune_steps=finetune_steps
     )

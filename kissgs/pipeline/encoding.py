@@ -15,7 +15,7 @@ from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import OutputError, UnsupportedError
-from kissgs.core.progress import Progress, SearchNote, as_stage, load_kernels
+from kissgs.core.progress import Context, Device, load_kernels
 from kissgs.core.resources import blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
@@ -26,14 +26,14 @@ from kissgs.pipeline.goal import Container
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.planner import plan_encoding, refine_order
 from kissgs.planning.rate_distortion import ColorRefit
-from kissgs.rendering.rasterizer import Device, need_cuda
+from kissgs.rendering.rasterizer import need_cuda
 from kissgs.settings import EncodeSettings, FinetuneSettings, Settings
 
 if TYPE_CHECKING:
+    from kissgs.compaction.popspa import Popspa
     from kissgs.finetuning.tune import Tuner
     from kissgs.pipeline.limited_time import SearchTime
     from kissgs.rendering.sensitivity import WeightedCameras
-    from kissgs.training.supervision import SupervisionViews, TrainingTargets
 
 
 def read_sensitivity(path: Path, key: str) -> Sensitivity | None:
@@ -79,38 +79,21 @@ REFIT_SIZE = 320
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Work:
-    """Scene, settings and receivers that all encodings of one compression share.
+    """Scene, settings and context that all encodings of one compression share."""
 
-    Attributes:
-        splats: clean scene to encode.
-        original: scene before compaction, or ``splats`` itself. Its renderings are the reference of a goal's PSNR, and
-            the targets of fine-tuning where there are no photographs.
-        settings: settings of all stages.
-        sensitivity: sensitivity of ``splats`` if measured before; None to measure it if the settings need it.
-        cache: file in which the measured sensitivity of ``splats`` is kept; None for no file.
-        views: capture of the scene; None for virtual cameras.
-        cleaned: defects of the input that were corrected, for the metadata.
-        container: the container to write.
-        packed: whether the files become a zip, whose size then counts; False for a folder.
-        device: device of training.
-        threads: number of threads; 0 means one per processor.
-        progress: receives the events of all stages; its note says how far a search has come.
-        time: time until which the container shall be finished; None for no limit.
-    """
-
-    splats: Splats
+    splats: Splats  # clean scene to encode
     original: Splats
+    """Scene before compaction, or ``splats`` itself. Its renderings are the reference of a goal's PSNR, and the targets
+    of fine-tuning where there are no photographs."""
     settings: Settings
-    sensitivity: Sensitivity | None
-    cache: Path | None
+    sensitivity: Sensitivity | None  # of splats if measured before; None to measure it if the settings need it
+    cache: Path | None  # file in which the measured sensitivity of splats is kept
     views: Views | None
-    cleaned: Cleaned
+    cleaned: Cleaned  # for the metadata
     container: ContainerName
-    packed: bool
-    device: Device
-    threads: int
-    progress: SearchNote
-    time: SearchTime | None
+    packed: bool  # whether the files become a zip, whose size then counts
+    context: Context
+    time: SearchTime | None  # how a limited time is divided; None for no limit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,6 +107,7 @@ class Measured:
 
 def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     """Measure the sensitivity of the work's scene, or of one with fewer Gaussians, if the settings need it."""
+    load_kernels(work.context.progress)
     if not settings.rate_distortion or len(splats) == 0:
         return Measured(splats)
     from kissgs.cameras.virtual.samples import default_view_count, sensitivity_cameras
@@ -132,7 +116,6 @@ def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     sensitivity = work.sensitivity if whole else None
     if sensitivity is not None:
         sensitivity.check(splats)
-    load_kernels(work.progress)
     captured = work.views is not None and len(work.views.train) > 0
     refits = captured and settings.color_refit_iterations > 0  # a refit to virtual cameras is worse than none
     if sensitivity is not None and not refits:
@@ -140,64 +123,44 @@ def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     cameras = sensitivity_cameras(
         splats,
         work.views,
+        work.context,
         count=settings.sensitivity_views or default_view_count(len(splats)),
         size=settings.sensitivity_view_size,
-        threads=work.threads,
-        progress=work.progress,
     )
     if sensitivity is None:
         view_uncertainty = settings.view_uncertainty
         if view_uncertainty is None:
             view_uncertainty = VIEW_UNCERTAINTY[captured]
-        cache = work.cache if whole else None
-        sensitivity = _sensitivity(splats, cameras, view_uncertainty, cache, work.threads, work.progress)
+        sensitivity = _sensitivity(splats, cameras, view_uncertainty, work.cache if whole else None, work.context)
         return_free_memory()
     recolor = None
     if refits:
-        recolor = _recolor(splats, cameras, sensitivity, settings.color_refit_iterations, work.threads, work.progress)
+        recolor = _recolor(splats, cameras, sensitivity, settings.color_refit_iterations, work.context)
     return Measured(splats, sensitivity, recolor)
 
 
-def plan(work: Work, scene: Measured, settings: EncodeSettings, progress: Progress) -> EncodingPlan:
+def plan(work: Work, scene: Measured, settings: EncodeSettings, context: Context) -> EncodingPlan:
     """Decide all levels of a scene."""
     return plan_encoding(
         scene.splats,
         settings,
+        context,
         sensitivity=scene.sensitivity,
         recolor=scene.recolor,
         container=MODELS[work.container],
         keep_costs=bool(work.settings.finetune.enabled),
-        threads=work.threads,
-        progress=progress if scene.sensitivity is None else _without_kernels(progress),
     )
 
 
-def _without_kernels(progress: Progress) -> Progress:
-    """Return a receiver for planning after :func:`measure`, which has loaded the kernels."""
-
-    def receive(stage: str, fraction: float, note: str = "") -> None:
-        if stage != "kernels":
-            progress(stage, fraction)
-
-    return receive
-
-
 def write(
-    work: Work, chosen: EncodingPlan, settings: EncodeSettings, compacted: int, progress: Progress, steps: int = 0
+    work: Work, chosen: EncodingPlan, settings: EncodeSettings, compacted: int, context: Context, steps: int = 0
 ) -> Encoded:
     """Make the files of a plan, of a scene from which ``compacted`` Gaussians are gone, fine-tuned in ``steps``."""
     if steps and settings.order == "refined":  # training has changed the levels
-        with blas_workers(work.threads) as pool:
-            chosen = refine_order(chosen, None, pool, progress)
+        with blas_workers(context.threads) as pool:
+            chosen = refine_order(chosen, None, pool, context.progress)
     return write_files(
-        work.container,
-        chosen,
-        settings,
-        cleaned=work.cleaned,
-        compacted=compacted,
-        finetune_steps=steps,
-        threads=work.threads,
-        progress=progress,
+        work.container, chosen, settings, context, cleaned=work.cleaned, compacted=compacted, finetune_steps=steps
     )
 
 
@@ -216,18 +179,19 @@ def encode(
     """
     compacted = len(work.original) - len(scene.splats)
     pruned = settings if tuner is None else _pruned_for_finetune(settings, work.settings.finetune)
-    chosen = plan(work, scene, pruned if completes else settings, work.progress)
+    chosen = plan(work, scene, pruned if completes else settings, work.context)
     if tuner is None or not chosen.grid.mask.any():
-        return Container(encoded=write(work, chosen, settings, compacted, work.progress), settings=settings)
+        return Container(encoded=write(work, chosen, settings, compacted, work.context), settings=settings)
 
-    def files(tuned: EncodingPlan, steps: int, progress: Progress) -> Encoded:
-        return write(work, tuned, pruned if steps or completes else settings, compacted, progress, steps)
+    def files(tuned: EncodingPlan, steps: int, context: Context) -> Encoded:
+        return write(work, tuned, pruned if steps or completes else settings, compacted, context, steps)
 
     start = chosen
     if not completes and pruned != settings:
-        start = plan(work, scene, pruned, as_stage("finetune", work.progress))
+        start = plan(work, scene, pruned, work.context.stage("finetune"))
     encoded, report = tuner(None if completes else chosen, start, scene.splats, files, checkpoint)
-    return Container(encoded=encoded, settings=pruned if report.kept else settings, finetuning=report)
+    used = pruned if report.kept else settings
+    return Container(encoded=encoded, settings=used, finetuning=report, checkpoint=checkpoint)
 
 
 def _pruned_for_finetune(settings: EncodeSettings, finetune: FinetuneSettings) -> EncodeSettings:
@@ -238,29 +202,19 @@ def _pruned_for_finetune(settings: EncodeSettings, finetune: FinetuneSettings) -
     return settings.model_copy(update={"prune_threshold_bits": threshold})
 
 
-def make_tuner(
-    work: Work,
-    settings: FinetuneSettings | None = None,
-    prepared: tuple[SupervisionViews, TrainingTargets] | None = None,
-) -> Tuner:
-    """Return what fine-tunes the levels, by default with the settings of the work.
-
-    ``prepared`` are views and targets of compaction, which are used if those of fine-tuning are the same.
-    """
+def make_tuner(work: Work, settings: FinetuneSettings | None = None, compaction: Popspa | None = None) -> Tuner:
+    """Return what fine-tunes the levels, with the images of a compaction if the settings would choose the same."""
     from kissgs.finetuning.tune import Tuner
+    from kissgs.training.supervision import supervision_views, training_targets
 
-    return Tuner.of(
-        work.original,
-        settings or work.settings.finetune,
-        work.views,
-        device=work.device,
-        threads=work.threads,
-        progress=work.progress,
-        container=MODELS[work.container],
-        decode=DECODERS[work.container],
-        deadline=None if work.time is None else work.time.deadline,
-        prepared=prepared if _same_views(work.settings) else None,
-    )
+    settings = settings or work.settings.finetune
+    if compaction is not None and compaction.settings.trains and _same_views(work.settings):
+        supervision, targets = compaction.supervision, compaction.load_targets()
+    else:
+        supervision = supervision_views(work.original, work.views, settings, work.context, scoring_stride=0)
+        targets = training_targets(work.original, supervision, work.context)
+    model, decode = MODELS[work.container], DECODERS[work.container]
+    return Tuner(work.original, settings, supervision, targets, work.context, model, decode)
 
 
 def _same_views(settings: Settings) -> bool:
@@ -289,20 +243,25 @@ def check_finetuning(settings: Settings, views: Views | None, device: Device) ->
 
 
 def _sensitivity(
-    splats: Splats,
-    cameras: WeightedCameras,
-    view_uncertainty: float,
-    cache: Path | None,
-    threads: int,
-    progress: Progress,
+    splats: Splats, cameras: WeightedCameras, view_uncertainty: float, cache: Path | None, context: Context
 ) -> Sensitivity:
     """Measure the sensitivity, or read it from the file ``cache`` if that was made for this scene and these cameras."""
     from kissgs.rendering.sensitivity import measure_sensitivity
 
-    if cache is None:
-        return measure_sensitivity(
+    key = "" if cache is None else _key(splats, cameras, view_uncertainty)
+    found = None if cache is None else read_sensitivity(cache, key)
+    if found is None:
+        threads, progress = context.threads, context.progress
+        found = measure_sensitivity(
             splats, cameras, view_uncertainty=view_uncertainty, threads=threads, progress=progress
         )
+        if cache is not None:
+            write_sensitivity(cache, found, key)
+    return found
+
+
+def _key(splats: Splats, cameras: WeightedCameras, view_uncertainty: float) -> str:
+    """Return the key of a sensitivity: equal only for equal results."""
     key = hashlib.sha256(
         f"{SENSITIVITY_VERSION} {__version__} {view_uncertainty} {splats.sh_degree} "
         f"{cameras.weights} {cameras.spread} {cameras.captured}{' antialiased' * splats.antialiased}".encode()
@@ -312,17 +271,11 @@ def _sensitivity(
         key.update(f"{camera.width} {camera.height} {camera.dilation} ".encode())
     for values in (cameras.background, *(getattr(splats, name) for name in ATTRIBUTES)):
         key.update(values.tobytes())
-    sensitivity = read_sensitivity(cache, key.hexdigest())
-    if sensitivity is None:
-        sensitivity = measure_sensitivity(
-            splats, cameras, view_uncertainty=view_uncertainty, threads=threads, progress=progress
-        )
-        write_sensitivity(cache, sensitivity, key.hexdigest())
-    return sensitivity
+    return key.hexdigest()
 
 
 def _recolor(
-    splats: Splats, cameras: WeightedCameras, sensitivity: Sensitivity, steps: int, threads: int, progress: Progress
+    splats: Splats, cameras: WeightedCameras, sensitivity: Sensitivity, steps: int, context: Context
 ) -> ColorRefit:
     """Return a function that refits base colours to renderings of the scene from the capture's cameras."""
     from kissgs.rendering.sensitivity import refit_colors
@@ -332,7 +285,7 @@ def _recolor(
     def recolor(decoded: Splats, order: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M 3"]:
         weights = sensitivity.color_weight[order], sensitivity.prior[order]
         decoded = replace(decoded, antialiased=splats.antialiased)
-        return refit_colors(decoded, splats, cameras, *weights, steps=steps, threads=threads, progress=progress)
+        return refit_colors(decoded, splats, cameras, *weights, context, steps=steps)
 
     return recolor
 

@@ -12,6 +12,8 @@ from kissgs.evaluation.results import MAX_VIEW_PSNR, as_json, drop_of, over_scen
 from kissgs.settings import EncodeSettings
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from kissgs.compaction.result import Compacted
     from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
@@ -26,6 +28,7 @@ class Container:
     settings: EncodeSettings
     finetuning: FinetuneReport | None = None
     compacted: Compacted | None = None
+    checkpoint: Path | None = None  # with the final state of its fine-tuning
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kissgs.core.errors import OutputError
-from kissgs.core.progress import Deadline
+from kissgs.core.progress import Context, Deadline
 from kissgs.core.resources import processors
 from kissgs.io.files import atomic_file, reason_of
 from kissgs.settings import Preset, Settings
@@ -227,10 +227,9 @@ def decided(settings: Settings, views: Views | None, *, keep_all: bool = False, 
     return settings.decided(photographs=photographs, torch=has_torch() if torch is None else torch)
 
 
-def choose(
-    requested: Settings, views: Views | None, count: int, deadline: Deadline | None, *, keep_all: bool, threads: int
-) -> Choice:
-    """Choose what to do with ``count`` Gaussians until ``deadline``; the note also says where torch is missing."""
+def choose(requested: Settings, views: Views | None, count: int, context: Context, *, keep_all: bool) -> Choice:
+    """Choose what to do with ``count`` Gaussians until the deadline; the note also says where torch is missing."""
+    deadline, threads = context.deadline, context.threads
     chosen = {
         torch: in_time(
             requested,

@@ -12,7 +12,7 @@ import numpy as np
 from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.core.array_types import Int
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import Deadline, Progress, SearchNote, as_stage, ignore_stop_search, silent
+from kissgs.core.progress import Context, Deadline, Device, Progress, ignore_stop_search, silent
 from kissgs.core.resources import StageTimer, peak_memory, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import MAX_GAUSSIANS, Cleaned, Splats, empty_splats
@@ -24,7 +24,6 @@ from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.goal import Attempt
 from kissgs.pipeline.limited_time import choose, decided
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
-from kissgs.rendering.rasterizer import Device
 from kissgs.settings import GOALS, EncodeSettings, Settings
 from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
 from kissgs.training.checkpoint import delete_checkpoints, finetune_checkpoint_path
@@ -200,25 +199,14 @@ def compact(
     if target is not None:
         check_ply(target, overwrite=overwrite)
     clock = StageTimer(progress)
+    context = Context(threads, device, clock)
     splats, cleaned, _ = open_scene(source, reading, threads, clock)
-    views, note = _fitting(splats, views, force_views, threads, clock)
-    result = compact_scene(
-        splats,
-        settings.compact,
-        views,
-        evaluate=evaluate,
-        checkpoint=Path(checkpoint) if checkpoint is not None else None,
-        threads=threads,
-        device=device,
-        progress=clock,
-    )
+    views, note = _fitting(splats, views, context, force=force_views)
+    file = Path(checkpoint) if checkpoint is not None else None
+    result = compact_scene(splats, settings.compact, views, context, evaluate=evaluate, checkpoint=file)
     if target is not None:
-        save_ply(
-            result.splats,
-            target,
-            overwrite=overwrite,
-            progress=ignore_stop_search(clock) if settings.searches else clock,
-        )
+        receiver = ignore_stop_search(clock) if settings.searches else clock
+        save_ply(result.splats, target, overwrite=overwrite, progress=receiver)
         delete_checkpoints(result.checkpoint)
     clock.stop()
     report = replace(
@@ -287,27 +275,28 @@ def compress(
     Raises:
         KissgsError: one of its subclasses, with a message for the user.
     """
-    from kissgs.pipeline.encoding import Work, encode, make_tuner, measure
+    from kissgs.pipeline.encoding import Work
 
     requested, keep_all = settings or Settings(), sensitivity is not None
     settings = decided(requested, views, keep_all=keep_all)
     target, kind = None if destination is None else Path(destination), named_container(container, destination)
     checkpoint = None if checkpoint is None else Path(checkpoint)
     _check(settings, views, target, checkpoint, overwrite=overwrite, device=device)
-    deadline = None if settings.time_limit is None else Deadline.after(settings.time_limit)
     clock = StageTimer(progress)
+    deadline = None if settings.time_limit is None else Deadline.after(settings.time_limit)
+    context = Context(threads, device, clock, deadline)
 
     # Read.
-    original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
-    notes, source_count, sh_degree = reading_notes(original), len(original) + cleaned.removed, original.sh_degree
+    splats, cleaned, source_bytes = open_scene(source, reading, threads, clock)
+    notes, source_count, sh_degree = reading_notes(splats), len(splats) + cleaned.removed, splats.sh_degree
     if evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled:
-        views, views_note = _fitting(original, views, force_views, threads, clock)
+        views, views_note = _fitting(splats, views, context, force=force_views)
         notes.append(views_note)
-    choice = choose(requested, views, len(original), deadline, keep_all=keep_all, threads=threads)
+    choice = choose(requested, views, len(splats), context, keep_all=keep_all)
     settings = choice.settings
     work = Work(
-        splats=original,
-        original=original,
+        splats=splats,
+        original=splats,
         settings=settings,
         sensitivity=sensitivity,
         cache=None if cache is None else Path(cache),
@@ -315,45 +304,31 @@ def compress(
         cleaned=cleaned,
         container=kind,
         packed=target is None or is_packed(target),
-        device=device,
-        threads=threads,
-        progress=SearchNote(clock),
+        context=context,
         time=choice.time,
     )
-    del original
-    after_search = ignore_stop_search(clock) if settings.searches else clock
+    del splats
 
     # Compact, plan, tune and write the files: once, or several times towards a goal.
     compacted = _compact_first(work, checkpoint)
-    finetune_checkpoint = None
-    attempts: tuple[Attempt, ...] = ()
+    after_search = replace(context, progress=ignore_stop_search(clock)) if settings.searches else context
     if settings.encode.has_goal:
-        from kissgs.pipeline.search import Search
-
-        search = Search(work, requested.aims)
-        best = search.run()
-        made, attempts, compacted = best.made, tuple(search.attempts), compacted or search.compacted(best)
-        finetuning, search_note = search.finetuning(best), search.note(best)
+        made, trials, note = _search(work, aims=requested.aims)
     else:
-        work.progress, search_note = SearchNote(after_search), ""
-        if settings.finetune.enabled and len(work.splats) > 0:
-            finetune_checkpoint = None if checkpoint is None else finetune_checkpoint_path(checkpoint)
-            scene = measure(work, work.splats, settings.encode)
-            made = encode(work, scene, settings.encode, make_tuner(work), checkpoint=finetune_checkpoint)
-        else:
-            made = _encode_once(work, disposable=not (evaluate or isinstance(source, Splats)))
-        finetuning = made.finetuning
+        work.context = after_search
+        trials, note = (), ""
+        made = _encode_once(work, checkpoint, disposable=not (evaluate or isinstance(source, Splats)))
+    compacted, encoded = compacted or made.compacted, made.encoded
 
     # Evaluate, store, report.
-    encoded = made.encoded
-    container_bytes, file_bytes = stored_sizes(encoded.files, packed=work.packed)
-    evaluation = _evaluate(work.original, encoded.files, views, threads, after_search) if evaluate else None
-    checkpoints = (None if compacted is None else compacted.checkpoint, finetune_checkpoint)
+    evaluation = _evaluate(work.original, encoded.files, views, after_search) if evaluate else None
+    checkpoints = [None if compacted is None else compacted.checkpoint, made.checkpoint]
     if target is not None:
-        after_search("write", 0.0)
+        after_search.progress("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite, names=FILES)
         delete_checkpoints(*checkpoints)
     clock.stop()
+    container_bytes, file_bytes = stored_sizes(encoded.files, packed=work.packed)
     report = Report(
         source_count=source_count,
         count=len(encoded.order),
@@ -363,15 +338,15 @@ def compress(
         file_bytes=file_bytes,
         cleaned=cleaned,
         compaction=None if compacted is None else compacted.report,
-        finetuning=finetuning,
+        finetuning=made.finetuning,
         invisible=encoded.invisible,
         pruned_by_rd=encoded.pruned_by_rd,
-        note="; ".join(filter(None, [*notes, encoded.coarse, encoded.note, search_note, choice.note])),
+        note="; ".join(filter(None, [*notes, encoded.coarse, encoded.note, note, choice.note])),
         clipped_colors=encoded.clipped_colors,
         form_error=encoded.form_error,
         max_quantization_error=encoded.errors,
         rd_lambda=encoded.rd_lambda,
-        trials=attempts,
+        trials=trials,
         seconds=clock.seconds,
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
@@ -383,15 +358,13 @@ def compress(
     return Compressed(encoded.files, order, report, remaining, kind)
 
 
-def _fitting(
-    splats: Splats, views: Views | None, force: bool, threads: int, progress: Progress
-) -> tuple[Views | None, str]:
+def _fitting(splats: Splats, views: Views | None, context: Context, *, force: bool) -> tuple[Views | None, str]:
     """Return the views in the coordinates of the scene and a note; raise InvalidViewsError if they do not show it."""
     if views is None:
         return None, ""
     from kissgs.evaluation.evaluate import fitting_views
 
-    return fitting_views(splats, views, force=force, threads=threads, progress=progress)
+    return fitting_views(splats, views, context, force=force)
 
 
 def _check(
@@ -427,31 +400,39 @@ def _compact_first(work: Work, checkpoint: Path | None) -> Compacted | None:
         if checkpoint is not None:
             raise UnsupportedError(NO_CHECKPOINT.format("goal"))
         return unchanged(work.splats, "too few to remove any") if len(work.splats) < 2 else None
-    compacted = compact_scene(
-        work.splats,
-        settings,
-        work.views,
-        checkpoint=checkpoint,
-        threads=work.threads,
-        device=work.device,
-        progress=work.progress,
-    )
+    compacted = compact_scene(work.splats, settings, work.views, work.context, checkpoint=checkpoint)
     work.splats = compacted.splats
     return compacted
 
 
-def _encode_once(work: Work, *, disposable: bool) -> Container:
-    """Plan and write the files; a disposable scene is forgotten in between, so that its memory is free for them."""
-    from kissgs.pipeline.encoding import measure, plan, write
+def _search(work: Work, *, aims: bool) -> tuple[Container, tuple[Attempt, ...], str]:
+    """Make containers until one meets the goal; return the best one, all attempts and a note."""
+    from kissgs.pipeline.search import Search
+
+    search = Search(work, aims)
+    best = search.run()
+    made = replace(best.made, compacted=search.compacted(best), finetuning=search.finetuning(best))
+    return made, tuple(search.attempts), search.note(best)
+
+
+def _encode_once(work: Work, checkpoint: Path | None, *, disposable: bool) -> Container:
+    """Plan, fine-tune if the settings say so, and write the files.
+
+    A disposable scene that is not fine-tuned is forgotten once it is planned, so that its memory is free for the files.
+    """
+    from kissgs.pipeline.encoding import encode, make_tuner, measure, plan, write
     from kissgs.pipeline.goal import Container
 
     settings, compacted = work.settings.encode, len(work.original) - len(work.splats)
-    chosen = plan(work, measure(work, work.splats, settings), settings, work.progress)
+    if work.settings.finetune.enabled and len(work.splats) > 0:
+        file = None if checkpoint is None else finetune_checkpoint_path(checkpoint)
+        return encode(work, measure(work, work.splats, settings), settings, make_tuner(work), checkpoint=file)
+    chosen = plan(work, measure(work, work.splats, settings), settings, work.context)
     if disposable:
         work.splats = work.original = empty_splats(0, 0)
         work.sensitivity = None
     return_free_memory()
-    return Container(encoded=write(work, chosen, settings, compacted, work.progress), settings=settings)
+    return Container(encoded=write(work, chosen, settings, compacted, work.context), settings=settings)
 
 
 def _settings_as_used(decided: Settings, used: EncodeSettings, requested: Settings) -> dict[str, Any]:
@@ -469,13 +450,11 @@ def _settings_as_used(decided: Settings, used: EncodeSettings, requested: Settin
     return decided.model_copy(update=groups).as_json()
 
 
-def _evaluate(
-    splats: Splats, container: Mapping[str, bytes], views: Views | None, threads: int, progress: Progress
-) -> Evaluation:
+def _evaluate(splats: Splats, container: Mapping[str, bytes], views: Views | None, context: Context) -> Evaluation:
     """Evaluate a container, and report decoding, kernels and rendering as the one stage "evaluate"."""
     from kissgs.evaluation.evaluate import evaluate
 
-    progress("evaluate", 0.0)
+    context.progress("evaluate", 0.0)
     most = ReadOptions(max_gaussians=max(len(splats), MAX_GAUSSIANS))
-    decoded = read_scene(container, most, threads=threads)
-    return evaluate(splats, decoded, views, threads=threads, progress=as_stage("evaluate", progress))
+    decoded = read_scene(container, most, threads=context.threads)
+    return evaluate(splats, decoded, views, threads=context.threads, progress=context.stage("evaluate").progress)

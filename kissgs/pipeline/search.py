@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kissgs.compaction.budget import Compactor, SearchEvaluation, unchanged
+from kissgs.compaction.budget import SearchEvaluation, chosen_views, estimate_note, unchanged
+from kissgs.compaction.popspa import PathPoint, Popspa, TrainingPath
 from kissgs.compaction.result import Compacted, CountTrial
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.progress import SearchNote, as_stage, ignore_stop_search
+from kissgs.core.progress import Context, SearchNote, ignore_stop_search
 from kissgs.core.splats import MAX_GAUSSIANS, Splats
 from kissgs.evaluation.results import ESTIMATED_DROP, drop_of
 from kissgs.io.scene_format import ReadOptions
@@ -39,7 +40,6 @@ from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
-    from kissgs.compaction.popspa import PathPoint, TrainingPath
     from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
     from kissgs.finetuning.tune import Tuner
@@ -114,7 +114,7 @@ class Search:
         goal: the goal.
         compare: compares a decoded container with the original scene.
         plan: number of trained containers, and the first of them.
-        compactor: compactor of the scene if fewer Gaussians may serve the goal; None to keep all of them.
+        compactor: compaction of the scene if fewer Gaussians may serve the goal; None to keep all of them.
         path: its training path.
         attempts: all attempts, in order, without their containers.
         tried: scenes that were evaluated before any encoding.
@@ -125,7 +125,7 @@ class Search:
 
     work: Work
     aims: bool = False
-    compactor: Compactor | None = field(init=False, default=None)
+    compactor: Popspa | None = field(init=False, default=None)
     goal: Goal = field(init=False)
     compare: SearchEvaluation = field(init=False)
     plan: SearchPlan = field(init=False)
@@ -135,6 +135,7 @@ class Search:
     best: Attempt | None = field(init=False, default=None)
     closest: Attempt | None = field(init=False, default=None)
     stopped: bool = field(init=False, default=False)
+    _progress: SearchNote = field(init=False)  # the receiver of the work's context
     _pruned: list[Attempt] = field(init=False, default_factory=list)  # losses at points 1, 2 and so on
     _whole: Scene | None = field(init=False, default=None)
     _whole_searched: bool = field(init=False, default=False)
@@ -147,24 +148,25 @@ class Search:
     _longest: float = field(init=False, default=0.0)  # attempt without training, seconds
 
     def __post_init__(self) -> None:
-        work, compact = self.work, self.work.settings.compact
+        self._progress = SearchNote(self.work.context.progress)
+        work = self.work = replace(self.work, context=replace(self.work.context, progress=self._progress))
+        compact = work.settings.compact
         self.goal = Goal.of(self.encode_settings)
         if not compact.auto_count or len(work.splats) < 2:
             self.plan = SearchPlan(TUNED_CONTAINERS)
-            self.compare = SearchEvaluation(work.original, work.views, work.threads)
+            self.compare = SearchEvaluation(work.original, work.views)
             return
-        self.compactor = Compactor.of(
-            work.splats, compact, work.views, threads=work.threads, device=work.device, progress=work.progress
-        )
+        supervision = chosen_views(work.splats, compact, work.views, work.context)
+        self.compactor = Popspa(work.splats, compact, supervision, work.context)
         self.plan = SearchPlan(compact.max_compactions)
         if work.time is not None and self.trains:
             in_time = work.time.plan(photographs=self.photographs, aims=self.aims)
             self.plan = replace(in_time, containers=min(self.plan.containers, in_time.containers))
         if work.time is not None and self.photographs:
             most = work.time.scoring_views(max(self.first[0], 1))
-            self.compactor = replace(self.compactor, supervision=self.compactor.supervision.with_scoring(most))
-        self.compare = self.compactor.compare
-        self.path = self.compactor.path(keep_states=not self.tunes)
+            self.compactor = replace(self.compactor, supervision=supervision.with_scoring(most))
+        self.compare = SearchEvaluation.of(work.splats, work.views, supervision)
+        self.path = TrainingPath(self.compactor, keep_states=not self.tunes)
 
     @property
     def encode_settings(self) -> EncodeSettings:
@@ -243,7 +245,7 @@ class Search:
             if found is None:
                 raise
         finally:
-            self.work.progress.note = ""
+            self._progress.note = ""
         if self.best is None and self.aims:
             self.best = self.closest
         if self.best is None or self.best.bytes > (self.goal.most_bytes or math.inf):
@@ -356,11 +358,11 @@ class Search:
         A trained point that leaves less than half of the error to the encoder is left out, as most do that are still
         to be fine-tuned.
         """
-        work, latest, self.stopped = self.work, path.points[-1], False
-        self.work = replace(work, progress=SearchNote(ignore_stop_search(work.progress)))
+        latest, self.stopped = path.points[-1], False
+        self._progress.progress = ignore_stop_search(self._progress.progress)
         serves = self.goal.by_size
         if not serves and latest.trained:
-            evaluation = self.compare(latest.splats, as_stage("evaluate", self.work.progress))
+            evaluation = self.compare(latest.splats, self.work.context.stage("evaluate"))
             serves = self.goal.margin(self.goal.measured(Attempt(len(latest), None, 0), evaluation)) >= 1.0  # half
         if serves:
             self._along_lambda(self._untrained(path, latest), most=self.encode_settings.max_encodes)
@@ -386,7 +388,7 @@ class Search:
 
     def _try_unencoded(self, splats: Splats) -> Attempt:
         """Return the figures of a scene that is not encoded, and record them for the report."""
-        evaluation = self.compare(splats, as_stage("evaluate", self.work.progress))
+        evaluation = self.compare(splats, self.work.context.stage("evaluate"))
         found = self.goal.measured(Attempt(len(splats), None, 0), evaluation)
         ssim_decides = self.goal.decisive(found).setting == "max_ssim_drop"
         self.tried.append(CountTrial(len(splats), drop_of(evaluation), found.ssim_drop, ssim_decides))
@@ -435,7 +437,8 @@ class Search:
             self._trained[number] = scene
         if self._tuner is not None and self.work.time is not None:
             share = self.work.time.for_container(self._containers_left)
-            self._tuner.deadline = share.earlier(self._evaluation_seconds)
+            deadline = share.earlier(self._evaluation_seconds)
+            self._tuner.context = replace(self._tuner.context, deadline=deadline)
         return self._trained[number]
 
     def _completing_tuner(self, path: TrainingPath) -> Tuner:
@@ -443,8 +446,7 @@ class Search:
         finetune, compactor = self.work.settings.finetune, path.task
         changes = {name: factor * getattr(finetune, name) for name, factor in COMPLETING.items()}
         changes["steps"] = max(1, round(changes["steps"]))
-        prepared = (compactor.supervision, path.targets) if compactor.settings.trains else None
-        tuner = make_tuner(self.work, finetune.model_copy(update=changes), prepared)
+        tuner = make_tuner(self.work, finetune.model_copy(update=changes), compactor)
         if self.work.time is None:
             return tuner
         seconds = self.compare.seconds if compactor.supervision.captured else 0.0
@@ -485,7 +487,7 @@ class Search:
         """Make trained containers of points of the path up to ``last``, the first one at point ``first``."""
 
         def encode_at(number: int, log2_lambda: float | None) -> Attempt:
-            self.work.progress.note = "; last: ".join(
+            self._progress.note = "; last: ".join(
                 [f"{count_at(number, len(path.whole)):,} Gaussians", *(each.summary() for each in self.attempts[-1:])]
             )
             scene = self._scene_at(path, number)
@@ -537,7 +539,7 @@ class Search:
 
     def _keep(self, attempt: Attempt, scene: Scene) -> None:
         self.attempts.append(replace(attempt, container=None))
-        self.work.progress.note = f"try {len(self.attempts) + 1}, last: {attempt.summary()}"
+        self._progress.note = f"try {len(self.attempts) + 1}, last: {attempt.summary()}"
         if self.goal.margin(attempt) < 0:
             if self.closest is None or self.goal.margin(attempt) > self.goal.margin(self.closest):
                 self.closest = attempt
@@ -563,11 +565,12 @@ class Search:
     def _evaluate(self, made: Container) -> Evaluation:
         """Compare a container with the original, also where the search is stopped meanwhile: the container exists."""
         try:
-            self.work.progress("evaluate", 0.0)
+            self.work.context.progress("evaluate", 0.0)
         except StopSearch:
             self.stopped = True
         most = ReadOptions(max_gaussians=max(len(self.work.original), MAX_GAUSSIANS))
-        return self.compare(read_scene(made.encoded.files, most, threads=self.work.threads))
+        threads = self.work.context.threads
+        return self.compare(read_scene(made.encoded.files, most, threads=threads), Context(threads))
 
     def _loss(self, made: Container) -> float:
         """Return the drop of PSNR of a container, decibels; infinite if a rendering failed.
@@ -589,7 +592,8 @@ class Search:
         found = best.made.compacted or unchanged(self.work.splats, self._reason_to_keep_all())
         trained = found.report.target_source == "photos" or best.trained
         beyond = BEYOND_PHOTOGRAPHS if trained and best.made.compacted and self.photographs else ""
-        estimated = "" if self.encode_settings.max_psnr_drop is not None or not self.tried else self.compactor.note
+        estimates = bool(self.tried) and self.encode_settings.max_psnr_drop is None
+        estimated = estimate_note(self.compactor.supervision) if estimates else ""
         note = "; ".join(filter(None, [found.report.note, beyond, estimated]))
         return replace(found, report=replace(found.report, trials=tuple(self.tried), note=note))
 

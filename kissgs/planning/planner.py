@@ -11,7 +11,7 @@ import numpy as np
 from kissgs.core.array_types import Float32, Float64, Int, Int32, Integer, UInt8, UInt16
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.positions import coarse_note
-from kissgs.core.progress import Progress, load_kernels, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Progress
 from kissgs.core.resources import Workers, blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS, Splats
@@ -288,14 +288,13 @@ MAX_GROUPS = 1 << 14
 def plan_encoding(
     splats: Splats,
     settings: EncodeSettings,
+    context: Context = DEFAULT_CONTEXT,
     *,
     sensitivity: Sensitivity | None = None,
     recolor: ColorRefit | None = None,
     container: ContainerModel = EVEN_LEVELS,
     keep_costs: bool = True,
     groups: UInt16[np.ndarray, " N"] | None = None,
-    threads: int = 0,
-    progress: Progress = silent,
 ) -> EncodingPlan:
     """Choose order, rotation forms, codebook and levels for a clean scene.
 
@@ -308,16 +307,15 @@ def plan_encoding(
         raise UnsupportedError(f"a container holds up to {MAX_GROUPS:,} groups of Gaussians; make them larger")
     if sensitivity is not None:
         sensitivity.check(splats)
-    load_kernels(progress)
     kept = visible_gaussians(splats, settings)
-    with blas_workers(threads) as pool:
-        planning = Planning(settings, container, pool, progress)
+    with blas_workers(context.threads) as pool:
+        planning = Planning(settings, container, pool, context.progress)
         if sensitivity is not None and (sensitivity.color_weight[kept] > 0).any():
             plan = plan_rate_distortion(splats, kept, sensitivity, recolor, planning, keep_costs, groups)
         else:
             plan = plan_uniform(splats, kept, planning, groups)
         if settings.order == "refined":
-            plan = refine_order(plan, groups, pool, progress)
+            plan = refine_order(plan, groups, pool, context.progress)
         return replace(plan, coarse=_coarse(splats, plan))
 
 

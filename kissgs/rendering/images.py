@@ -11,10 +11,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from kissgs.core.array_types import Float32, UInt8
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.rasterizer import BLACK, Colour, Device, render
+from kissgs.rendering.rasterizer import BLACK, Colour, render
 
 LOSSLESS = 100
 """Value of ``quality`` that means lossless WebP."""
@@ -29,11 +29,9 @@ MAX_PIXEL_BYTES = 4 << 30
 def render_all(
     splats: Splats,
     cameras: Sequence[Camera],
+    context: Context = DEFAULT_CONTEXT,
     *,
     background: Colour = BLACK,
-    threads: int = 0,
-    device: Device = "cpu",
-    progress: Progress = silent,
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
     """Render an image for each camera, with 8 bits per channel; a repeated camera object gives the same array."""
     if 3 * sum(camera.width * camera.height for camera in cameras) > MAX_PIXEL_BYTES:
@@ -43,11 +41,11 @@ def render_all(
         )
     rendered: dict[int, UInt8[np.ndarray, "H W 3"]] = {}
     for done, camera in enumerate(cameras):
-        progress("render", done / len(cameras))
+        context.progress("render", done / len(cameras))
         if id(camera) not in rendered:
-            image, _ = render(splats, camera, background=background, threads=threads, device=device)
+            image, _ = render(splats, camera, background=background, threads=context.threads, device=context.device)
             rendered[id(camera)] = to_bytes(image)
-    progress("render", 1.0)
+    context.progress("render", 1.0)
     return [rendered[id(camera)] for camera in cameras]
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Device
 from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.rendering import constants
@@ -120,7 +120,6 @@ def image_renderer(splats: Splats) -> ImageRenderer:
 # :mod:`kissgs.rendering.constants` defines the image. Torch is needed on CUDA only. With gradients, the rasteriser is
 # :func:`kissgs.rendering.differentiable.rasterize`.
 
-Device = Literal["cpu", "cuda"]
 Colour = Sequence[float]
 
 BLACK: Colour = (0.0, 0.0, 0.0)
@@ -166,10 +165,9 @@ def drawn_opacities(splats: Splats) -> Float64[np.ndarray, " N"]:
 def removal_scores(
     splats: Splats,
     cameras: Sequence[Camera],
+    context: Context = DEFAULT_CONTEXT,
     *,
     background: Colour = BLACK,
-    threads: int = 0,
-    progress: Progress = silent,
 ) -> Float64[np.ndarray, " N"]:
     """Return, for each Gaussian, the squared image error that its removal alone would cause.
 
@@ -181,9 +179,9 @@ def removal_scores(
 
     scores = np.zeros(len(splats), np.float64)
     colour = np.asarray(background, np.float32)
-    with Workers(threads) as pool:
+    with Workers(context.threads) as pool:
         for done, camera in enumerate(cameras):
-            progress("score", done / len(cameras))
+            context.progress("score", done / len(cameras))
             scores += frame_scores(draw(splats, camera, colour, pool), pool)
-    progress("score", 1.0)
+    context.progress("score", 1.0)
     return scores

@@ -12,7 +12,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Progress, silent
 from kissgs.core.resources import Workers, return_free_memory
 from kissgs.core.sensitivity import BLOCK, LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import SH_C0, Splats
@@ -241,10 +241,9 @@ def refit_colors(
     cameras: WeightedCameras,
     color_weight: Float32[np.ndarray, " M"],
     prior: Float32[np.ndarray, " M"],
+    context: Context = DEFAULT_CONTEXT,
     *,
     steps: int,
-    threads: int = 0,
-    progress: Progress = silent,
 ) -> Float32[np.ndarray, "M 3"]:
     """Return base colours of ``decoded`` with which its renderings are nearest to those of ``original``.
 
@@ -259,7 +258,7 @@ def refit_colors(
     damping = DAMPING * float(np.median(diagonal[diagonal > 0]))
     attraction = prior.astype(np.float64)[:, None] * SH_C0**2 + damping
     views, passes = list(zip(cameras.cameras, cameras.per_pixel(), strict=True)), itertools.count()
-    with Workers(threads) as pool:
+    with Workers(context.threads) as pool:
         targets = []
         if sum(camera.width * camera.height for camera, _ in views) <= MAX_CACHED_PIXELS:
             targets = [draw(original, camera, cameras.background, pool).image for camera, _ in views]
@@ -269,14 +268,14 @@ def refit_colors(
             total, number = np.zeros(sh0.shape, np.float32), next(passes)
             scene = replace(decoded, sh0=sh0.astype(np.float32))
             for done, (camera, weight) in enumerate(views):
-                progress("refit", (number + done / len(views)) / (steps + 1))
+                context.progress("refit", (number + done / len(views)) / (steps + 1))
                 frame = draw(scene, camera, cameras.background, pool)
                 target = targets[done] if targets else draw(original, camera, cameras.background, pool).image
                 add_color_gradients(frame, (target - frame.image) * np.float32(weight), total, pool)
             return attraction * (decoded.sh0 - sh0) + total
 
         sh0 = _conjugate_gradients(negative_gradient, decoded.sh0.astype(np.float64), diagonal + damping, steps)
-    progress("refit", 1.0)
+    context.progress("refit", 1.0)
     return np.clip(sh0, decoded.sh0 - MAX_CHANGE, decoded.sh0 + MAX_CHANGE).astype(np.float32)
 
 

@@ -12,7 +12,7 @@ from kissgs._version import __version__
 from kissgs.core.array_types import UInt8
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.positions import recorded
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context
 from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.containers import META_NAME
@@ -48,21 +48,14 @@ FILES = (META_NAME, *MEANS, QUATS, SCALES, SH0, *SHN)
 """Names of all files that a container may have."""
 
 
-def write_files(
-    plan: EncodingPlan,
-    settings: EncodeSettings,
-    *,
-    threads: int = 0,
-    progress: Progress = silent,
-) -> Encoded:
+def write_files(plan: EncodingPlan, settings: EncodeSettings, context: Context = DEFAULT_CONTEXT) -> Encoded:
     """Make the files of a plan."""
     if not plan.grid.mask.any():
         raise UnsupportedError("a SOG file cannot hold a scene without visible Gaussians; write SOG-XT (.zip) instead")
-
-    progress("images", 0.0)
+    context.progress("images", 0.0)
     images = render_planes(plan)
-    with blas_workers(threads) as pool:
-        files = compress_images(images, settings, pool, partial(progress, "images"), codebook=SHN[0])
+    with blas_workers(context.threads) as pool:
+        files = compress_images(images, settings, pool, partial(context.progress, "images"), codebook=SHN[0])
     return Encoded.of(plan, {META_NAME: metadata(plan, plan.scene.sh_degree), **files})
 
 

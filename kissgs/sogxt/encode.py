@@ -9,7 +9,7 @@ import numpy as np
 
 from kissgs._version import __version__
 from kissgs.core.array_types import Float32, UInt8
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, load_kernels
 from kissgs.core.resources import blas_workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, NOTHING_CLEANED, Cleaned, Splats
@@ -27,32 +27,31 @@ from kissgs.sogxt import container, metadata
 def encode(
     splats: Splats,
     settings: EncodeSettings,
+    context: Context = DEFAULT_CONTEXT,
     *,
     sensitivity: Sensitivity | None = None,
     recolor: ColorRefit | None = None,
-    threads: int = 0,
-    progress: Progress = silent,
 ) -> Encoded:
     """Encode a clean scene: :func:`kissgs.planning.planner.plan_encoding`, then :func:`write_files`."""
-    plan = plan_encoding(splats, settings, sensitivity=sensitivity, recolor=recolor, threads=threads, progress=progress)
-    return write_files(plan, settings, threads=threads, progress=progress)
+    load_kernels(context.progress)
+    plan = plan_encoding(splats, settings, context, sensitivity=sensitivity, recolor=recolor)
+    return write_files(plan, settings, context)
 
 
 def write_files(
     plan: EncodingPlan,
     settings: EncodeSettings,
+    context: Context = DEFAULT_CONTEXT,
     *,
     cleaned: Cleaned = NOTHING_CLEANED,
     compacted: int = 0,
     finetune_steps: int = 0,
-    threads: int = 0,
-    progress: Progress = silent,
 ) -> Encoded:
     """Make the files of a plan; the bytes do not depend on the number of threads. The metadata records the counts."""
-    progress("images", 0.0)
+    context.progress("images", 0.0)
     images = render_planes(plan)
-    with blas_workers(threads) as pool:
-        files = compress_images(images, settings, pool, partial(progress, "images"))
+    with blas_workers(context.threads) as pool:
+        files = compress_images(images, settings, pool, partial(context.progress, "images"))
     scene, count = plan.scene, int(plan.grid.mask.sum())
     omitted = {*GOALS, "max_encodes"} | (
         {"sh_codebook_size"} if settings.sh_codebook_size == MAX_CODEBOOK_SIDE**2 else set()

@@ -17,7 +17,7 @@ from kissgs.cameras.views import black
 from kissgs.cameras.virtual.samples import MAX_VIEWS, default_view_count, sensitivity_cameras
 from kissgs.core.array_types import Float32
 from kissgs.core.positions import STREAMED_REMEDY, WORLD, Cuts, cuts_without_coarse, recorded, visible_sizes
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import Context, Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, clean, concatenate, sampled_rows
 from kissgs.formats import ContainerName
@@ -271,7 +271,7 @@ def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: 
     least = min(MOST_VIEWS, VIEWS_PER_CHUNK * len(layout.filled))
     views = settings.sensitivity_views or max(default_view_count(total), least)
     size = settings.sensitivity_view_size
-    cameras = sensitivity_cameras(coarsest, None, count=views, size=size, threads=threads)
+    cameras = sensitivity_cameras(coarsest, None, Context(threads), count=views, size=size)
     write_json(work / CAMERAS, [camera_as_dict(camera) for camera in cameras.cameras])
 
 
@@ -295,18 +295,18 @@ def make_file(
             cameras = [view.camera for view in read_cameras(work / CAMERAS)]
             sensitivity = measure_file(splats, others, cameras, file.level, settings, threads, progress)
             del others
+        context = Context(threads, progress=progress)
         plan = plan_encoding(
             splats,
             settings,
+            context,
             sensitivity=sensitivity,
             container=MODELS[layout.container],
             groups=groups,
             keep_costs=False,
-            threads=threads,
-            progress=progress,
         )
         del sensitivity, splats
-        encoded = write_files(layout.container, plan, settings, threads=threads, progress=progress)
+        encoded = write_files(layout.container, plan, settings, context)
         write_container(encoded.files, work / OUT / layout.path(file.name), overwrite=True)
         rows = np.bincount(groups[encoded.order], minlength=len(counts)).tolist()
         stored = {"counts": rows, "note": encoded.coarse}

@@ -16,7 +16,7 @@ from typing import Any
 from kissgs._version import __version__
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.positions import middle_of, with_origin, world_positions
-from kissgs.core.progress import Progress, as_stage, silent
+from kissgs.core.progress import Context, Progress, silent
 from kissgs.core.splats import BLOCK, Splats
 from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
 from kissgs.io.files import reason_of
@@ -208,7 +208,8 @@ def _make(
             return
         for at, item in enumerate(items):
             part(at / len(items))
-            run_item(item, as_stage(stage, lambda _, now, note="", at=at: part((at + now) / len(items))))
+            context = Context(progress=lambda _, now, note="", at=at: part((at + now) / len(items)))
+            run_item(item, context.stage(stage).progress)
 
     run("merge", "chunk", layout.filled)
     if encode.rate_distortion and not (work / CAMERAS).exists():

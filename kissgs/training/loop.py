@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import Pace, Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Pace
 from kissgs.core.resources import keep_free_memory
 from kissgs.rendering import tensors
 from kissgs.rendering.cpu.frame import Gradients
@@ -85,23 +85,22 @@ def train(
     scene: TrainableScene,
     targets: TrainingTargets,
     plan: TrainingPlan,
+    context: Context = DEFAULT_CONTEXT,
     *,
     first: int = 0,
     after: Callable[[int], None] = lambda done: None,
-    threads: int = 0,
-    progress: Progress = silent,
 ) -> None:
     """Fit a scene to target images, from step ``first`` on; ``after`` receives the number of steps done.
 
     On the CPU, the result depends on the seed but not on the number of threads; on a GPU it is not reproducible. If
-    ``progress`` raises, the scene is in the state after the last completed step.
+    the receiver of progress raises, the scene is in the state after the last completed step.
     """
     order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
-    with torch_threads(threads), keep_free_memory():
+    with torch_threads(context.threads), keep_free_memory():
         step, pace = first, plan.pace
         pace.update(step)
         while step < pace.steps:
-            progress(plan.stage, step / pace.steps, running.text(len(scene)))
+            context.progress(plan.stage, step / pace.steps, running.text(len(scene)))
             parameters = scene.gaussians()
             losses, errors = [], []
             for n in islice(order, plan.batch):
@@ -112,7 +111,7 @@ def train(
                     ssim_weight=plan.ssim_weight,
                     mse_weight=plan.mse_weight,
                     antialiased=scene.antialiased,
-                    threads=threads,
+                    threads=context.threads,
                     receive=scene.receive,
                 )
                 losses.append(loss)
@@ -129,7 +128,7 @@ def train(
             step += 1
             after(step)
             pace.update(step)
-    progress(plan.stage, 1.0, running.text(len(scene)))
+    context.progress(plan.stage, 1.0, running.text(len(scene)))
 
 
 def image_loss(

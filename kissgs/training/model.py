@@ -14,6 +14,7 @@ from numba import njit
 from kissgs.core.array_types import Float32, Int, Int32
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.numba_kernels import compiled
+from kissgs.core.progress import Device
 from kissgs.core.resources import Workers
 from kissgs.core.splats import (
     ATTRIBUTES,
@@ -26,7 +27,6 @@ from kissgs.core.splats import (
     clean,
 )
 from kissgs.rendering.cpu.frame import Gradients
-from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.tensors import tensors_of
 
 try:

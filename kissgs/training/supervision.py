@@ -12,10 +12,10 @@ import numpy as np
 from kissgs.cameras.views import View, Views, black
 from kissgs.cameras.virtual.samples import close_ups, random_poses, scattered_cameras, scene_views
 from kissgs.core.array_types import Float32, Shaped
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.rasterizer import Device, ImageRenderer, image_renderer, render
+from kissgs.rendering.rasterizer import ImageRenderer, image_renderer, render
 from kissgs.settings import TrainingViewSettings
 
 SCORING_STRIDE = 4
@@ -74,10 +74,9 @@ def supervision_views(
     splats: Splats,
     views: Views | None,
     settings: TrainingViewSettings,
+    context: Context = DEFAULT_CONTEXT,
     *,
     scoring_stride: int = SCORING_STRIDE,
-    threads: int = 0,
-    progress: Progress = silent,
 ) -> SupervisionViews:
     """Return a capture's training views with virtual ones of the whole scene, or virtual views alone.
 
@@ -85,12 +84,12 @@ def supervision_views(
     drawn; 0: none scores.
     """
     if views is None or not views.train:
-        virtual = _virtual_views(splats, settings, scoring_stride, threads, progress)
+        virtual = _virtual_views(splats, settings, scoring_stride, context)
         if views is None or not views.test:
             return virtual
         return replace(virtual, test=_evaluation_views(views), background=views.background)
     train = tuple(_thinned(view, number, settings.view_size) for number, view in enumerate(views.train))
-    synthetic, per_epoch = _synthetic_views(splats, views.train, settings, threads, progress)
+    synthetic, per_epoch = _synthetic_views(splats, views.train, settings, context)
     side = _virtual_side(settings)
     scoring = math.ceil(SCORING_SHARE * len(train)) if scoring_stride else 0
     source = f"{len(synthetic)} virtual cameras" if synthetic else ""
@@ -110,7 +109,7 @@ def supervision_views(
 
 
 def _synthetic_views(
-    splats: Splats, train: Sequence[View], settings: TrainingViewSettings, threads: int, progress: Progress
+    splats: Splats, train: Sequence[View], settings: TrainingViewSettings, context: Context
 ) -> tuple[tuple[View, ...], int]:
     """Return virtual views of all that a capture may not show, in random order, and their number in each epoch.
 
@@ -122,8 +121,8 @@ def _synthetic_views(
     per_epoch = max(1, round(len(train) * share / (1 - share)))
     side = max(1, round(math.sqrt(camera.width * camera.height)))
     count = max(per_epoch, MIN_SYNTHETIC_VIEWS)
-    regions = scene_views(splats, width=side, height=side, count=count // 4, threads=threads, progress=progress)
-    cameras = [view.camera for view in regions.all]
+    regions = scene_views(splats, context, width=side, height=side, count=count // 4)
+    cameras, threads = [view.camera for view in regions.all], context.threads
     cameras += scattered_cameras(splats, side=side, count=count - len(cameras), seed=settings.seed, threads=threads)
     order = np.random.default_rng(settings.seed).permutation(len(cameras))
     views = [
@@ -163,19 +162,11 @@ def _evaluation_views(views: Views) -> tuple[View, ...]:
     return _evenly_selected([view for view in chosen if view.photo is not None] or chosen)
 
 
-def _virtual_views(
-    splats: Splats, settings: TrainingViewSettings, stride: int, threads: int, progress: Progress
-) -> SupervisionViews:
+def _virtual_views(splats: Splats, settings: TrainingViewSettings, stride: int, context: Context) -> SupervisionViews:
     """Return virtual views only; their targets are renderings of the scene."""
     side = _virtual_side(settings)
-    drawn = random_poses(
-        splats,
-        side=side,
-        count=max(1, settings.views * (stride or SCORING_STRIDE) // SCORING_STRIDE),
-        seed=settings.seed,
-        threads=threads,
-        progress=progress,
-    )
+    count = max(1, settings.views * (stride or SCORING_STRIDE) // SCORING_STRIDE)
+    drawn = random_poses(splats, context, side=side, count=count, seed=settings.seed)
     scoring = _scoring_views(splats, drawn.train[::stride], side, settings.seed) if stride else ()
     close_up_count = len(scoring) - len(drawn.train[::stride]) if stride else 0
     return SupervisionViews(
@@ -294,22 +285,19 @@ class TrainingTargets:
 def training_targets(
     reference: Splats,
     supervision: SupervisionViews,
-    *,
-    threads: int = 0,
-    device: Device = "cpu",
-    progress: Progress = silent,
+    context: Context = DEFAULT_CONTEXT,
 ) -> TrainingTargets:
     """Load the photographs of the training views, and render ``reference`` for those that have none."""
     views, background = supervision.train, supervision.background
-    renderer, images = _renderer(reference, threads, device), []
+    renderer, images = _renderer(reference, context), []
     backgrounds = tuple(background if view.background is None else view.background for view in views)
     for done, view in enumerate(views):
-        progress("targets", done / len(views))
+        context.progress("targets", done / len(views))
         if view.photo is not None:
             images.append(view.load_photo())
         else:
             images.append(np.clip(renderer(view.camera, backgrounds[done].tolist())[0], 0, 1).astype(np.float16))
-    progress("targets", 1.0)
+    context.progress("targets", 1.0)
     return TrainingTargets(
         cameras=tuple(view.camera for view in views),
         images=tuple(images),
@@ -320,7 +308,7 @@ def training_targets(
     )
 
 
-def _renderer(reference: Splats, threads: int, device: Device) -> ImageRenderer:
-    if device == "cuda":
+def _renderer(reference: Splats, context: Context) -> ImageRenderer:
+    if context.device == "cuda":
         return image_renderer(reference)
-    return lambda camera, background: render(reference, camera, background=background, threads=threads)
+    return lambda camera, background: render(reference, camera, background=background, threads=context.threads)

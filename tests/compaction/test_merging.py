@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 import kissgs
 from kissgs import CompactSettings
 from kissgs.compaction import merging
-from kissgs.compaction.budget import Compactor, compact_scene
+from kissgs.compaction.budget import chosen_views, compact_scene
 from kissgs.compaction.merging import BLUR, CONTRAST, merge_gaussians
-from kissgs.compaction.scene_training import highest_indices
+from kissgs.compaction.scoring import highest_indices
+from kissgs.core.progress import Context
 from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN
 from kissgs.rendering.camera import look_at
@@ -222,8 +223,8 @@ def test_the_count_is_exact_and_gaussians_that_stay_are_untouched(degree, count,
 
 def test_the_result_depends_neither_on_threads_nor_on_the_order():
     scene = cloud(500, degree=1)
-    merged, index = merge_gaussians(scene, 100, threads=1)
-    again, same_index = merge_gaussians(scene, 100, threads=5)
+    merged, index = merge_gaussians(scene, 100, Context(1))
+    again, same_index = merge_gaussians(scene, 100, Context(5))
     assert same(merged, again)
     assert (index == same_index).all()
     shuffled = np.random.default_rng(0).permutation(500)
@@ -287,5 +288,5 @@ def test_a_budget_is_met_by_merging_without_views():
     assert [(step.name, step.count) for step in result.report.steps] == [("input", 200), ("merge", 50)]
     assert (result.report.target_source, result.report.source) == ("nothing", "")
     assert all(getattr(result.splats, name).dtype == np.float32 for name in ATTRIBUTES)
-    supervision = Compactor.of(scene, CompactSettings(ratio=0.25, method="merge"), None).supervision
+    supervision = chosen_views(scene, CompactSettings(ratio=0.25, method="merge"), None, Context())
     assert supervision.train == supervision.score == (), "it draws no cameras that nothing uses"

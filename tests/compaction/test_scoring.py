@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 import kissgs
 from kissgs.cameras.views import black
-from kissgs.compaction.scene_training import highest_indices, prune_by_score
+from kissgs.compaction.scoring import highest_indices, prune_by_score
+from kissgs.core.progress import Context
 from kissgs.core.splats import ATTRIBUTES, SH_C0
 from kissgs.rendering.rasterizer import removal_scores
 from kissgs.rendering.sensitivity import Coverage
@@ -107,7 +108,7 @@ def test_the_number_of_scorings_is_the_smallest_possible(min_keep, scorings):
     def progress(stage, fraction, note=""):
         events.append(fraction)
 
-    prune_by_score(cloud(80), VIEWS[:1], black(), 20, min_keep_per_scoring=min_keep, progress=progress)
+    prune_by_score(cloud(80), VIEWS[:1], black(), 20, Context(progress=progress), min_keep_per_scoring=min_keep)
     found = (len(events) - 1) / 2  # each scoring reports its beginning and its end
     assert found == scorings if scorings < 5 else 55 < found <= scorings, "60 removals, one or more per scoring"
     assert events == sorted(events)

@@ -19,7 +19,7 @@ WORSE = replace(SCENE, opacities=SCENE.opacities - 0.5)
 
 @pytest.mark.quick(0)
 def test_without_a_capture_poses_of_photographs_and_cameras_over_the_whole_scene_compare():
-    compare = SearchEvaluation(SCENE, None, 1)
+    compare = SearchEvaluation(SCENE, None)
     assert compare.seconds == 0
     found = compare(WORSE)
     assert compare.seconds > 0
@@ -37,7 +37,7 @@ def test_without_a_capture_poses_of_photographs_and_cameras_over_the_whole_scene
 
 
 def test_the_views_and_their_renderings_are_made_once(monkeypatch):
-    compare, rendered = SearchEvaluation(SCENE, None, 1), []
+    compare, rendered = SearchEvaluation(SCENE, None), []
     first = compare(WORSE)
     monkeypatch.setattr(
         "kissgs.evaluation.evaluate.render_clamped",
@@ -52,7 +52,7 @@ def test_the_views_and_their_renderings_are_made_once(monkeypatch):
 def test_held_out_views_may_have_equal_names():
     scene = cloud(50)
     views = Views(around(3), tuple(replace(view, name="x") for view in around(3)), black(), "")
-    compare = SearchEvaluation(scene, views, 1)
+    compare = SearchEvaluation(scene, views)
     for candidate in (scene, scene):
         assert compare(candidate).mean.candidate_vs_reference.psnr == float("inf")
 
@@ -60,7 +60,7 @@ def test_held_out_views_may_have_equal_names():
 def test_a_capture_compares_in_its_held_out_views():
     scene = cloud(50)
     views = Views(around(3), around(2), black(), "")
-    found = SearchEvaluation(scene, views, 1)(scene)
+    found = SearchEvaluation(scene, views)(scene)
     assert [view.view.name for view in found.views] == [view.name for view in views.test]
     assert found.surroundings is None
 
@@ -68,6 +68,6 @@ def test_a_capture_compares_in_its_held_out_views():
 @pytest.mark.parametrize("count", [1, 7])
 def test_few_gaussians_are_compared(count):
     few = SCENE.select(range(count))
-    found = SearchEvaluation(few, None, 1)(few)
+    found = SearchEvaluation(few, None)(few)
     assert found.views
     assert found.surroundings.views

@@ -10,9 +10,9 @@ from helpers.training_scenes import around, cloud, same
 import kissgs
 from kissgs import CompactSettings
 from kissgs.cameras.views import black
-from kissgs.compaction.popspa import Popspa, TrainingPath
-from kissgs.compaction.scene_training import MOST_STEP_PER_SIZE, prune_by_score
-from kissgs.core.progress import Deadline, silent
+from kissgs.compaction.popspa import MOST_STEP_PER_SIZE, Popspa, TrainingPath
+from kissgs.compaction.scoring import prune_by_score
+from kissgs.core.progress import Context, Deadline, silent
 from kissgs.training.supervision import SupervisionViews
 
 SCENE = cloud(60)
@@ -22,7 +22,7 @@ SHORT = {"sparsify_steps": 12, "refine_steps": 6, "prune_rounds": 3, "min_keep_p
 def path(threads=1, progress=silent, **changes):
     views = SupervisionViews(around(5), around(5), around(3), black(), "five views")
     settings = CompactSettings(**{**SHORT, **changes})
-    return TrainingPath(Popspa(SCENE, settings, views, threads=threads, progress=progress))
+    return TrainingPath(Popspa(SCENE, settings, views, Context(threads, progress=progress)))
 
 
 def test_points_have_falling_numbers_and_know_their_gaussians():

@@ -1,9 +1,9 @@
-"""Deadlines and the number of steps that fit in. Oracle: a clock that the test sets."""
+"""Deadlines, the number of steps that fit in, and parts of a stage. Oracle: a clock that the test sets."""
 
 import pytest
 
 from kissgs.core import progress as deadline
-from kissgs.core.progress import Deadline, Pace
+from kissgs.core.progress import Context, Deadline, Pace
 
 
 @pytest.fixture
@@ -66,3 +66,13 @@ def test_a_machine_that_becomes_slower_ends_in_time(clock):
 def test_no_step_is_made_after_the_deadline(clock):
     assert made(clock, Pace(10, Deadline.after(-1)), lambda done: 1.0) == 0
     assert made(clock, Pace(10, Deadline.after(2.5)), lambda done: 9.0) == 1
+
+
+def test_parts_of_a_stage_are_reported_as_that_stage():
+    events, deadline = [], Deadline(3.0)
+    whole = Context(2, "cuda", lambda *event: events.append(event), deadline)
+    part = whole.stage("evaluate")
+    part.progress("kernels", 1.0)
+    part.progress("evaluate", 0.5, "a note of another stage")
+    assert events == [("evaluate", 0.0), ("evaluate", 0.5)]
+    assert (part.threads, part.device, part.deadline) == (2, "cuda", deadline)

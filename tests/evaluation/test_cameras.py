@@ -13,6 +13,7 @@ from helpers.whole_scenes import joined, moved
 import kissgs
 from kissgs.cameras.views import MIN_DISTANCE, Views, black
 from kissgs.core.errors import InvalidViewsError
+from kissgs.core.progress import Context
 from kissgs.evaluation.cameras import (
     BACKGROUNDS,
     HEIGHT,
@@ -38,8 +39,8 @@ def alpha(scene, view):
 
 
 def test_cameras_depend_on_the_seed_but_not_on_threads():
-    first = cameras_of(evaluation_views(SCENE, threads=1))
-    assert first == cameras_of(evaluation_views(SCENE, threads=3))
+    first = cameras_of(evaluation_views(SCENE, Context(1)))
+    assert first == cameras_of(evaluation_views(SCENE, Context(3)))
     other = cameras_of(evaluation_views(SCENE, seed=1))
     assert not set(first) & set(other)
     assert not set(first) & set(cameras_of(kissgs.virtual_views(SCENE, width=WIDTH, height=HEIGHT)))

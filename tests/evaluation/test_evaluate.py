@@ -16,6 +16,7 @@ import kissgs
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.views import View, Views
 from kissgs.core.errors import Cancelled, InvalidViewsError, UnsupportedError
+from kissgs.core.progress import Context
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation import evaluate as evaluation_module
 from kissgs.evaluation.cameras import evaluation_views
@@ -206,11 +207,12 @@ def test_missing_photographs_are_an_error(tmp_path):
 
 def test_progress_is_reported_and_can_cancel():
     events = []
-    compare_images(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
+    context = Context(progress=lambda stage, fraction: events.append((stage, fraction)))
+    compare_images(SCENE, SCENE, cameras(test=4), context)
     assert [fraction for stage, fraction in events if stage == "evaluate"] == [0, 0.25, 0.5, 0.75, 1]
     assert {stage for stage, _ in events} == {"kernels", "evaluate"}
     events.clear()
-    evaluate(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
+    evaluate(SCENE, SCENE, cameras(test=4), progress=context.progress)
     fractions = [fraction for stage, fraction in events if stage == "evaluate"]
     np.testing.assert_allclose(fractions, np.arange(29) / 28)
     assert list(dict.fromkeys(stage for stage, _ in events)) == ["kernels", "cameras", "evaluate"]

@@ -15,6 +15,7 @@ from PIL import Image
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.views import View, Views
 from kissgs.core.errors import Cancelled
+from kissgs.core.progress import Context
 from kissgs.evaluation.evaluate import compare_images, evaluate
 from kissgs.evaluation.html import (
     FULL_SCALES,
@@ -174,7 +175,9 @@ def test_progress_can_cancel():
             raise Cancelled("enough")
 
     with pytest.raises(Cancelled):
-        html_report(found, ReportScene(name="a", splats=SCENE), ReportScene(name="b", splats=SCENE), progress=stop)
+        html_report(
+            found, ReportScene(name="a", splats=SCENE), ReportScene(name="b", splats=SCENE), Context(progress=stop)
+        )
     assert events == [("html", 0), ("html", 1 / 3)]
 
 

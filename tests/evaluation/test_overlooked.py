@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import kissgs
+from kissgs.core.progress import Context
 from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import COUNT, MAX_ADDED, VISIBLE_PSNR, Parts, evaluation_views
@@ -110,7 +111,7 @@ def test_the_loss_of_any_object_is_visible():
 
 
 def test_added_cameras_follow_the_drawn_ones_whatever_the_threads():
-    first, again = evaluation_views(FIFTY, threads=1).test, evaluation_views(FIFTY, threads=3).test
+    first, again = evaluation_views(FIFTY, Context(1)).test, evaluation_views(FIFTY, Context(3)).test
     assert [view.name for view in first] == [view.name for view in again] == sorted(view.name for view in first)
     for one, other in zip(first, again, strict=True):
         assert one.camera.viewmat.tobytes() == other.camera.viewmat.tobytes()

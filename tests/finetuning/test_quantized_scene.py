@@ -10,6 +10,7 @@ from helpers.training_scenes import cloud, same
 from helpers.tuning_scenes import FIELDS, choices, chosen, shuffled
 
 from kissgs import Settings, Splats, decompress
+from kissgs.core.progress import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.finetuning.planes import TABLES
 from kissgs.finetuning.quantized_scene import QuantizedScene, table_name
@@ -28,7 +29,7 @@ def scene_of(scene, preset, container, **changes):
 
 
 def files_of(plan, container):
-    return write_files(container, plan, Settings().encode, threads=1).files
+    return write_files(container, plan, Settings().encode, Context(1)).files
 
 
 def decoded_by(work):

@@ -13,8 +13,8 @@ from helpers.tuning_scenes import Interrupted, chosen, stopping_after
 import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
 from kissgs.cameras.views import Views, black
-from kissgs.compaction.scene_training import Phase, SceneTraining
-from kissgs.core.progress import silent
+from kissgs.compaction.popspa import Phase, Popspa, SceneTraining
+from kissgs.core.progress import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.evaluation.evaluate import evaluate
 from kissgs.finetuning.quantized_scene import QuantizedScene
@@ -24,6 +24,7 @@ from kissgs.pipeline.scene_files import describe
 from kissgs.rendering.sensitivity import measure_sensitivity
 from kissgs.sogxt.container import YAML_NAME, zip_bytes
 from kissgs.training.checkpoint import Checkpoint
+from kissgs.training.supervision import supervision_views, training_targets
 
 SHORT = {"enabled": True, "steps": 12, "lr": 0.2, "codebook_lr": 0.3, "synthetic_lr_scale": 1.0}
 SHORT |= {"views": 16, "view_size": 60}
@@ -38,12 +39,14 @@ def tuner(scene, container="sogxt", size=40, **changes):
     capture = Views(around(12, size), around(7, size)[1:3], black(), "circle")
     settings = FinetuneSettings(**{**SHORT, "synthetic_view_share": 0.0, **changes})
     made_for = {"container": MODELS[container], "decode": DECODERS[container]}
-    return Tuner.of(scene, settings, capture, threads=1, **made_for)
+    supervision = supervision_views(scene, capture, settings, Context(1), scoring_stride=0)
+    targets = training_targets(scene, supervision, Context(1))
+    return Tuner(scene, settings, supervision, targets, Context(1), **made_for)
 
 
 def written(settings, container="sogxt"):
-    def files(plan, steps, progress):
-        return write_files(container, plan, settings, finetune_steps=steps, threads=1)
+    def files(plan, steps, context):
+        return write_files(container, plan, settings, context, finetune_steps=steps)
 
     return files
 
@@ -53,7 +56,7 @@ def tuned(
 ):
     work = work or tuner(scene, container, **changes)
     if progress is not None:
-        work = replace(work, progress=progress)
+        work = replace(work, context=replace(work.context, progress=progress))
     settings = Settings.research(preset, **encode).encode
     plan = chosen(scene, preset, MODELS[container], **encode)
     return work(plan, plan, scene, written(settings, container), checkpoint)
@@ -85,9 +88,9 @@ def test_training_has_the_loss_of_the_settings(preset, weights, stage, monkeypat
         files = written(Settings.from_preset("fast").encode)
         work(plan, plan, scene, files)
     else:
-        training = SceneTraining(scene, settings, work.supervision, 1, "cpu")
-        training.begin(work.targets)
-        training.train(Phase("refine", 1, 40), work.targets, (0,), progress=silent)
+        training = SceneTraining(Popspa(scene, settings, work.supervision, targets=work.targets))
+        training.begin()
+        training.train(Phase("refine", 1, 40), 0, Context(1))
     assert [(plan.ssim_weight, plan.mse_weight) for plan in plans] == [weights]
 
 
@@ -101,7 +104,7 @@ def test_the_derivative_of_the_loss_contains_the_weight_of_the_squared_error():
 def capture(plans):
     """Return a function in place of the training loop, which keeps the plan."""
 
-    def train(scene, targets, plan, **others):
+    def train(scene, targets, plan, context, **others):
         plans.append(plan)
 
     return train
@@ -128,7 +131,7 @@ def test_a_worse_container_is_not_kept(container):
     assert report.psnr_after < report.psnr_before
     settings = Settings.research("fast", **COARSE).encode
     plan = chosen(scene, "fast", MODELS[container], **COARSE)
-    assert encoded.files == written(settings, container)(plan, 0, silent).files
+    assert encoded.files == written(settings, container)(plan, 0, Context(1)).files
 
 
 @pytest.mark.parametrize(("container", "batch"), [("sogxt", 3), ("sog", 1)])
@@ -136,7 +139,7 @@ def test_the_result_depends_on_the_seed_but_not_on_threads(container, batch):
     scene, found, before = cloud(200, 1), [], torch.get_num_threads()
     for threads in (1, 3):
         torch.set_num_threads(threads)
-        work = replace(tuner(scene, container, batch=batch), threads=threads)
+        work = replace(tuner(scene, container, batch=batch), context=Context(threads))
         encoded, report = tuned(scene, container, work=work)
         found.append((encoded.files, report.psnr_after))
     torch.set_num_threads(before)
@@ -340,8 +343,8 @@ def test_the_coding_error_does_not_depend_on_compaction():
     smaller, found = scene.select(np.arange(100)), []
     for work in (tuner(scene), replace(tuner(scene), original=smaller)):
         settings = Settings.from_preset("fast").encode
-        encoded = written(settings)(chosen(smaller, "fast"), 0, silent)
-        found.append(work._coding_error(encoded, smaller, silent))
+        encoded = written(settings)(chosen(smaller, "fast"), 0, Context(1))
+        found.append(work._coding_error(encoded, smaller, Context(1)))
     assert found[0] == found[1]
 
 

@@ -14,6 +14,7 @@ from helpers import reference_decoder
 from helpers.codec_scenes import rounding, signed_log, stored_forms
 from helpers.extremes import EXTREMES
 from kissgs import Settings, Splats
+from kissgs.core.progress import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.io.ply import read_ply
@@ -67,7 +68,7 @@ def chosen(name, preset):
     if settings.rate_distortion:
         watch = WeightedCameras([BY_NAME[name].camera()], [1.0], np.float32(BACKGROUND))
         sensitivity = measure_sensitivity(splats, watch, view_uncertainty=0.3, threads=1)
-    return plan_encoding(splats, settings, sensitivity=sensitivity, threads=1)
+    return plan_encoding(splats, settings, Context(1), sensitivity=sensitivity)
 
 
 def encode_settings(preset):
@@ -77,7 +78,7 @@ def encode_settings(preset):
 @functools.cache
 def packed(name, preset):
     """Return the container of a row."""
-    return write_files(chosen(name, preset), encode_settings(preset), threads=1)
+    return write_files(chosen(name, preset), encode_settings(preset), Context(1))
 
 
 def largest(*errors):
@@ -157,7 +158,7 @@ def _levels(splats, choice, settings):
     sum(values.sum() for values in shown.values()).backward()
     if not all(torch.isfinite(latents.grad).all() for latents in work.latents.values()):
         return math.inf
-    files, mask = write_files(work.plan(), settings, threads=1).files, choice.grid.mask
+    files, mask = write_files(work.plan(), settings, Context(1)).files, choice.grid.mask
     inside = {field: work.planes[field].levels(work.latents[field]).detach().numpy() for field in (*FIELDS, "means")}
     for field in FIELDS:
         image = reference_decoder.levels(files, field, 4 if field == "quaternions" else 3)[mask]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from helpers import reference_float64
-from kissgs.core.progress import Pace
+from kissgs.core.progress import Context, Pace
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.differentiable import plain_photometric_loss
 from kissgs.training.loop import TrainingPlan, train
@@ -37,7 +37,7 @@ def trained(splats, camera):
     targets, rates = stripes(camera), RATES | {"means": RATES["means"] * (np.median(away) if len(away) else 1.0)}
     model = GaussianModel(splats)
     train(
-        model, targets, TrainingPlan("step", Pace(STEPS), lambda done: rates, 0.2, mse_weight=5.0, seed=[0]), threads=1
+        model, targets, TrainingPlan("step", Pace(STEPS), lambda done: rates, 0.2, mse_weight=5.0, seed=[0]), Context(1)
     )
     wanted, clear = oracle(splats, targets, rates)
     worst = 0.0

@@ -7,6 +7,7 @@ import numpy as np
 from helpers.training_scenes import around, cloud
 from kissgs import Settings
 from kissgs.cameras.views import black
+from kissgs.core.progress import Context
 from kissgs.planning.planner import plan_encoding
 from kissgs.planning.quantize import EVEN_LEVELS
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
@@ -38,7 +39,7 @@ def chosen(scene, preset="balanced", container=EVEN_LEVELS, **changes):
         sensitivity = measure_sensitivity(
             scene, WeightedCameras(cameras, [1.0] * len(cameras), black()), view_uncertainty=0.3
         )
-    return plan_encoding(scene, settings, sensitivity=sensitivity, container=container, threads=1)
+    return plan_encoding(scene, settings, Context(1), sensitivity=sensitivity, container=container)
 
 
 def choices():

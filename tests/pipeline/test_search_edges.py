@@ -9,6 +9,7 @@ import pytest
 import kissgs
 from kissgs import OutputError, Settings, Splats, StopSearch, UnsupportedError
 from kissgs.compaction.budget import SearchEvaluation
+from kissgs.core.progress import Context
 from kissgs.pipeline.goal import Attempt, Goal
 from kissgs.sogxt.encode import encode
 
@@ -86,8 +87,8 @@ def test_no_goal_is_met_if_an_object_is_lost():
     """One of two objects is missing: the mean over views hid that, as views of the other object lose nothing."""
     away = Splats(**{name: getattr(SCENE, name) + np.float32(1000 * (name == "means")) for name in ATTRIBUTES})
     both = Splats(**{name: np.concatenate([getattr(SCENE, name), getattr(away, name)]) for name in ATTRIBUTES})
-    one = encode(SCENE, Settings.research("fast", quality_offset_db=12).encode, threads=1)
-    found = SearchEvaluation(both, None, 1)(kissgs.decompress(one.files))
+    one = encode(SCENE, Settings.research("fast", quality_offset_db=12).encode, Context(1))
+    found = SearchEvaluation(both, None)(kissgs.decompress(one.files))
     for goal in ({"psnr": 30.0}, {"max_psnr_drop": 2.0}):
         limits = Goal.of(settings(**goal).encode)
         attempt = limits.measured(Attempt(len(SCENE), None, 0), found)

@@ -10,6 +10,7 @@ from helpers.random_sensitivity import encode_rd, random_sensitivity
 
 import kissgs
 from kissgs import Settings, compress, decompress
+from kissgs.core.progress import Context
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.sogxt.encode import encode
@@ -126,7 +127,7 @@ def test_threads_do_not_change_a_byte():
     splats = random_scene(1000, 3, seed=7)
     sensitivity = random_sensitivity(splats)
     settings = Settings.from_preset("small").encode
-    one, three = (encode(splats, settings, sensitivity=sensitivity, threads=threads).files for threads in (1, 3))
+    one, three = (encode(splats, settings, Context(threads), sensitivity=sensitivity).files for threads in (1, 3))
     assert one == three
 
 

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 from kissgs.core.errors import UnsupportedError
+from kissgs.core.progress import Context
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.images import (
     GAP,
@@ -127,7 +128,8 @@ def test_another_aspect_ratio_shows_more_and_never_less():
 def test_an_image_is_rendered_once_for_each_camera():
     scene, cameras, events = sample_scene(500, sh_degree=0), [some_camera(), some_camera(20, 20)], []
     path = [*cameras, cameras[0]]
-    images = render_all(scene, path, background=(1, 1, 1), progress=lambda stage, done: events.append((stage, done)))
+    context = Context(progress=lambda stage, done: events.append((stage, done)))
+    images = render_all(scene, path, context, background=(1, 1, 1))
     assert images[0] is images[2]
     for pixels, camera in zip(images, path, strict=True):
         assert np.array_equal(pixels, to_bytes(render(scene, camera, background=(1, 1, 1))[0]))

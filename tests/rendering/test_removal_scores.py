@@ -10,6 +10,7 @@ from scipy.stats import spearmanr
 
 import kissgs
 from kissgs.core.errors import Cancelled
+from kissgs.core.progress import Context
 from kissgs.rendering.rasterizer import removal_scores, render
 
 
@@ -65,21 +66,22 @@ def test_scores_behind_opaque_gaussians_are_0():
 
 def test_scores_do_not_depend_on_threads():
     splats, views = blobs(400, 1, spread=1.5), [camera(90, 60, seed=1), camera(90, 60, seed=2)]
-    first = removal_scores(splats, views, threads=1)
+    first = removal_scores(splats, views, Context(1))
     for threads in (2, 5):
-        assert np.array_equal(first, removal_scores(splats, views, threads=threads))
+        assert np.array_equal(first, removal_scores(splats, views, Context(threads)))
 
 
 def test_progress_is_reported_and_may_cancel():
     events = []
-    removal_scores(blobs(3), [camera()] * 4, progress=lambda stage, fraction: events.append((stage, fraction)))
+    context = Context(progress=lambda stage, fraction: events.append((stage, fraction)))
+    removal_scores(blobs(3), [camera()] * 4, context)
     assert events == [("score", fraction) for fraction in (0, 0.25, 0.5, 0.75, 1.0)]
 
     def stop(stage, fraction):
         raise Cancelled("cancelled")
 
     with pytest.raises(Cancelled):
-        removal_scores(blobs(3), [camera()], progress=stop)
+        removal_scores(blobs(3), [camera()], Context(progress=stop))
 
 
 def test_no_gaussians_and_no_cameras():

@@ -27,6 +27,7 @@ from PIL import Image
 
 from kissgs import Settings, compress, decompress
 from kissgs.core.positions import signed_log
+from kissgs.core.progress import Context
 from kissgs.core.splats import clean
 from kissgs.sogxt.encode import encode
 
@@ -246,7 +247,8 @@ def test_constant_scenes_cost_next_to_nothing():
 
 def test_progress_names_every_stage_and_ends_at_one():
     events = []
-    encode(random_scene(300, 3), Settings().encode, progress=lambda stage, fraction: events.append((stage, fraction)))
+    context = Context(progress=lambda stage, fraction: events.append((stage, fraction)))
+    encode(random_scene(300, 3), Settings().encode, context)
     stages = list(dict.fromkeys(stage for stage, _ in events))
     assert stages == ["kernels", "order", "forms", "codebook", "sort codebook", "reorder", "images"]
     assert all(0 <= fraction <= 1 for _, fraction in events)

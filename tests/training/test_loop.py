@@ -8,7 +8,7 @@ import torch
 from helpers.training_scenes import around, cloud, same, targets_of
 
 import kissgs
-from kissgs.core.progress import Pace
+from kissgs.core.progress import Context, Pace
 from kissgs.rendering.differentiable import plain_photometric_loss, rasterize
 from kissgs.rendering.rasterizer import render
 from kissgs.rendering.tensors import tensors_of
@@ -78,7 +78,7 @@ def test_an_interrupted_training_resumes_exactly():
 
     first = GaussianModel(dimmed(scene))
     with pytest.raises(kissgs.Cancelled):
-        train(first, targets, plan(23), after=steps.append, progress=stop)
+        train(first, targets, plan(23), Context(progress=stop), after=steps.append)
     assert steps == list(range(1, 10))
     second = GaussianModel.restored(first.state(), scene)
     train(second, targets, plan(23), first=9)
@@ -90,7 +90,7 @@ def test_the_result_depends_on_the_seed_but_not_on_threads():
     targets, found = targets_of(scene), []
     for threads, seed in ((1, 0), (3, 0), (1, 1)):
         model, before = GaussianModel(dimmed(scene)), torch.get_num_threads()
-        train(model, targets, plan(8, seed=(seed,)), threads=threads)
+        train(model, targets, plan(8, seed=(seed,)), Context(threads))
         assert torch.get_num_threads() == before
         found.append(model.splats())
     assert same(*found[:2])
@@ -158,7 +158,8 @@ def test_notes_report_running_means_of_loss_and_psnr():
     targets = targets_of(scene)
     start = dimmed(scene)
     frozen = plan(3, rates=lambda done: dict.fromkeys(RATES, 0.0))
-    train(GaussianModel(start), targets, frozen, progress=lambda stage, fraction, note="": notes.append(note))
+    context = Context(progress=lambda stage, fraction, note="": notes.append(note))
+    train(GaussianModel(start), targets, frozen, context)
     order = [n for n, _ in zip(targets.order((0,)), range(3), strict=False)]
     losses, errors = [], []
     for n in order:

@@ -26,7 +26,7 @@ from kissgs.cameras.virtual.select import (
     with_size,
 )
 from kissgs.core.array_types import Bool, Float32, Int
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Progress
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import BLOCK, Sensitivity
 from kissgs.core.splats import Splats, concatenate
@@ -166,14 +166,12 @@ def _surrounding_cameras(bounds: SceneBounds, like: Camera) -> Iterator[Camera]:
         yield look_at(position, bounds.centre, bounds.up, fov=FIELD_OF_VIEW, width=like.width, height=like.height)
 
 
-def scene_views(
-    splats: Splats, *, width: int, height: int, count: int, threads: int = 0, progress: Progress = silent
-) -> Views:
+def scene_views(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: int, height: int, count: int) -> Views:
     """Return views of every region of a scene, more of regions that show more; every 8th is held out."""
     check_images(count, width, height)
-    with Workers(threads) as pool:
-        regions = find_regions(splats, (width, height), pool, progress, camera_count=count)
-    progress("cameras", 1.0)
+    with Workers(context.threads) as pool:
+        regions = find_regions(splats, (width, height), pool, context.progress, camera_count=count)
+    context.progress("cameras", 1.0)
     counts = allocate_cameras(regions, count)
     cameras = [camera for region, n in zip(regions, counts, strict=True) for camera in region.cameras(n)]
     return split_views(with_size(cameras[:count], width, height))
@@ -203,11 +201,10 @@ def default_view_count(gaussians: int) -> int:
 def sensitivity_cameras(
     splats: Splats,
     views: Views | None,
+    context: Context = DEFAULT_CONTEXT,
     *,
     count: int,
     size: int,
-    threads: int = 0,
-    progress: Progress = silent,
 ) -> WeightedCameras:
     """Return the cameras, each with its weight, that measure sensitivity and refit colours.
 
@@ -216,16 +213,14 @@ def sensitivity_cameras(
     """
     if views is None or not views.train:
         side = size * 4 // 5
-        virtual = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        virtual = scene_views(splats, context, width=side, height=side, count=count)
         cameras = [_widened(view.camera) if n % 2 else view.camera for n, view in enumerate(virtual.all)]
         return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
     captured = [view.camera for view in views.train]
     chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
     selected = [captured[n].sampled_at_most(size) for n in chosen]  # virtual cameras see what is between the samples
     side = round(float(np.sqrt(selected[0].width * selected[0].height)))
-    virtual = scene_views(
-        splats, width=side, height=side, count=max(1, count * 2 // 3), threads=threads, progress=progress
-    )
+    virtual = scene_views(splats, context, width=side, height=side, count=max(1, count * 2 // 3))
     weight = VIRTUAL_WEIGHT * len(selected) / len(virtual.all)
     cameras = [*selected, *(view.camera for view in virtual.all)]
     weights = [1.0] * len(selected) + [weight] * len(virtual.all)
@@ -269,9 +264,7 @@ Pose = tuple[Vec3, Vec3]
 """Position and look-at target, world units."""
 
 
-def random_poses(
-    splats: Splats, *, side: int, count: int, seed: int = 0, threads: int = 0, progress: Progress = silent
-) -> Views:
+def random_poses(splats: Splats, context: Context = DEFAULT_CONTEXT, *, side: int, count: int, seed: int = 0) -> Views:
     """Return views for square images from random poses around every region of a scene; every 8th is held out.
 
     The region with the largest share gets ``count`` of them; together there are at most :data:`MAX_COUNT_FACTOR` times
@@ -280,15 +273,15 @@ def random_poses(
     check_images(count, side, side)
     rng = np.random.default_rng(seed)
     cameras: list[Camera] = []
-    with Workers(threads) as pool:
-        regions = find_regions(splats, (side, side), pool, progress, camera_count=0)
+    with Workers(context.threads) as pool:
+        regions = find_regions(splats, (side, side), pool, context.progress, camera_count=0)
         largest_share = max(region.share for region in regions) or 1.0
         total = round(count * min(1 / largest_share, MAX_COUNT_FACTOR))
         for region, region_count in zip(regions, allocate_cameras(regions, total), strict=True):
             cameras += _random_cameras(region, region_count, side, rng)
     if len(cameras) < min(2, count):
-        return scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
-    progress("cameras", 1.0)
+        return scene_views(splats, context, width=side, height=side, count=count)
+    context.progress("cameras", 1.0)
     return split_views(cameras[:total])
 
 

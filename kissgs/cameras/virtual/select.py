@@ -25,7 +25,7 @@ from kissgs.cameras.virtual.candidates import (
     view_scores,
 )
 from kissgs.core.array_types import Float64, Int
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import DEFAULT_CONTEXT, Context, Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera, look_at, pinhole
@@ -215,13 +215,13 @@ def virtual_views(
     Raises:
         InvalidViewsError: ``count``, ``width`` or ``height`` is less than 1.
     """
-    _, _, views = _select(splats, (width, height), count, threads, progress)
+    _, _, views = _select(splats, (width, height), count, Context(threads, progress=progress))
     return replace(views, origin=splats.origin)
 
 
-def best_view(splats: Splats, *, width: int, height: int, threads: int = 0, progress: Progress = silent) -> View:
+def best_view(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: int, height: int) -> View:
     """Return the one of :func:`virtual_views` that represents the scene best, by view score and distance."""
-    candidates, selected, views = _select(splats, (width, height), 32, threads, progress)
+    candidates, selected, views = _select(splats, (width, height), 32, context)
     bounds = candidates.bounds
     distances = [float(np.linalg.norm(candidates.cameras[n].position - bounds.centre)) for n in selected]
     scores = candidates.scores[selected] + [overview_bonus(distance / bounds.radius) for distance in distances]
@@ -270,12 +270,12 @@ def split_views(cameras: list[Camera]) -> Views:
 
 
 def _select(
-    splats: Splats, size: tuple[int, int], count: int, threads: int, progress: Progress
+    splats: Splats, size: tuple[int, int], count: int, context: Context
 ) -> tuple[ScoredCandidates, list[int], Views]:
     """Return all scored candidates of a scene, the indices of the selected ones, and their views."""
     check_images(count, *size)
-    with Workers(threads) as pool:
-        candidates = score_candidates(splats, size, pool, progress).refined(count)
-    progress("cameras", 1.0)
+    with Workers(context.threads) as pool:
+        candidates = score_candidates(splats, size, pool, context.progress).refined(count)
+    context.progress("cameras", 1.0)
     selected = select_diverse(candidates, count)
     return candidates, selected, split_views(with_size([candidates.cameras[n] for n in selected], *size))

@@ -10,11 +10,14 @@ from kissgs.cameras.render import find_orbit
 from kissgs.cameras.virtual.samples import random_poses, scene_views
 from kissgs.cameras.virtual.select import virtual_views
 from kissgs.core.errors import Cancelled, InvalidViewsError
+from kissgs.core.progress import Context
 from kissgs.core.splats import Splats
 from kissgs.rendering.rasterizer import render
 
 
 def cameras_of(place, scene, *, side=32, count=9, **options):
+    if place is not virtual_views:  # the public function
+        options = {"context": Context(**options)}
     if place is find_orbit:
         return place(scene, width=side, height=side, **options).loop_cameras(count, side, side)
     size = {"side": side} if place is random_poses else {"width": side, "height": side}
