@@ -454,8 +454,8 @@ GROUPS: dict[str, type[StageSettings]] = {
     "finetune": FinetuneSettings,
 }
 
-AIMED_DROP = 0.1
-"""Loss of PSNR, decibels, that a search aims at where only its time is limited: few people see it."""
+TIME_ONLY_DROP = 0.1
+"""Loss of PSNR, decibels, that a container may have where only the time is limited: few people see it."""
 
 
 class Settings(StageSettings):
@@ -479,13 +479,13 @@ class Settings(StageSettings):
         return self.encode.has_goal or self.compact.max_psnr_drop is not None
 
     @property
-    def aims(self) -> bool:
+    def time_only(self) -> bool:
         """Whether only the time is limited, so that training may choose the quality."""
         encode = self.encode
         return self.time_limit is not None and encode.rate_distortion and not encode.has_goal and not encode.rd_lambda
 
-    def decided(self, *, photographs: bool | None, torch: bool) -> Self:
-        """Return settings with what they leave open decided: whether training serves the goal.
+    def resolved(self, *, photographs: bool | None, torch: bool) -> Self:
+        """Return settings with what they leave open resolved: whether training serves the goal.
 
         A size or a loss is served best by fewer Gaussians and by training, on photographs or without a capture on
         renderings of the scene, and so is a time limit alone with photographs. A PSNR to the scene's own renderings
@@ -499,17 +499,17 @@ class Settings(StageSettings):
             torch: whether torch is installed, which training needs.
         """
         serves_goal = self.encode.has_goal and photographs is not False
-        trains = torch and self.encode.psnr is None and (serves_goal or (self.aims and bool(photographs)))
+        trains = torch and self.encode.psnr is None and (serves_goal or (self.time_only and bool(photographs)))
         compact, finetune = self.compact, self.finetune
-        if compact.auto_count is None or self.aims:
+        if compact.auto_count is None or self.time_only:
             keeps_all = not compact.trains or (photographs is None and finetune.enabled is False)
             wanted = trains and not keeps_all and (compact.auto_count or not compact.enabled)
             compact = compact.model_copy(update={"auto_count": wanted})
-        if finetune.enabled is None and (trains or not self.aims):
+        if finetune.enabled is None and (trains or not self.time_only):
             finetune = finetune.model_copy(update={"enabled": trains})
         encode = self.encode
-        if self.aims and compact.auto_count:
-            encode = encode.model_copy(update={"max_psnr_drop": AIMED_DROP})
+        if self.time_only and compact.auto_count:
+            encode = encode.model_copy(update={"max_psnr_drop": TIME_ONLY_DROP})
         return self.model_copy(update={"compact": compact, "encode": encode, "finetune": finetune})
 
     def as_json(self) -> dict[str, Any]:
@@ -531,7 +531,7 @@ class Settings(StageSettings):
                 "time_limit does not apply to compaction by a given budget: leave out count, ratio and max_psnr_drop "
                 "of compact, or the time limit"
             )
-        if compact.auto_count and not (self.encode.has_goal or self.aims):
+        if compact.auto_count and not (self.encode.has_goal or self.time_only):
             raise ValueError(
                 "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop, psnr or a time limit, or the "
                 "number of Gaussians to keep"

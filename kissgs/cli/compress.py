@@ -183,7 +183,7 @@ def compress(
     """Compress each scene into a SOG-XT container, into SOG, or into a folder with levels of detail."""
     from kissgs.cli import compress_scenes
     from kissgs.formats import ending_of, named_container, named_manifest
-    from kissgs.pipeline.limited_time import decided
+    from kissgs.pipeline.limited_time import resolved
 
     manifest = None if output is None else named_manifest(Path(output))
     kind = named_container(encoding.container, None if manifest or output == "-" else output)
@@ -192,7 +192,7 @@ def compress(
         encoding.evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
     )
     capture = open_views(training.views)
-    training.refuse_without_training(decided(settings, capture))
+    training.refuse_without_training(resolved(settings, capture))
     if capture is not None and not renders and not common.quiet:
         sys.stderr.write(
             f"kissgs: --views has no effect: the preset {encoding.preset} renders no images; add --evaluate\n"

@@ -30,7 +30,7 @@ from kissgs.core.progress import Progress, load_kernels, silent
 from kissgs.formats import ContainerName
 from kissgs.io.files import move_into_place, open_scene_file, reason_of
 from kissgs.io.scene_format import ReadOptions
-from kissgs.pipeline.limited_time import decided
+from kissgs.pipeline.limited_time import resolved
 from kissgs.pipeline.pipeline import Compressed, compress
 from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of
 from kissgs.settings import Settings
@@ -87,7 +87,7 @@ class SceneCompression(BaseModel):
 def compress_here(options: SceneCompression, capture: Views | None, scene: str, target: Path) -> Result:
     """Compress a scene."""
     piped = str(target) == "-"
-    searches = decided(options.settings, capture).searches
+    searches = resolved(options.settings, capture).searches
     with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:
         made = options.run(scene, None if piped else target, capture, progress)
     if piped:
@@ -286,7 +286,7 @@ class ClusterCompression:
         """Return an estimate of the memory that a scene needs, bytes."""
         settings = self.options.settings
         goal_trains = settings.encode.has_goal and (self.options.views or settings.finetune.enabled is not False)
-        trains = settings.compact.enabled or settings.finetune.enabled or goal_trains or settings.aims
+        trains = settings.compact.enabled or settings.finetune.enabled or goal_trains or settings.time_only
         plain = size if scene.suffix.lower() == ".ply" else PACKED_RATIO * size
         return PROCESS_BYTES + (TRAINING_RATIO if trains else MEMORY_RATIO) * plain
 

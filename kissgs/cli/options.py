@@ -296,7 +296,9 @@ class TrainingOptions:
 
     def refuse_without_training(self, settings: Settings) -> None:
         """Raise UnsupportedError if ``--checkpoint`` or ``--device`` is given where nothing could train."""
-        trains = settings.finetune.enabled or (settings.compact.enabled and settings.compact.trains) or settings.aims
+        trains = (
+            settings.finetune.enabled or (settings.compact.enabled and settings.compact.trains) or settings.time_only
+        )
         if trains or not (self.checkpoint or self.device != "cpu"):
             return
         remedy = "leave them out, these settings take no training steps"

@@ -205,7 +205,7 @@ def _search_drop(task: Popspa, compare: SearchEvaluation, allowed: float) -> Com
     total, trials = len(task.splats), dict[int, float]()
     best: Compacted | None = None
 
-    def room(log2_share: float) -> float:
+    def margin(log2_share: float) -> float:
         nonlocal best
         count = min(max(1, round(total * 2**log2_share)), total - 1)
         if count not in trials:
@@ -217,7 +217,7 @@ def _search_drop(task: Popspa, compare: SearchEvaluation, allowed: float) -> Com
 
     least = -math.log2(total)
     try:
-        find_root(room, max(START_LOG2, least), DROP_PER_HALVING, TOLERANCE_DB, (least, MAX_LOG2), GRAIN_LOG2)
+        find_root(margin, max(START_LOG2, least), DROP_PER_HALVING, TOLERANCE_DB, (least, MAX_LOG2), GRAIN_LOG2)
     except StopSearch:
         if best is None:
             raise

@@ -36,7 +36,7 @@ class CountTrial:
     count: int
     drop: float  # of PSNR as goals count it, decibels
     ssim_drop: float | None = None  # None where that is no goal
-    ssim_decides: bool = False  # whether the limit of SSIM leaves the least room
+    ssim_decides: bool = False  # whether the limit of SSIM leaves the least margin
 
     def summary(self) -> str:
         """Return the loss that decides in one phrase: "50,000 Gaussians lose 0.120 dB"."""

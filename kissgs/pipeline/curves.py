@@ -1,4 +1,4 @@
-"""Curves through the plane of number of Gaussians and lambda, along which a search finds the root of a goal's room.
+"""Curves through the plane of number of Gaussians and lambda, along which a search finds the root of a goal's margin.
 
 One curve changes lambda alone, the other removes Gaussians and raises lambda together.
 """
@@ -208,7 +208,7 @@ def along_path(
         first: number of the first point.
         last: largest number of a point.
         most: largest number of containers.
-        near: room, log2 of the number of Gaussians, below which a container that meets the goal ends the search.
+        near: margin, log2 of the number of Gaussians, below which a container that meets the goal ends the search.
     """
     first, begin = min(max(first, 1), last), math.nan
 
@@ -224,10 +224,10 @@ def along_path(
             rest = step - (number - first) / POINTS_PER_HALVING
             x = begin + DOUBLINGS_PER_HALVING * rest
             attempt = encode(number, min(max(x, LOG2_LAMBDA_RANGE[0]), LOG2_LAMBDA_RANGE[1]))
-        room = goal.log2_room(attempt)
-        if not math.isfinite(begin + room):
+        margin = goal.log2_margin(attempt)
+        if not math.isfinite(begin + margin):
             raise NoFurtherError
-        return room
+        return margin
 
     stop = StopRule(most, tries_bound=False, most_step=MAX_STEP, caution=CAUTION)
     find_root(margin, 0.0, 1.0 if goal.by_size else -1.0, near, (-math.inf, math.inf), stop=stop)

@@ -109,8 +109,9 @@ class Attempt:
 
 
 TRAINED_NEAR, TRAINED_SIZE_NEAR, MOST_NEAR = 4.0, 2.5, 0.4
-"""Factors on the room that ends a search where each container takes a training, the second for a size, and the largest
-such room: with it, three quarters of an allowed drop are used. Another container would save some 7 % of the bytes."""
+"""Factors on the margin that ends a search where each container takes a training, the second for a size, and the
+largest such margin: with it, three quarters of an allowed drop are used. Another container would save some 7 % of the
+bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +120,8 @@ class Limit:
 
     setting: str
     value: float  # bytes, decibels, or a difference of SSIM
-    slope: float  # typical change of the room per doubling of lambda
-    near: float  # room that is small enough to end a search
+    slope: float  # typical change of the margin per doubling of lambda
+    near: float  # margin that is small enough to end a search
     per_halving: float  # typical change of the figure by half as many Gaussians, of a size that of its log2
     quarter_loss: float | None = None  # loss expected with a quarter of the Gaussians and training, on the safe side
 
@@ -136,7 +137,7 @@ class Limit:
             case _:
                 return attempt.ssim_drop
 
-    def room(self, attempt: Attempt) -> float:
+    def margin(self, attempt: Attempt) -> float:
         """Return by how much an attempt stays within the limit: at least 0 where it is met.
 
         The unit is log2 of a ratio for sizes and drops, and decibels for a PSNR. Infinite where nothing is lost at all:
@@ -153,17 +154,17 @@ class Limit:
         return math.log2(self.value / found) if found < math.inf else -math.inf
 
     def near_enough(self, *, trained: bool) -> float:
-        """Return the room that is small enough to end a search, more if each container takes a training."""
+        """Return the margin that is small enough to end a search, more if each container takes a training."""
         factor = TRAINED_SIZE_NEAR if self.setting == "target_size" else TRAINED_NEAR
         return max(min(factor * self.near, MOST_NEAR), self.near) if trained else self.near
 
-    def log2_room(self, attempt: Attempt) -> float:
-        """Return the room as log2 of the number of Gaussians, in which a loss is linear; NaN where unknown."""
+    def log2_margin(self, attempt: Attempt) -> float:
+        """Return the margin as log2 of the number of Gaussians, in which a loss is linear; NaN where unknown."""
         found = self.figure(attempt)
         if found is None:
             return math.nan
-        room = math.log2(self.value / found) if self.setting == "target_size" else self.value - found
-        return room / self.per_halving
+        margin = math.log2(self.value / found) if self.setting == "target_size" else self.value - found
+        return margin / self.per_halving
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,16 +211,16 @@ class Goal:
         return attempt.with_evaluation(evaluation, ssim=self.limits[-1].setting == "max_ssim_drop")
 
     def decisive(self, attempt: Attempt) -> Limit:
-        """Return the limit to which an attempt has the least room."""
-        return min(self.limits, key=lambda limit: limit.room(attempt))
+        """Return the limit to which an attempt has the least margin."""
+        return min(self.limits, key=lambda limit: limit.margin(attempt))
 
     def margin(self, attempt: Attempt) -> float:
-        """Return the room to the limit that decides (:meth:`Limit.room`): at least 0 where all are met."""
-        return self.decisive(attempt).room(attempt)
+        """Return the least margin (:meth:`Limit.margin`): at least 0 where all limits are met."""
+        return self.decisive(attempt).margin(attempt)
 
-    def log2_room(self, attempt: Attempt) -> float:
-        """Return the room to the limit that decides as log2 of the number of Gaussians (:meth:`Limit.log2_room`)."""
-        return min(limit.log2_room(attempt) for limit in self.limits)
+    def log2_margin(self, attempt: Attempt) -> float:
+        """Return the least margin as log2 of the number of Gaussians (:meth:`Limit.log2_margin`)."""
+        return min(limit.log2_margin(attempt) for limit in self.limits)
 
     @property
     def allowed_log2(self) -> float:
@@ -240,7 +241,7 @@ class Goal:
                 + (", or for fewer Gaussians: compact with auto_count" * suggest_compaction)
             )
         finest = max(attempts, key=self.margin)
-        missed = {limit: limit.figure(finest) for limit in self.limits if limit.room(finest) < 0}
+        missed = {limit: limit.figure(finest) for limit in self.limits if limit.margin(finest) < 0}
         first = next(iter(missed))
         if first.setting == "psnr":  # one thing at a time
             missed = {first: missed[first]}

@@ -119,7 +119,7 @@ class SearchPlan:
     offset_db: float = 4.0  # added to quality_offset_db there
 
 
-AIMING = (
+TIME_ONLY = (
     (4.2, SearchPlan(1, 4, 3.0)),
     (8.0, SearchPlan(1, 5, 3.0)),
     (16.0, SearchPlan(1)),
@@ -131,7 +131,7 @@ AIMING = (
 With fewer Gaussians, training that is too short loses more than they save.
 """
 
-MEETING = (
+WITH_GOAL = (
     (4.2, SearchPlan(1, 2, 3.0)),
     (8.5, SearchPlan(1, 4, 3.0)),
     (40.0, SearchPlan(2, 5, 3.0)),
@@ -171,10 +171,10 @@ class SearchTime:
         """Expected seconds to write a fine-tuned container and to evaluate it in small images."""
         return ENDING_SHARE * self.encode_seconds
 
-    def plan(self, *, photographs: bool, aims: bool) -> SearchPlan:
+    def plan(self, *, photographs: bool, time_only: bool) -> SearchPlan:
         """Return what to do in the time that is left, by the targets, and whether the goal is no more than an aim."""
         left = self.deadline.seconds / self.encode_seconds
-        plans = RENDERED if not photographs else AIMING if aims else MEETING
+        plans = RENDERED if not photographs else TIME_ONLY if time_only else WITH_GOAL
         return next(plan for most, plan in plans if left <= most)
 
     def scoring_views(self, rounds: int) -> int:
@@ -216,15 +216,15 @@ class Choice:
     note: str = ""
 
 
-def decided(settings: Settings, views: Views | None, *, keep_all: bool = False, torch: bool | None = None) -> Settings:
-    """Return the settings with what they leave open decided, see :meth:`kissgs.Settings.decided`.
+def resolved(settings: Settings, views: Views | None, *, keep_all: bool = False, torch: bool | None = None) -> Settings:
+    """Return the settings with what they leave open resolved, see :meth:`kissgs.Settings.resolved`.
 
     ``keep_all`` says that all Gaussians stay unless the settings request otherwise, ``torch`` whether it is installed.
     """
     if keep_all and settings.compact.auto_count is None:
         settings = settings.model_copy(update={"compact": settings.compact.model_copy(update={"auto_count": False})})
     photographs = None if views is None else has_photographs(views)
-    return settings.decided(photographs=photographs, torch=has_torch() if torch is None else torch)
+    return settings.resolved(photographs=photographs, torch=has_torch() if torch is None else torch)
 
 
 def choose(requested: Settings, views: Views | None, count: int, context: Context, *, keep_all: bool) -> Choice:
@@ -233,7 +233,7 @@ def choose(requested: Settings, views: Views | None, count: int, context: Contex
     chosen = {
         torch: in_time(
             requested,
-            decided(requested, views, keep_all=keep_all, torch=torch),
+            resolved(requested, views, keep_all=keep_all, torch=torch),
             None if deadline is None else SearchTime(deadline, encode_seconds(requested.preset, count, threads)),
             count=count,
             captured=views is not None,
@@ -250,7 +250,7 @@ def choose(requested: Settings, views: Views | None, count: int, context: Contex
 def in_time(
     requested: Settings, settings: Settings, time: SearchTime | None, *, count: int, captured: bool, torch: bool
 ) -> Choice:
-    """Return the ``settings`` that were decided as if there were time for everything, changed to fit into the time.
+    """Return the ``settings`` that were resolved as if there were time for everything, changed to fit into the time.
 
     Training that was not requested is left out where there is too little time for it, and the preset where even a
     plain encoding takes too long, unless a goal or a setting of the encoder is given. Without a goal and a capture,
@@ -260,12 +260,12 @@ def in_time(
         return Choice(settings)
     plain, left = time.encode_seconds, time.deadline.seconds
     if left >= TRAINING_TIME * plain and count > 1:
-        tunes = requested.aims and not captured and settings.finetune.enabled is None
+        tunes = requested.time_only and not captured and settings.finetune.enabled is None
         if tunes and torch and left >= TUNING_TIME * plain:
             settings = settings.model_copy(update={"finetune": settings.finetune.model_copy(update={"enabled": True})})
         return Choice(settings, time)
     trained = settings.compact.auto_count and not requested.compact.auto_count
-    settings = requested.decided(photographs=False, torch=False)
+    settings = requested.resolved(photographs=False, torch=False)
     note = TOO_LITTLE_TIME if trained and count > 1 else ""
     if note and not settings.encode.has_goal:
         note += ", so nothing limits the loss but the preset"

@@ -22,7 +22,7 @@ from kissgs.formats import ContainerName, named_container
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.goal import Attempt
-from kissgs.pipeline.limited_time import choose, decided
+from kissgs.pipeline.limited_time import choose, resolved
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
 from kissgs.settings import GOALS, EncodeSettings, Settings
 from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
@@ -248,7 +248,7 @@ def compress(
             compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``enabled``, the levels are then
             fine-tuned on the photographs of ``views``, or on renderings of the scene. A goal other than ``psnr`` does
             both by itself, unless there are ``views`` without held-out photographs, see
-            :meth:`kissgs.Settings.decided`.
+            :meth:`kissgs.Settings.resolved`.
         reading: options for a ``source`` that is a file.
         container: ``"sogxt"``, or ``"sog"`` for the files of SOG 2, which other viewers open; by default SOG if
             ``destination`` ends in ``.sog``, else SOG-XT.
@@ -278,7 +278,7 @@ def compress(
     from kissgs.pipeline.encoding import Work
 
     requested, keep_all = settings or Settings(), sensitivity is not None
-    settings = decided(requested, views, keep_all=keep_all)
+    settings = resolved(requested, views, keep_all=keep_all)
     target, kind = None if destination is None else Path(destination), named_container(container, destination)
     checkpoint = None if checkpoint is None else Path(checkpoint)
     _check(settings, views, target, checkpoint, overwrite=overwrite, device=device)
@@ -313,7 +313,7 @@ def compress(
     compacted = _compact_first(work, checkpoint)
     after_search = replace(context, progress=ignore_stop_search(clock)) if settings.searches else context
     if settings.encode.has_goal:
-        made, trials, note = _search(work, aims=requested.aims)
+        made, trials, note = _search(work, time_only=requested.time_only)
     else:
         work.context = after_search
         trials, note = (), ""
@@ -405,11 +405,11 @@ def _compact_first(work: Work, checkpoint: Path | None) -> Compacted | None:
     return compacted
 
 
-def _search(work: Work, *, aims: bool) -> tuple[Container, tuple[Attempt, ...], str]:
+def _search(work: Work, *, time_only: bool) -> tuple[Container, tuple[Attempt, ...], str]:
     """Make containers until one meets the goal; return the best one, all attempts and a note."""
     from kissgs.pipeline.search import Search
 
-    search = Search(work, aims)
+    search = Search(work, time_only)
     best = search.run()
     made = replace(best.made, compacted=search.compacted(best), finetuning=search.finetuning(best))
     return made, tuple(search.attempts), search.note(best)
@@ -435,19 +435,19 @@ def _encode_once(work: Work, checkpoint: Path | None, *, disposable: bool) -> Co
     return Container(encoded=write(work, chosen, settings, compacted, work.context), settings=settings)
 
 
-def _settings_as_used(decided: Settings, used: EncodeSettings, requested: Settings) -> dict[str, Any]:
+def _settings_as_used(resolved: Settings, used: EncodeSettings, requested: Settings) -> dict[str, Any]:
     """Return the settings with the changes by a search for a goal and by fine-tuning, and the goals as requested."""
     kept = ["rd_lambda", "quality_offset_db", "color_refit_iterations", "max_encodes"]
-    if decided.encode.has_goal:
+    if resolved.encode.has_goal:
         kept.append("prune_threshold_bits")  # fine-tuned containers have another one
-    changes = {name: getattr(decided.encode, name) for name in kept}  # the same request gives the same bytes
+    changes = {name: getattr(resolved.encode, name) for name in kept}  # the same request gives the same bytes
     changes |= {name: getattr(requested.encode, name) for name in GOALS}
     groups: dict[str, Any] = {"encode": used.model_copy(update=changes)}
-    if requested.aims:  # what the time decides
+    if requested.time_only:  # what the time decides
         auto_count, tuned = requested.compact.auto_count, requested.finetune.enabled
-        groups["compact"] = decided.compact.model_copy(update={"auto_count": auto_count})
-        groups["finetune"] = decided.finetune.model_copy(update={"enabled": tuned})
-    return decided.model_copy(update=groups).as_json()
+        groups["compact"] = resolved.compact.model_copy(update={"auto_count": auto_count})
+        groups["finetune"] = resolved.finetune.model_copy(update={"enabled": tuned})
+    return resolved.model_copy(update=groups).as_json()
 
 
 def _evaluate(splats: Splats, container: Mapping[str, bytes], views: Views | None, context: Context) -> Evaluation:

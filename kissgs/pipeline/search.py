@@ -110,7 +110,7 @@ class Search:
 
     Attributes:
         work: what all encodings share.
-        aims: whether the goal is no more than an aim: if no container meets it in time, the closest one is kept.
+        time_only: whether only the time is limited: if no container meets the usual loss, the closest one is kept.
         goal: the goal.
         compare: compares a decoded container with the original scene.
         plan: number of trained containers, and the first of them.
@@ -124,7 +124,7 @@ class Search:
     """
 
     work: Work
-    aims: bool = False
+    time_only: bool = False
     compactor: Popspa | None = field(init=False, default=None)
     goal: Goal = field(init=False)
     compare: SearchEvaluation = field(init=False)
@@ -160,7 +160,7 @@ class Search:
         self.compactor = Popspa(work.splats, compact, supervision, work.context)
         self.plan = SearchPlan(compact.max_compactions)
         if work.time is not None and self.trains:
-            in_time = work.time.plan(photographs=self.photographs, aims=self.aims)
+            in_time = work.time.plan(photographs=self.photographs, time_only=self.time_only)
             self.plan = replace(in_time, containers=min(self.plan.containers, in_time.containers))
         if work.time is not None and self.photographs:
             most = work.time.scoring_views(max(self.first[0], 1))
@@ -238,15 +238,15 @@ class Search:
                 self._search_without_photographs(self.path)
         except StopSearch:
             self.stopped = True
-            found = self.best or (self.closest if self.aims else None)
+            found = self.best or (self.closest if self.time_only else None)
             if found is None and self.path is not None:
                 self._encode_latest(self.path)
-                found = self.best or (self.closest if self.aims else None)
+                found = self.best or (self.closest if self.time_only else None)
             if found is None:
                 raise
         finally:
             self._progress.note = ""
-        if self.best is None and self.aims:
+        if self.best is None and self.time_only:
             self.best = self.closest
         if self.best is None or self.best.bytes > (self.goal.most_bytes or math.inf):
             raise UnsupportedError(self._failure())
@@ -286,7 +286,7 @@ class Search:
             self._prune_to(path, min(first - 1, PRUNABLE_POINTS))
         if limited is not None and not self._recovers(path):
             self._search_all_gaussians(tunes=False)
-            left = limited.plan(photographs=True, aims=self.aims).containers
+            left = limited.plan(photographs=True, time_only=self.time_only).containers
             self.plan = replace(self.plan, containers=min(self.plan.containers, left))
         last = last_number(len(path.whole))
         if limited is None and not self.goal.by_size:
@@ -295,7 +295,7 @@ class Search:
                 first = last = failing - 1
         if not self._whole_searched or self.plan.containers > 1:
             self._along_path(path, first, last)
-        if self.best is None and not self.aims:
+        if self.best is None and not self.time_only:
             self._search_all_gaussians()
 
     def _first_that_fails(self, path: TrainingPath, number: int) -> int:
@@ -533,7 +533,7 @@ class Search:
         if limited is None:
             return
         met = self.best is not None and self.best.bytes <= (self.goal.most_bytes or math.inf)
-        enough = met or (bool(self.attempts) and (trained or self.aims))
+        enough = met or (bool(self.attempts) and (trained or self.time_only))
         if enough and limited.deadline.seconds < limited.expected(self._longest, trained=trained):
             raise NoFurtherError
 
@@ -607,10 +607,10 @@ class Search:
         """Return a note: losses are estimates, or the finest container of the scene is below the target size."""
         if self.encode_settings.max_psnr_drop is not None and best.against == "renderings":
             return ESTIMATED_DROP
-        room, target = self.goal.margin(best), self.target_size
+        margin, target = self.goal.margin(best), self.target_size
         finest = best.rd_lambda == 2.0 ** LOG2_LAMBDA_RANGE[0]
         limited = codebook_limited(best.made.settings, self.work.splats.sh_degree)
-        if not target or not finest or limited or room <= self.goal.limits[0].near:
+        if not target or not finest or limited or margin <= self.goal.limits[0].near:
             return ""
         return f"target_size {target:,} bytes is above the finest container of this scene: {best.bytes:,} bytes"
 

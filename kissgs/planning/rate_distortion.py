@@ -195,7 +195,7 @@ def plan_rate_distortion(
     model = ErrorModel(costs, sh_model, prune_bits, settings.gaussians_per_codebook_entry, uncertainty)
     usual = default_error(costs, splats, kept, sh_model)
     rd_lambda, default_lambda = choose_lambda(usual, model, settings, refits)
-    slack = max(1.0, float(np.sqrt(rd_lambda / default_lambda)))
+    step_growth = max(1.0, float(np.sqrt(rd_lambda / default_lambda)))
     pruned = costs.pruned_by_rd(rd_lambda, prune_bits, default_lambda)
     note = _pruning_note(pruned, costs)
     if pruned.any():
@@ -227,10 +227,10 @@ def plan_rate_distortion(
 
     planning.report("rounding")
     captured = sensitivity.captured.take(order)
-    largest = largest_changes(sensitivity.coverage.take(order), captured, slack)
+    largest = largest_changes(sensitivity.coverage.take(order), captured, step_growth)
     quantizer = RdFields(planning, criterion, largest)
     fields = quantizer.shapes(shapes, selected(sensitivity.shape_hessian, order))
-    fields["means"] = quantizer.means(splats, order, np.rint(captured + np.log2(slack)).astype(np.int8))
+    fields["means"] = quantizer.means(splats, order, np.rint(captured + np.log2(step_growth)).astype(np.int8))
     fields["f_dc"], clipped = quantizer.colors(
         _base_colors(splats, order, sensitivity, fields, codebook, recolor, pool)
     )

@@ -55,12 +55,12 @@ for larger errors. A Gaussian smaller than a pixel has no derivative by its size
 nearby, so scales may grow less than they may shrink (``growth``).
 """
 
-SLACK_POWER = 1 / 3
-"""Exponent with which these bounds grow with ``slack``, measured with cameras that the encoder did not use."""
+STEP_GROWTH_POWER = 1 / 3
+"""Exponent with which these bounds grow with ``step_growth``, measured with cameras that the encoder did not use."""
 
 
 def largest_changes(
-    coverage: Float[np.ndarray, " M"], captured: Float[np.ndarray, " M"], slack: float
+    coverage: Float[np.ndarray, " M"], captured: Float[np.ndarray, " M"], step_growth: float
 ) -> dict[str, Computed]:
     """Return the largest change by rounding of each attribute of each Gaussian, rows of float64.
 
@@ -72,7 +72,7 @@ def largest_changes(
         seen, by_capture = coverage[rows].astype(np.float64), captured[rows].astype(np.float64)
         unseen, virtual, capture = np.log([UNSEEN[name], VIRTUAL[name], CAPTURED[name]])
         logs = unseen * (1 - seen) + virtual * (seen - by_capture) + capture * by_capture
-        return np.minimum(np.exp(logs) * slack**SLACK_POWER, CAPTURED[name])
+        return np.minimum(np.exp(logs) * step_growth**STEP_GROWTH_POWER, CAPTURED[name])
 
     return {name: Computed(len(coverage), partial(change, name)) for name in CAPTURED}
 

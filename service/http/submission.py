@@ -94,7 +94,7 @@ async def submit(
 def parse_options(text: str | bytes) -> JobOptions:
     """Parse options from JSON; the problem of invalid ones lists every invalid field."""
     try:
-        options = JobOptions.model_validate_json(text).decided(photographs=None, torch=can_train())
+        options = JobOptions.model_validate_json(text).resolved(photographs=None, torch=can_train())
     except ValidationError as error:
         named, found = field_errors(error.errors())
         raise ProblemError(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from kissgs.pipeline.curves import LOG2_LAMBDA_RANGE, LambdaCurve, NoFurtherError, along_path, first_point
 from kissgs.pipeline.goal import Attempt, Goal
-from kissgs.pipeline.limited_time import AIMING, MEETING, SearchPlan
+from kissgs.pipeline.limited_time import TIME_ONLY, WITH_GOAL, SearchPlan
 from kissgs.pipeline.search import NEAR_LOG2
 from kissgs.settings import EncodeSettings
 
@@ -160,7 +160,7 @@ def test_the_first_container_is_never_far_from_that_of_the_plan():
     assert first(max_psnr_drop=20.0)[0] == 10
 
 
-@pytest.mark.parametrize("plan", [plan for plans in (MEETING, AIMING) for _, plan in plans])
+@pytest.mark.parametrize("plan", [plan for plans in (WITH_GOAL, TIME_ONLY) for _, plan in plans])
 @pytest.mark.parametrize("drop", [0.1, 0.5, 20.0])
 def test_a_single_container_keeps_its_reserve(plan, drop):
     goal = Goal.of(EncodeSettings(max_psnr_drop=drop))

@@ -84,7 +84,7 @@ def test_two_limits_take_few_more_encodings_than_the_tighter_one(growth, ssim_gr
         decisive = goal_of(**limits).decisive(model_trial(found, growth, ssim_growth))
         single, _ = searched(Goal((decisive,)), growth, ssim_growth, start)
         assert len(points) <= len(single) + 2
-        assert 0 <= decisive.room(model_trial(found, growth, ssim_growth)) <= decisive.near
+        assert 0 <= decisive.margin(model_trial(found, growth, ssim_growth)) <= decisive.near
 
 
 @pytest.mark.parametrize(

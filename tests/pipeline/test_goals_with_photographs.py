@@ -114,17 +114,17 @@ def test_the_order_leads_to_the_input(tmp_path):
 )
 def test_what_settings_leave_open(given, compacts, tunes):
     goal = Settings.research("balanced", max_psnr_drop=0.1, **given)
-    chosen = goal.decided(photographs=True, torch=True)
+    chosen = goal.resolved(photographs=True, torch=True)
     assert (chosen.compact.auto_count, chosen.finetune.enabled) == (compacts, tunes)
-    bare = goal.decided(photographs=None, torch=True)
+    bare = goal.resolved(photographs=None, torch=True)
     assert (bare.compact.auto_count, bare.finetune.enabled) == (compacts and tunes, tunes)
     for photographs_, torch in [(True, False), (None, False), (False, True)]:
-        chosen = goal.decided(photographs=photographs_, torch=torch)
+        chosen = goal.resolved(photographs=photographs_, torch=torch)
         assert (chosen.compact.auto_count, chosen.finetune.enabled) == (False, False)
     for other in (Settings(), Settings.from_preset("balanced", psnr=40)):
-        chosen = other.decided(photographs=True, torch=True)
+        chosen = other.resolved(photographs=True, torch=True)
         assert (chosen.compact.auto_count, chosen.finetune.enabled) == (False, False)
-    assert goal.decided(photographs=True, torch=True).decided(photographs=False, torch=False) == goal.decided(
+    assert goal.resolved(photographs=True, torch=True).resolved(photographs=False, torch=False) == goal.resolved(
         photographs=True, torch=True
     )
 
@@ -138,8 +138,8 @@ def test_what_settings_leave_open(given, compacts, tunes):
     ],
 )
 def test_towards_a_goal_of_ssim_training_gives_it_more_weight(goal, given, weights):
-    chosen = Settings.research("balanced", **goal, **given).decided(photographs=True, torch=True)
-    assert chosen.decided(photographs=True, torch=True) == chosen
+    chosen = Settings.research("balanced", **goal, **given).resolved(photographs=True, torch=True)
+    assert chosen.resolved(photographs=True, torch=True) == chosen
     assert (chosen.compact.ssim_weight, chosen.finetune.ssim_weight) == weights
 
 

@@ -116,7 +116,7 @@ def test_the_report_adds_up(tmp_path, ply):
     assert 0 < sum(report.seconds.values()) <= elapsed
     assert report.cpu_seconds > 0
     assert report.peak_memory > report.source_bytes
-    assert Settings.model_validate(report.settings) == FAST.decided(photographs=None, torch=True)
+    assert Settings.model_validate(report.settings) == FAST.resolved(photographs=None, torch=True)
     decoded = json.loads(json.dumps(report.as_dict()))
     assert decoded["cleaned"]["non_finite"] == 1
     assert decoded["ratio"] == report.ratio

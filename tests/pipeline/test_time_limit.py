@@ -12,7 +12,7 @@ import kissgs
 from kissgs import Settings, UnsupportedError
 from kissgs.core.progress import Deadline
 from kissgs.pipeline import limited_time as machine_speed
-from kissgs.pipeline.limited_time import MEETING, SearchTime, encode_seconds, in_time, save_speed
+from kissgs.pipeline.limited_time import WITH_GOAL, SearchTime, encode_seconds, in_time, save_speed
 from kissgs.settings import Preset
 from kissgs.training.supervision import SupervisionViews
 
@@ -26,9 +26,9 @@ def no_saved_speed(monkeypatch, tmp_path):
 
 def plan_of(seconds, count=100_000, *, photographs=True, **changes):
     requested = Settings.research(changes.pop("preset", "balanced"), time_limit=seconds, **changes)
-    decided = requested.decided(photographs=photographs or None, torch=True)
-    time = SearchTime(Deadline.after(seconds), encode_seconds(decided.preset, count, 2))
-    return in_time(requested, decided, time, count=count, captured=photographs, torch=True)
+    resolved = requested.resolved(photographs=photographs or None, torch=True)
+    time = SearchTime(Deadline.after(seconds), encode_seconds(resolved.preset, count, 2))
+    return in_time(requested, resolved, time, count=count, captured=photographs, torch=True)
 
 
 def trains(plan):
@@ -72,15 +72,16 @@ def test_a_goal_keeps_its_value():
 
 
 def test_more_time_makes_more_containers():
-    for aims in (True, False):
+    for time_only in (True, False):
         plans = [
-            SearchTime(Deadline.after(10 * units), 10).plan(photographs=True, aims=aims) for units in (3, 6, 12, 30, 90)
+            SearchTime(Deadline.after(10 * units), 10).plan(photographs=True, time_only=time_only)
+            for units in (3, 6, 12, 30, 90)
         ]
         assert [plan.containers for plan in plans] == sorted(plan.containers for plan in plans)
         assert [plan.number for plan in plans] == sorted(plan.number for plan in plans)
         assert (plans[0].containers, plans[-1].containers) == (1, 3)
     rendered = [
-        SearchTime(Deadline.after(10 * units), 10).plan(photographs=False, aims=False) for units in (4, 20, 40, 90)
+        SearchTime(Deadline.after(10 * units), 10).plan(photographs=False, time_only=False) for units in (4, 20, 40, 90)
     ]
     assert [plan.containers for plan in rendered] == [0, 1, 2, 3]
 
@@ -269,7 +270,7 @@ def test_a_short_search_prunes_no_further_than_it_trains(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
     monkeypatch.setattr("kissgs.pipeline.limited_time.encode_seconds", lambda *found: 1e-3)
-    monkeypatch.setattr(SearchTime, "plan", lambda self, photographs, aims: MEETING[0][1])
+    monkeypatch.setattr(SearchTime, "plan", lambda self, photographs, time_only: WITH_GOAL[0][1])
     requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     assert found.report.trials[0].count == round(200 * 0.8**2)

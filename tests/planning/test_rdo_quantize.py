@@ -127,10 +127,10 @@ def test_largest_changes_follow_who_has_looked_at_each():
     assert tuple(UNSEEN.values()) == steps
 
 
-def test_largest_changes_grow_with_slack_up_to_those_of_a_capture():
+def test_largest_changes_grow_with_the_steps_up_to_those_of_a_capture():
     some = np.array([0.0, 0.7])
     for name, most in CAPTURED.items():
-        each = np.stack([largest_changes(some, 0 * some, slack)[name][:] for slack in (1.0, 8.0, 1e9)])
+        each = np.stack([largest_changes(some, 0 * some, step_growth)[name][:] for step_growth in (1.0, 8.0, 1e9)])
         np.testing.assert_allclose(each[1], np.minimum(2 * each[0], most))
         np.testing.assert_allclose(each[2], most)
 
@@ -151,7 +151,7 @@ def test_unseen_gaussians_are_rounded_no_coarser_than_by_uniform_planning():
     assert UNSEEN["opacities"] < opacities[~unseen].max() <= VIRTUAL["opacities"] + 1e-4
 
 
-def test_slack_lets_changes_of_a_scene_grow_up_to_the_wide_limit():
+def test_larger_steps_let_changes_of_a_scene_grow_up_to_the_wide_limit():
     """Decoded values, not what was asked for: no scale is off by more than rounding may move it."""
     splats = random_scene(2000, 0, seed=5)
     sensitivity = random_sensitivity(splats)

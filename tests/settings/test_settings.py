@@ -51,7 +51,7 @@ def test_settings_survive_json(preset, made):
     for plain in (chosen, Settings.from_preset(preset)):
         assert Settings.model_validate_json(plain.model_dump_json()).model_dump_json() == plain.model_dump_json()
     if preset != "paper" and made == Settings.from_preset:
-        chosen = made("balanced", max_ssim_drop=0.1).decided(photographs=True, torch=True)
+        chosen = made("balanced", max_ssim_drop=0.1).resolved(photographs=True, torch=True)
         assert Settings.model_validate_json(chosen.model_dump_json()) == chosen
 
 
