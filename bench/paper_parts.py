@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt8
-from kissgs.core.progress import Context
+from kissgs.core.context import Context
 from kissgs.core.resources import blas_workers
 from kissgs.core.splats import Splats
 from kissgs.io.planes import compress_images

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from kissgs.cameras.virtual.select import virtual_views
     from kissgs.client import Remote
     from kissgs.compaction.result import Compacted, CompactionReport
+    from kissgs.core.context import Progress
     from kissgs.core.errors import (
         Cancelled,
         InvalidContainerError,
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
         StopSearch,
         UnsupportedError,
     )
-    from kissgs.core.progress import Progress
     from kissgs.core.sensitivity import Sensitivity
     from kissgs.core.splats import Splats, clean
     from kissgs.evaluation.evaluate import evaluate

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 from urllib.parse import urlsplit
 
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import Cancelled, InvalidSceneError, KissgsError, RemoteError, UnsupportedError
-from kissgs.core.progress import Progress, silent
 from kissgs.formats import ContainerName, named_container
 from kissgs.io.files import atomic_file, reason_of, refuse_existing
 from kissgs.settings import GROUPS, Settings

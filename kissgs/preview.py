@@ -21,9 +21,9 @@ from typing import Any
 from urllib.parse import quote, unquote, urlsplit
 
 from kissgs._version import __version__
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, KissgsError, UnsupportedError
 from kissgs.core.positions import WORLD
-from kissgs.core.progress import Progress, silent
 from kissgs.formats import CONTAINERS, FORMATS, ending_of
 from kissgs.io.containers import META_NAME, Source, open_source
 from kissgs.io.files import reason_of

@@ -16,7 +16,7 @@ from bench import paper_parts
 from bench.common import at_quality_offset, bytes_at, saving
 from bench.external import measure_external
 from bench.rendering import resampled
-from kissgs.core.progress import Context
+from kissgs.core.context import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import encode

@@ -25,6 +25,7 @@ import typer
 from kissgs.cli.files import progress_bar, show, write_output
 from kissgs.cli.options import ForceOption, ViewsOption, chosen, open_views, output_option
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
+from kissgs.core.resources import has_torch
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -50,7 +51,7 @@ def warmup() -> None:
     from kissgs.rendering import ssim_kernels  # noqa: F401
     from kissgs.rendering.cpu import frame, neighbours  # noqa: F401
 
-    if find_spec("torch"):  # without it nothing is trained
+    if has_torch():  # without it nothing is trained
         from kissgs.finetuning import planes  # noqa: F401
         from kissgs.training import model  # noqa: F401
 

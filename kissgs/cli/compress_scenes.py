@@ -25,12 +25,12 @@ from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
 from kissgs.cli.options import open_views
 from kissgs.cli.signals import stoppable
 from kissgs.cli.tables import report_table, streamed_table
+from kissgs.core.context import Progress, load_kernels, silent
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
-from kissgs.core.progress import Progress, load_kernels, silent
 from kissgs.formats import ContainerName
 from kissgs.io.files import move_into_place, open_scene_file, reason_of
 from kissgs.io.scene_format import ReadOptions
-from kissgs.pipeline.limited_time import resolved
+from kissgs.pipeline.choice import resolved
 from kissgs.pipeline.pipeline import Compressed, compress
 from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of
 from kissgs.settings import Settings

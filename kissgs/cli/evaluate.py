@@ -14,7 +14,7 @@ from kissgs.cli.files import print_json, progress_bar, say_notes, show
 from kissgs.cli.options import CaptureOptions, ForceOption, SceneOptions, one_of, with_option_groups
 
 if TYPE_CHECKING:
-    from kissgs.core.progress import Progress
+    from kissgs.core.context import Progress
     from kissgs.evaluation.html import ReportScene
 
 Split = Literal["test", "train", "all"]
@@ -57,8 +57,8 @@ def evaluate(
 ) -> None:
     """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""
     from kissgs.cli.tables import evaluation_table
+    from kissgs.core.context import Context
     from kissgs.core.positions import with_origin
-    from kissgs.core.progress import Context
     from kissgs.evaluation.evaluate import evaluate as measure
     from kissgs.evaluation.html import html_report
     from kissgs.io.files import atomic_file, refuse_existing

@@ -20,9 +20,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
+from kissgs.core.context import Progress as Receiver
+from kissgs.core.context import silent
 from kissgs.core.errors import InvalidSceneError, KissgsError, OutputError, UnsupportedError
-from kissgs.core.progress import Progress as Receiver
-from kissgs.core.progress import silent
 from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, named_manifest, names_folder
 
 if TYPE_CHECKING:

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
+from kissgs.core.context import Device
 from kissgs.core.errors import UnsupportedError
 from kissgs.formats import ENDINGS, SCENE_ENDINGS
-
-Device = Literal["cpu", "cuda"]
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views

@@ -16,7 +16,7 @@ from kissgs.formats import ENDINGS, ending_of, named_container
 
 if TYPE_CHECKING:
     from kissgs.client import Remote
-    from kissgs.core.progress import Progress
+    from kissgs.core.context import Progress
 
 ServerOption = Annotated[
     str, typer.Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="URL of the service.")

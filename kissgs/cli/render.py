@@ -271,7 +271,7 @@ def render(
     """Render an image of a scene, an orbit around it (animation or contact sheet), or all its views."""
     from kissgs.cameras.captures.transforms_json import camera_as_dict, write_camera
     from kissgs.cameras.render import RenderJob
-    from kissgs.core.progress import Context
+    from kissgs.core.context import Context
     from kissgs.evaluation.evaluate import in_scene_frame
     from kissgs.io.files import refuse_existing
     from kissgs.pipeline.scene_files import load

@@ -24,7 +24,7 @@ from kissgs.core.errors import StopSearch
 if TYPE_CHECKING:
     from types import FrameType
 
-    from kissgs.core.progress import Progress
+    from kissgs.core.context import Progress
 
 
 _STOPPING = (

@@ -18,8 +18,8 @@ from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
 from kissgs.compaction.scoring import prune_by_score
 from kissgs.core.array_types import Float32, Int
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Deadline, Pace, Progress, load_kernels
 from kissgs.core.errors import OutputError
-from kissgs.core.progress import DEFAULT_CONTEXT, Context, Deadline, Pace, Progress, load_kernels
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
@@ -244,14 +244,14 @@ show what matters, False for virtual views."""
 
 @dataclass(slots=True, eq=False)
 class SceneTraining:
-    """Prunes and trains the scene of a task, step by step."""
+    """Prunes and trains the scene of a compactor, step by step."""
 
-    task: Popspa
+    compactor: Popspa
     index: Int[np.ndarray, " M"] = field(init=False)  # in that scene, of each Gaussian that is left, ascending
     _model: GaussianModel | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        self.index = np.arange(len(self.task.splats))
+        self.index = np.arange(len(self.compactor.splats))
 
     def __len__(self) -> int:
         return len(self.index)
@@ -271,19 +271,19 @@ class SceneTraining:
         """Return the current scene."""
         if self._model is not None:
             return self.trained.splats()
-        source = self.task.splats
+        source = self.compactor.splats
         return source if len(self) == len(source) else source.select(self.index)
 
     def prune(self, count: int, context: Context) -> None:
         """Keep the ``count`` Gaussians that images would miss most; reports the stage "score"."""
-        views = self.task.supervision
+        views = self.compactor.supervision
         kept = prune_by_score(
             self.splats(),
             views.score,
             views.background,
             count,
             context,
-            min_keep_per_scoring=self.task.settings.min_keep_per_scoring,
+            min_keep_per_scoring=self.compactor.settings.min_keep_per_scoring,
             min_score=MIN_SCORE[views.captured],
         )
         self.index = self.index[kept]
@@ -294,14 +294,14 @@ class SceneTraining:
         """Make the current scene trainable."""
         from kissgs.training.model import GaussianModel
 
-        self._model = GaussianModel(self.splats(), self.task.context.device, self._position_extents())
+        self._model = GaussianModel(self.splats(), self.compactor.context.device, self._position_extents())
 
     def restore(self, state: State, index: Int[np.ndarray, " M"]) -> None:
         """Continue from the :meth:`kissgs.training.model.GaussianModel.state` of the Gaussians at ``index``."""
         from kissgs.training.model import GaussianModel
 
-        self.index, device = index, self.task.context.device
-        self._model = GaussianModel.restored(state, self.task.splats, device, self._position_extents())
+        self.index, device = index, self.compactor.context.device
+        self._model = GaussianModel.restored(state, self.compactor.splats, device, self._position_extents())
 
     def state(self) -> State:
         """Return a copy of the state of the training, see :meth:`restore`."""
@@ -323,7 +323,7 @@ class SceneTraining:
         """
         from kissgs.training.loop import TrainingPlan, train
 
-        settings, targets = self.task.settings, self.task.load_targets()
+        settings, targets = self.compactor.settings, self.compactor.load_targets()
         plan = TrainingPlan(
             stage=phase.name,
             pace=Pace(phase.steps, context.deadline),
@@ -336,7 +336,7 @@ class SceneTraining:
         train(self.trained, targets, plan, context, first=first, after=after)
 
     def _shape_regularizers(self) -> tuple[Regularizer, ...]:
-        settings = self.task.settings
+        settings = self.compactor.settings
         if not (settings.erank_weight or settings.min_scale_weight):
             return ()
         from kissgs.compaction.regularizers import ShapeRegularizer
@@ -345,7 +345,7 @@ class SceneTraining:
 
     def _camera_extent(self) -> float:
         """Return the extent of the cameras, world units; the scene's radius if they are nearly at one position."""
-        radius, extent = scene_bounds(self.task.splats).radius, self.task.load_targets().extent
+        radius, extent = scene_bounds(self.compactor.splats).radius, self.compactor.load_targets().extent
         return extent if extent > MIN_RELATIVE_EXTENT * radius else radius
 
     def _position_extents(self) -> Float32[np.ndarray, " M"]:
@@ -354,8 +354,8 @@ class SceneTraining:
         The rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size,
         and positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes.
         """
-        settings, source = self.task.settings, self.task.splats
-        extents = self.task.load_targets().local_extents(source.means[self.index], self._camera_extent())
+        settings, source = self.compactor.settings, self.compactor.splats
+        extents = self.compactor.load_targets().local_extents(source.means[self.index], self._camera_extent())
         sizes = np.exp(np.median(source.scales[self.index].astype(np.float64), axis=1))
         most = BASE_LR["means"] * max(settings.means_lr_scale, settings.final_means_lr_scale)
         return np.minimum(MOST_STEP_PER_SIZE / most * sizes, extents).astype(np.float32)
@@ -365,7 +365,7 @@ class SceneTraining:
 class _Run:
     """One compaction and its state, which a checkpoint saves."""
 
-    task: Popspa
+    compactor: Popspa
     count: int
     checkpoint: Checkpoint
     log: StepLog
@@ -373,13 +373,13 @@ class _Run:
     checkpoint_note: str = field(init=False, default="")
 
     def __post_init__(self) -> None:
-        self.training = SceneTraining(self.task)
+        self.training = SceneTraining(self.compactor)
 
     def run(self) -> Compacted:
         """Do all steps, or those that remain after the checkpoint."""
-        task = self.task
-        load_kernels(task.context.progress)
-        phases = training_phases(task.settings, len(task.splats), self.count)
+        compactor = self.compactor
+        load_kernels(compactor.context.progress)
+        phases = training_phases(compactor.settings, len(compactor.splats), self.count)
         if not phases:
             self._first_pruning(self.count)
             return self._result("nothing")
@@ -388,26 +388,26 @@ class _Run:
             self._train(phases, number, done, state)
             done, state = 0, {}
         self._save(len(phases), 0, {})
-        return self._result(task.load_targets().target_source)
+        return self._result(compactor.load_targets().target_source)
 
     def _start(self) -> tuple[int, int, State]:
         """Do the first pruning, or load the checkpoint; return the current phase, its steps done, and the state."""
-        task = self.task
+        compactor = self.compactor
         state = self.checkpoint.load()
         if state is not None:
             status = Status.from_state(state)
             self.training.restore(state, state["index"])
             self.log.restore(status.steps, status.seconds)
             return status.phase, status.done, state
-        self._first_pruning(first_pruning_count(task.settings, len(task.splats), self.count))
+        self._first_pruning(first_pruning_count(compactor.settings, len(compactor.splats), self.count))
         self.training.begin()
         self._save(0, 0, {})  # a file that cannot be written must be reported before the training
         return 0, 0, {}
 
     def _first_pruning(self, count: int) -> None:
         """Prune the input to ``count`` Gaussians."""
-        self.log.record("input", self.task.splats)
-        self.training.prune(count, self.task.context)
+        self.log.record("input", self.compactor.splats)
+        self.training.prune(count, self.compactor.context)
         self.log.record("prune", self.training.splats())
 
     def _train(self, phases: Sequence[Phase], number: int, done: int, state: State) -> None:
@@ -419,8 +419,8 @@ class _Run:
             if self.checkpoint.due:
                 self._save(number, step, {} if sparsifier is None else sparsifier.state())
 
-        progress = stage_progress(self.task.context.progress, phases, number)
-        context = replace(self.task.context, progress=progress, deadline=None)  # a given count takes all steps
+        progress = stage_progress(self.compactor.context.progress, phases, number)
+        context = replace(self.compactor.context, progress=progress, deadline=None)  # a given count takes all steps
         training.train(
             phase,
             number,
@@ -437,7 +437,7 @@ class _Run:
     def _sparsifier(self, phase: Phase, state: State) -> AdmmSparsifier | None:
         from kissgs.compaction.regularizers import AdmmSparsifier
 
-        settings = self.task.settings
+        settings = self.compactor.settings
         if phase.name != "sparsify" or not settings.admm_rho:
             return None
         opacities = self.training.trained.parameters["opacities"]
@@ -459,9 +459,9 @@ class _Run:
             self.checkpoint_note = f"the work went on without a checkpoint: {error}"
 
     def _result(self, target_source: str) -> Compacted:
-        supervision, scene = self.task.supervision, self.training.splats()
+        supervision, scene = self.compactor.supervision, self.training.splats()
         report = CompactionReport(
-            source_count=len(self.task.splats),
+            source_count=len(self.compactor.splats),
             count=len(scene),
             target_source=target_source,
             source=supervision.source,
@@ -506,13 +506,13 @@ class TrainingPath:
     to that number alone would do at its end. So several numbers of Gaussians share one training.
     """
 
-    task: Popspa
+    compactor: Popspa
     keep_states: bool = True  # every point, not just the last one, can be refined: that takes three times the memory
     points: list[PathPoint] = field(init=False)  # the whole scene first
     whole: PathPoint = field(init=False)  # without training, also after the first point was trained
 
     def __post_init__(self) -> None:
-        self.whole = PathPoint(0, self.task.splats, np.arange(len(self.task.splats)))
+        self.whole = PathPoint(0, self.compactor.splats, np.arange(len(self.compactor.splats)))
         self.points = [self.whole]
 
     def prune(self, count: int) -> PathPoint:
@@ -520,9 +520,9 @@ class TrainingPath:
 
         If a progress receiver raises here or in :meth:`train`, the path stays as it was.
         """
-        load_kernels(self.task.context.progress)
+        load_kernels(self.compactor.context.progress)
         training = self._at(self.points[-1])
-        training.prune(count, self.task.context)
+        training.prune(count, self.compactor.context)
         return self._add(training, len(self.points))
 
     def train(self, deadline: Deadline | None = None) -> PathPoint:
@@ -531,17 +531,17 @@ class TrainingPath:
         :data:`POINT_STEPS` times ``sparsify_steps / prune_rounds`` steps are made, rounded down; with a deadline, as
         many of them as fit in.
         """
-        task, point = self.task, self.points[-1]
-        if task.settings.sparsify_steps == 0:
+        compactor, point = self.compactor, self.points[-1]
+        if compactor.settings.sparsify_steps == 0:
             return point
-        per_point = POINT_STEPS[task.load_targets().target_source]
-        steps = per_point * task.settings.sparsify_steps // task.settings.prune_rounds
+        per_point = POINT_STEPS[compactor.load_targets().target_source]
+        steps = per_point * compactor.settings.sparsify_steps // compactor.settings.prune_rounds
         if steps == 0:
             return point
         training = self._at(point)
         if not point.trained:
             training.begin()
-        context = replace(task.context, deadline=deadline)
+        context = replace(compactor.context, deadline=deadline)
         training.train(Phase("sparsify", steps, len(point)), point.number, context)
         self.points.pop()
         return self._add(training, point.number)
@@ -551,26 +551,26 @@ class TrainingPath:
 
         With a ``deadline``, as many of its steps are made as fit in; reports the stage "refine".
         """
-        task, splats = self.task, point.splats
-        if refine and task.settings.refine_steps:
+        compactor, splats = self.compactor, point.splats
+        if refine and compactor.settings.refine_steps:
             training = self._at(point)
             if not point.trained:
                 training.begin()
-            phase = Phase("refine", task.settings.refine_steps, len(point))
-            training.train(phase, REFINEMENT + point.number, replace(task.context, deadline=deadline))
+            phase = Phase("refine", compactor.settings.refine_steps, len(point))
+            training.train(phase, REFINEMENT + point.number, replace(compactor.context, deadline=deadline))
             splats = training.splats()
         report = CompactionReport(
-            source_count=len(task.splats),
+            source_count=len(compactor.splats),
             count=len(splats),
-            target_source=task.load_targets().target_source if point.trained or refine else "nothing",
-            source=task.supervision.source,
+            target_source=compactor.load_targets().target_source if point.trained or refine else "nothing",
+            source=compactor.supervision.source,
             steps=(),
-            note=task.supervision.note,
+            note=compactor.supervision.note,
         )
         return Compacted(splats, point.index, report)
 
     def _at(self, point: PathPoint) -> SceneTraining:
-        training = SceneTraining(self.task)
+        training = SceneTraining(self.compactor)
         training.index = point.index
         if point.state is not None:
             training.restore(point.state, point.index)

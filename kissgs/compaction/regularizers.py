@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from kissgs.core.array_types import Float
-from kissgs.training.loop import Parameters, Regularizer, TrainableScene
+from kissgs.rendering.differentiable import Parameters
+from kissgs.training.loop import Regularizer, TrainableScene
 
 # Regularization of the shapes of Gaussians during training: neither needles nor balls.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from kissgs.cameras.views import View
 from kissgs.core.array_types import Float, Float32, Float64, Int
-from kissgs.core.progress import DEFAULT_CONTEXT, Context
+from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import removal_scores

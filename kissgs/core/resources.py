@@ -1,4 +1,4 @@
-"""Threads, time and memory: ordered thread pools, measurement of what work takes, return of freed memory."""
+"""Resources of the machine: freed memory, time and memory that work takes, torch, ordered thread pools."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from kissgs.core.progress import Progress
+from kissgs.core.context import Progress
 
 if TYPE_CHECKING:
     from threadpoolctl import threadpool_limits
@@ -143,6 +144,11 @@ def peak_memory() -> int:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+def has_torch() -> bool:
+    """Return whether torch is installed, which training needs."""
+    return find_spec("torch") is not None
 
 
 # Thread pools with ordered maps, so that results do not depend on the number of threads.

@@ -13,9 +13,9 @@ import numpy as np
 from kissgs.cameras.photographs import orientation
 from kissgs.cameras.views import Similarity, View, Views
 from kissgs.core.array_types import Float32, Shaped
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Device, Progress, load_kernels, silent
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 from kissgs.core.positions import Origin, with_origin
-from kissgs.core.progress import DEFAULT_CONTEXT, Context, Device, Progress, load_kernels, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison

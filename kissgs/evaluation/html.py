@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from kissgs.core.array_types import Float32, Float64, UInt8
-from kissgs.core.progress import DEFAULT_CONTEXT, Context
+from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
 from kissgs.evaluation.evaluate import background_of, render_clamped
 from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison, format_metric

@@ -314,7 +314,7 @@ def psnr_of(evaluation: Evaluation) -> float:
     """
     evaluation = over_scene(evaluation)
     mean = evaluation.mean.candidate_vs_reference.psnr
-    worst = _mean_of_worst([_squared_error(psnr) for psnr in _psnrs(evaluation)]) / MAX_ERROR_RATIO
+    worst = _mean_of_worst([squared_error(psnr) for psnr in _psnrs(evaluation)]) / MAX_ERROR_RATIO
     return mean if math.isnan(mean) or worst <= 0 else min(mean, -10 * math.log10(worst))
 
 
@@ -328,7 +328,7 @@ def drop_of(evaluation: Evaluation) -> float:
     """
     mean = evaluation.mean
     if mean.change is None:
-        drop = _drop_by(_squared_error(mean.candidate_vs_reference.psnr) / _squared_error(ASSUMED_PSNR))
+        drop = _drop_by(squared_error(mean.candidate_vs_reference.psnr) / squared_error(ASSUMED_PSNR))
         groups = [_errors_to_renderings(evaluation), _errors_to_renderings(over_scene(evaluation))]
     else:
         drop, groups = -mean.change, [_errors_added(evaluation)]
@@ -363,13 +363,13 @@ def _ssim_drops(evaluation: Evaluation) -> list[float]:
 
 def _errors_to_renderings(evaluation: Evaluation) -> list[float]:
     """Return each view's squared error to the reference's rendering, in units of that of :data:`ASSUMED_PSNR`."""
-    return [_squared_error(psnr) / _squared_error(ASSUMED_PSNR) for psnr in _psnrs(evaluation)]
+    return [squared_error(psnr) / squared_error(ASSUMED_PSNR) for psnr in _psnrs(evaluation)]
 
 
 def _errors_added(evaluation: Evaluation) -> list[float]:
     """Return the growth of each view's squared error to its photograph, in units of the reference's mean error."""
     pairs = [
-        (_squared_error(view.comparison.candidate.psnr), _squared_error(view.comparison.reference.psnr))
+        (squared_error(view.comparison.candidate.psnr), squared_error(view.comparison.reference.psnr))
         for view in evaluation.views
         if view.comparison.reference is not None
     ]
@@ -390,7 +390,7 @@ def _mean_of_worst(errors: Sequence[float]) -> float:
     return sum(sorted(errors)[-count:]) / count
 
 
-def _squared_error(psnr: float) -> float:
+def squared_error(psnr: float) -> float:
     """Return the mean squared error of a PSNR in decibels; 0 if that is infinite."""
     return float(10 ** (-psnr / 10))
 

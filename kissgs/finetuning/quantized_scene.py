@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float, Float32, Float64, Int
+from kissgs.core.context import Device, Pace
 from kissgs.core.positions import signed_exp
-from kissgs.core.progress import Device, Pace
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.finetuning.planes import Plane, each_part, level_bits, planes_of, sum_by_label
 from kissgs.planning import rotation_forms
@@ -24,7 +24,7 @@ from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel, Quantized
 from kissgs.planning.rd_criterion import Costs
 from kissgs.planning.rd_fields import UNUSED_COUNT, decoded_quats
 from kissgs.planning.sh_codebook import COEFFICIENTS
-from kissgs.rendering.tensors import Parameters
+from kissgs.rendering.differentiable import Parameters
 from kissgs.training.loop import Regularizer
 from kissgs.training.model import PrunableAdam
 

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 
 from kissgs._version import __version__
+from kissgs.core.context import Context, Pace
 from kissgs.core.errors import OutputError
-from kissgs.core.progress import Context, Pace
-from kissgs.core.splats import ATTRIBUTES, MAX_GAUSSIANS, Splats, clean
+from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.evaluation.evaluate import compare_images
-from kissgs.evaluation.results import Evaluation
+from kissgs.evaluation.results import Evaluation, squared_error
 from kissgs.finetuning.planes import FIELDS, TABLES
 from kissgs.finetuning.quantized_scene import QuantizedScene, RateLoss, TotalVariationLoss, table_name
 from kissgs.finetuning.result import FinetuneReport
@@ -144,16 +144,16 @@ class Tuner:
         return _Result(
             bytes=len(zip_bytes(encoded.files)),
             psnr=evaluation.mean.candidate.psnr,
-            error=float(np.mean([_squared_error(view.comparison.candidate.psnr) for view in evaluation.views])),
+            error=float(np.mean([squared_error(view.comparison.candidate.psnr) for view in evaluation.views])),
         )
 
     def _coding_error(self, encoded: Encoded, scene: Splats, context: Context) -> float:
         """Return the mean squared error of a container's renderings relative to those of the encoded scene."""
         views = self._compare(scene, encoded, context).views
-        return float(np.mean([_squared_error(view.comparison.candidate_vs_reference.psnr) for view in views]))
+        return float(np.mean([squared_error(view.comparison.candidate_vs_reference.psnr) for view in views]))
 
     def _compare(self, reference: Splats, encoded: Encoded, context: Context) -> Evaluation:
-        reading = ReadOptions(max_gaussians=max(len(reference), MAX_GAUSSIANS))
+        reading = ReadOptions.allowing(len(reference))
         decoded = self.decode(encoded.files, reading, threads=context.threads)
         return compare_images(reference, decoded, self.supervision.eval_views, context)
 
@@ -283,7 +283,3 @@ class _Result:
     def cost(self, rd_lambda: float) -> float:
         """Return the error plus lambda times bits."""
         return self.error + 8 * self.bytes * rd_lambda
-
-
-def _squared_error(psnr: float) -> float:
-    return float(10 ** (-psnr / 10))

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Shaped, UInt8
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.positions import WORLD, from_world, origin_for
-from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.containers import is_file_name
 from kissgs.io.conventions import (

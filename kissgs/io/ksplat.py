@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, Int64, Shaped
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.conventions import OPACITY_OF_BYTE, SH0_OF_BYTE, log_scales
 from kissgs.io.files import SceneFile, open_scene_file, refuse_degree, refuse_more_than

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.array_types import Float, Float32, Float64, Int64, Shaped, UInt32
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.positions import WORLD, Origin, from_world, in_world, origin_for, world_positions
-from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats, sampled_rows
 from kissgs.io.conventions import (
     colors_of,

@@ -8,7 +8,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, Literal
 
-from kissgs.core.progress import Progress
+from kissgs.core.context import Progress
 from kissgs.core.splats import MAX_GAUSSIANS, Splats
 from kissgs.io.files import BinaryWriter
 
@@ -37,6 +37,11 @@ class ReadOptions:
     raw_axes: bool = False
     origin: Literal["auto"] | None = None
     antialiased: bool | None = None
+
+    @classmethod
+    def allowing(cls, count: int) -> ReadOptions:
+        """Return options that read a scene of ``count`` Gaussians, or of any number that is read by default."""
+        return cls(max_gaussians=max(count, MAX_GAUSSIANS))
 
     @property
     def max_compressed(self) -> int:

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.array_types import Int64, Shaped
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError
-from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, empty_splats
 from kissgs.io.conventions import (
     OPACITY_OF_BYTE,

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.array_types import Float, Float32, UInt8
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.conventions import (
     OPACITY_OF_BYTE,

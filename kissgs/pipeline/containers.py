@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kissgs.core.progress import DEFAULT_CONTEXT, Context
+from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned
 from kissgs.formats import ContainerName
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan

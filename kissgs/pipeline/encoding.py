@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import zipfile
 from dataclasses import dataclass, fields, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,9 +13,9 @@ import numpy as np
 from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
+from kissgs.core.context import Context, Device, load_kernels
 from kissgs.core.errors import OutputError, UnsupportedError
-from kissgs.core.progress import Context, Device, load_kernels
-from kissgs.core.resources import blas_workers, return_free_memory
+from kissgs.core.resources import blas_workers, has_torch, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
 from kissgs.formats import ContainerName
@@ -202,14 +201,14 @@ def _pruned_for_finetune(settings: EncodeSettings, finetune: FinetuneSettings) -
     return settings.model_copy(update={"prune_threshold_bits": threshold})
 
 
-def make_tuner(work: Work, settings: FinetuneSettings | None = None, compaction: Popspa | None = None) -> Tuner:
+def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: Popspa | None = None) -> Tuner:
     """Return what fine-tunes the levels, with the images of a compaction if the settings would choose the same."""
     from kissgs.finetuning.tune import Tuner
     from kissgs.training.supervision import supervision_views, training_targets
 
     settings = settings or work.settings.finetune
-    if compaction is not None and compaction.settings.trains and _same_views(work.settings):
-        supervision, targets = compaction.supervision, compaction.load_targets()
+    if compactor is not None and compactor.settings.trains and _same_views(work.settings):
+        supervision, targets = compactor.supervision, compactor.load_targets()
     else:
         supervision = supervision_views(work.original, work.views, settings, work.context, scoring_stride=0)
         targets = training_targets(work.original, supervision, work.context)
@@ -229,7 +228,7 @@ def check_finetuning(settings: Settings, views: Views | None, device: Device) ->
     Raises:
         UnsupportedError: torch or a GPU is missing; the goal is one that fine-tuning would miss.
     """
-    if find_spec("torch") is None:
+    if not has_torch():
         raise UnsupportedError(
             "fine-tuning needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough)"
         )

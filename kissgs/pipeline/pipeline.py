@@ -11,18 +11,18 @@ import numpy as np
 
 from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.core.array_types import Int
+from kissgs.core.context import Context, Deadline, Device, Progress, ignore_stop_search, silent
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import Context, Deadline, Device, Progress, ignore_stop_search, silent
 from kissgs.core.resources import StageTimer, peak_memory, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import MAX_GAUSSIANS, Cleaned, Splats, empty_splats
+from kissgs.core.splats import Cleaned, Splats, empty_splats
 from kissgs.evaluation.results import Evaluation
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.formats import ContainerName, named_container
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
+from kissgs.pipeline.choice import choose, resolved
 from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.goal import Attempt
-from kissgs.pipeline.limited_time import choose, resolved
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
 from kissgs.settings import GOALS, EncodeSettings, Settings
 from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
@@ -455,6 +455,6 @@ def _evaluate(splats: Splats, container: Mapping[str, bytes], views: Views | Non
     from kissgs.evaluation.evaluate import evaluate
 
     context.progress("evaluate", 0.0)
-    most = ReadOptions(max_gaussians=max(len(splats), MAX_GAUSSIANS))
+    most = ReadOptions.allowing(len(splats))
     decoded = read_scene(container, most, threads=context.threads)
     return evaluate(splats, decoded, views, threads=context.threads, progress=context.stage("evaluate").progress)

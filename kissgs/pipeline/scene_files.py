@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidContainerError, OutputError, UnsupportedError
 from kissgs.core.positions import WORLD, centred, in_world, origin_for, relative_to, world_positions
-from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, clean
 from kissgs.formats import ENDINGS, FORMATS, LEVELS_NAME, LOD_NAME, SCENE_ENDINGS, output_format
 from kissgs.io.containers import (

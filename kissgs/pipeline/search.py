@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kissgs.compaction.budget import SearchEvaluation, chosen_views, estimate_note, unchanged
+from kissgs.compaction.budget import chosen_views, estimate_note, unchanged
 from kissgs.compaction.popspa import PathPoint, Popspa, TrainingPath
 from kissgs.compaction.result import Compacted, CountTrial
+from kissgs.compaction.search_evaluation import SearchEvaluation
+from kissgs.core.context import Context, SearchNote, ignore_stop_search
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.progress import Context, SearchNote, ignore_stop_search
-from kissgs.core.splats import MAX_GAUSSIANS, Splats
+from kissgs.core.splats import Splats
 from kissgs.evaluation.results import ESTIMATED_DROP, drop_of
 from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline.choice import has_photographs
 from kissgs.pipeline.curves import (
     KEEP,
     LOG2_LAMBDA_RANGE,
@@ -34,7 +36,7 @@ from kissgs.pipeline.curves import (
 )
 from kissgs.pipeline.encoding import Measured, Work, encode, make_tuner, measure
 from kissgs.pipeline.goal import Attempt, Container, Goal
-from kissgs.pipeline.limited_time import SearchPlan, has_photographs
+from kissgs.pipeline.limited_time import SearchPlan
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import stored_sizes
@@ -443,7 +445,7 @@ class Search:
 
     def _completing_tuner(self, path: TrainingPath) -> Tuner:
         """Return what fine-tunes containers of the path, and so completes its training."""
-        finetune, compactor = self.work.settings.finetune, path.task
+        finetune, compactor = self.work.settings.finetune, path.compactor
         changes = {name: factor * getattr(finetune, name) for name, factor in COMPLETING.items()}
         changes["steps"] = max(1, round(changes["steps"]))
         tuner = make_tuner(self.work, finetune.model_copy(update=changes), compactor)
@@ -568,7 +570,7 @@ class Search:
             self.work.context.progress("evaluate", 0.0)
         except StopSearch:
             self.stopped = True
-        most = ReadOptions(max_gaussians=max(len(self.work.original), MAX_GAUSSIANS))
+        most = ReadOptions.allowing(len(self.work.original))
         threads = self.work.context.threads
         return self.compare(read_scene(made.encoded.files, most, threads=threads), Context(threads))
 

@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, Int32, Integer, UInt8, UInt16
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.positions import coarse_note
-from kissgs.core.progress import DEFAULT_CONTEXT, Context, Progress
 from kissgs.core.resources import Workers, blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS, Splats

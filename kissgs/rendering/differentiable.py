@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from kissgs.rendering.constants import DILATION
 from kissgs.rendering.cpu.frame import Gradients, differentiate, draw
 from kissgs.rendering.cpu.records import Frame
 from kissgs.rendering.metrics import differences_and_ssim
-from kissgs.rendering.tensors import Parameters
 
 try:
     import torch
@@ -24,6 +23,9 @@ try:
     from torch.autograd.function import BackwardCFunction, FunctionCtx, once_differentiable
 except ModuleNotFoundError as error:
     raise UnsupportedError("gradients need torch, which is not installed: pip install 'kissgs[train]'") from error
+
+Parameters = Mapping[str, Tensor]
+"""Stored parameters of a scene, by the names in :class:`kissgs.core.splats.Splats`."""
 
 
 def rasterize(

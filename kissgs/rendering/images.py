@@ -10,8 +10,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from kissgs.core.array_types import Float32, UInt8
+from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import BLACK, Colour, render

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Device
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import DEFAULT_CONTEXT, Context, Device
 from kissgs.core.resources import Workers
-from kissgs.core.splats import SH_REST_COUNTS, Splats
+from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
 from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from kissgs.rendering.tensors import Parameters
 
 
 # The rasteriser on CUDA: gsplat in its modes "classic" and "antialiased", with :mod:`kissgs.rendering.constants`.
@@ -34,7 +32,7 @@ GSPLAT_MISSING = "rendering on CUDA needs gsplat, which is not installed: pip in
 
 
 def rasterize_on_cuda(
-    parameters: Parameters,
+    parameters: Mapping[str, Tensor],
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -89,12 +87,17 @@ def need_cuda() -> None:
         raise UnsupportedError(GSPLAT_MISSING)
 
 
+def tensors_of(splats: Splats, device: str = "cpu") -> dict[str, Tensor]:
+    """Return the parameters by name as torch tensors; on the CPU they share memory with ``splats``."""
+    import torch
+
+    return {name: torch.from_numpy(getattr(splats, name)).to(device) for name in ATTRIBUTES}
+
+
 def image_renderer(splats: Splats) -> ImageRenderer:
     """Return a renderer of a scene, which is copied to the GPU once."""
     need_cuda()
     import torch
-
-    from kissgs.rendering.tensors import tensors_of
 
     parameters = tensors_of(splats, "cuda")
 

@@ -8,8 +8,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, Self
 
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import KissgsError, RunnerError
-from kissgs.core.progress import Progress, silent
 
 log = logging.getLogger("kissgs.runners")
 

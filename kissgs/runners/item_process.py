@@ -19,8 +19,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from kissgs.core.context import Progress
 from kissgs.core.errors import KissgsError
-from kissgs.core.progress import Progress
 from kissgs.runners.contract import MEMORY_LIMIT
 
 EVENT_SECONDS = 0.25

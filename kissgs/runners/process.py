@@ -22,7 +22,7 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import IO, Any
 
-from kissgs.core.progress import Progress, silent
+from kissgs.core.context import Progress, silent
 from kissgs.runners.contract import (
     CRASHED,
     INTERNAL,

@@ -20,8 +20,8 @@ from dataclasses import asdict
 from importlib.util import find_spec
 from typing import IO, Any
 
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import RunnerError
-from kissgs.core.progress import Progress, silent
 from kissgs.runners.contract import UNREACHABLE, Outcome, Resources, RunHandle, WorkItem, log, refusal_of, report
 from kissgs.runners.process import child_environment, json_lines
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt8
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.positions import recorded, signed_exp
-from kissgs.core.progress import Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats, empty_splats
 from kissgs.formats import LOD_NAME

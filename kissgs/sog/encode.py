@@ -10,9 +10,9 @@ import numpy as np
 
 from kissgs._version import __version__
 from kissgs.core.array_types import UInt8
+from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.positions import recorded
-from kissgs.core.progress import DEFAULT_CONTEXT, Context
 from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.containers import META_NAME

@@ -16,8 +16,8 @@ from kissgs.cameras.captures.transforms_json import camera_as_dict, read_cameras
 from kissgs.cameras.views import black
 from kissgs.cameras.virtual.samples import MAX_VIEWS, default_view_count, sensitivity_cameras
 from kissgs.core.array_types import Float32
+from kissgs.core.context import Context, Progress, silent
 from kissgs.core.positions import STREAMED_REMEDY, WORLD, Cuts, cuts_without_coarse, recorded, visible_sizes
-from kissgs.core.progress import Context, Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, clean, concatenate, sampled_rows
 from kissgs.formats import ContainerName

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from kissgs._version import __version__
+from kissgs.core.context import Context, Progress, silent
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.positions import middle_of, with_origin, world_positions
-from kissgs.core.progress import Context, Progress, silent
 from kissgs.core.splats import BLOCK, Splats
 from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
 from kissgs.io.files import reason_of

@@ -11,12 +11,11 @@ from typing import Protocol
 
 import numpy as np
 
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Pace
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import DEFAULT_CONTEXT, Context, Pace
 from kissgs.core.resources import keep_free_memory
-from kissgs.rendering import tensors
 from kissgs.rendering.cpu.frame import Gradients
-from kissgs.rendering.differentiable import photometric_loss, rasterize
+from kissgs.rendering.differentiable import Parameters, photometric_loss, rasterize
 from kissgs.training.supervision import TrainingTargets
 
 try:
@@ -27,9 +26,6 @@ except ModuleNotFoundError as error:
 
 SMOOTHING = 0.98
 """Weight of the former value in the running means of loss and squared error."""
-
-Parameters = tensors.Parameters
-"""Stored parameters of a scene, by name; the type that regularizers receive."""
 
 LrSchedule = Callable[[float], Mapping[str, float]]
 """Function from the fraction of steps done, 0 to 1, to the learning rates by parameter."""

@@ -12,9 +12,9 @@ import numpy as np
 from numba import njit
 
 from kissgs.core.array_types import Float32, Int, Int32
+from kissgs.core.context import Device
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.numba_kernels import compiled
-from kissgs.core.progress import Device
 from kissgs.core.resources import Workers
 from kissgs.core.splats import (
     ATTRIBUTES,
@@ -27,7 +27,7 @@ from kissgs.core.splats import (
     clean,
 )
 from kissgs.rendering.cpu.frame import Gradients
-from kissgs.rendering.tensors import tensors_of
+from kissgs.rendering.rasterizer import tensors_of
 
 try:
     import torch

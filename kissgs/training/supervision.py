@@ -12,7 +12,7 @@ import numpy as np
 from kissgs.cameras.views import View, Views, black
 from kissgs.cameras.virtual.samples import close_ups, random_poses, scattered_cameras, scene_views
 from kissgs.core.array_types import Float32, Shaped
-from kissgs.core.progress import DEFAULT_CONTEXT, Context
+from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import ImageRenderer, image_renderer, render

@@ -55,7 +55,7 @@ def test_gradients_of_samples_are_those_of_their_pixels():
     """Oracle: the gradients of the whole image, for a loss that has these pixels only."""
     torch = pytest.importorskip("torch")
     from kissgs.rendering.differentiable import rasterize
-    from kissgs.rendering.tensors import tensors_of
+    from kissgs.rendering.rasterizer import tensors_of
 
     scene = cloud(500, degree=0)
     camera = look_at(np.array([0, -1.0, -4]), np.zeros(3), np.array([0, -1.0, 0]), fov=0.9, width=64, height=48)

@@ -16,7 +16,7 @@ from kissgs.cameras.virtual.samples import scene_views
 from kissgs.compaction.budget import compact_scene
 from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.scoring import highest_indices, prune_by_score
-from kissgs.core.progress import Context
+from kissgs.core.context import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.rasterizer import render

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import kissgs
 from kissgs.cameras.views import black
 from kissgs.compaction.scoring import highest_indices, prune_by_score
-from kissgs.core.progress import Context
+from kissgs.core.context import Context
 from kissgs.core.splats import ATTRIBUTES, SH_C0
 from kissgs.rendering.rasterizer import removal_scores
 from kissgs.rendering.sensitivity import Coverage

@@ -8,7 +8,7 @@ from helpers.training_scenes import around, cloud
 import kissgs
 from kissgs.cameras.views import Views, black
 from kissgs.cameras.virtual.samples import random_poses
-from kissgs.compaction.budget import COUNT, SearchEvaluation
+from kissgs.compaction.search_evaluation import COUNT, SearchEvaluation
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images, render_clamped
 from kissgs.evaluation.results import SEARCH_SEED
@@ -43,8 +43,8 @@ def test_the_views_and_their_renderings_are_made_once(monkeypatch):
         "kissgs.evaluation.evaluate.render_clamped",
         lambda *given, **named: rendered.append(1) or render_clamped(*given, **named),
     )
-    monkeypatch.setattr("kissgs.compaction.budget.random_poses", None)
-    monkeypatch.setattr("kissgs.compaction.budget.evaluation_views", None)
+    monkeypatch.setattr("kissgs.compaction.search_evaluation.random_poses", None)
+    monkeypatch.setattr("kissgs.compaction.search_evaluation.evaluation_views", None)
     assert compare(WORSE).as_dict() == first.as_dict()
     assert len(rendered) == len(first.views) + len(first.surroundings.views)  # the candidate alone
 

@@ -12,7 +12,7 @@ from kissgs import CompactSettings
 from kissgs.cameras.views import black
 from kissgs.compaction.popspa import MOST_STEP_PER_SIZE, Popspa, TrainingPath
 from kissgs.compaction.scoring import prune_by_score
-from kissgs.core.progress import Context, Deadline, silent
+from kissgs.core.context import Context, Deadline, silent
 from kissgs.training.supervision import SupervisionViews
 
 SCENE = cloud(60)
@@ -49,12 +49,12 @@ def test_the_first_step_of_a_position_is_a_share_of_the_size_of_a_small_gaussian
     scales = SCENE.scales.copy()
     scales[::2] = [np.log(0.001), np.log(0.002), -30.0]  # a disc without thickness
     walked = path(sparsify_steps=3)
-    walked.task = replace(walked.task, splats=replace(SCENE, scales=scales))
-    walked.points[0] = replace(walked.points[0], splats=walked.task.splats)
+    walked.compactor = replace(walked.compactor, splats=replace(SCENE, scales=scales))
+    walked.points[0] = replace(walked.points[0], splats=walked.compactor.splats)
     point = walked.prune(50)
     assert walked.train().trained
     moved = np.abs(walked.points[-1].splats.means - SCENE.means[point.index]).max(axis=1)
-    sizes = np.exp(np.median(walked.task.splats.scales[point.index], axis=1))
+    sizes = np.exp(np.median(walked.compactor.splats.scales[point.index], axis=1))
     small = point.index % 2 == 0
     assert (moved[small] <= 0.5 * MOST_STEP_PER_SIZE * sizes[small] + 1e-6).all()
     assert moved[small].max() > 0.4 * MOST_STEP_PER_SIZE * sizes[small].min()
@@ -77,7 +77,7 @@ def test_a_point_is_trained_for_so_many_steps(photographed, sparsify_steps, expe
     walked = path(progress=progress, sparsify_steps=sparsify_steps)
     if photographed:
         train = photographs(SCENE, tmp_path, train=5, held_out=0).train
-        walked.task = replace(walked.task, supervision=replace(walked.task.supervision, train=train))
+        walked.compactor = replace(walked.compactor, supervision=replace(walked.compactor.supervision, train=train))
     walked.prune(40)
     assert walked.train(deadline).trained == (expected > 0)
     assert done == [step / expected for step in range(expected)]

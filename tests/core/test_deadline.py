@@ -2,8 +2,8 @@
 
 import pytest
 
-from kissgs.core import progress as deadline
-from kissgs.core.progress import Context, Deadline, Pace
+from kissgs.core import context as deadline
+from kissgs.core.context import Context, Deadline, Pace
 
 
 @pytest.fixture

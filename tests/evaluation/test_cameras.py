@@ -12,8 +12,8 @@ from helpers.whole_scenes import joined, moved
 
 import kissgs
 from kissgs.cameras.views import MIN_DISTANCE, Views, black
+from kissgs.core.context import Context
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.progress import Context
 from kissgs.evaluation.cameras import (
     BACKGROUNDS,
     HEIGHT,

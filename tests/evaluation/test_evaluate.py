@@ -15,8 +15,8 @@ from PIL import Image
 import kissgs
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.views import View, Views
+from kissgs.core.context import Context
 from kissgs.core.errors import Cancelled, InvalidViewsError, UnsupportedError
-from kissgs.core.progress import Context
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation import evaluate as evaluation_module
 from kissgs.evaluation.cameras import evaluation_views

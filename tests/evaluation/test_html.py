@@ -14,8 +14,8 @@ from PIL import Image
 
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.views import View, Views
+from kissgs.core.context import Context
 from kissgs.core.errors import Cancelled
-from kissgs.core.progress import Context
 from kissgs.evaluation.evaluate import compare_images, evaluate
 from kissgs.evaluation.html import (
     FULL_SCALES,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import kissgs
-from kissgs.core.progress import Context
+from kissgs.core.context import Context
 from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import COUNT, MAX_ADDED, VISIBLE_PSNR, Parts, evaluation_views

@@ -12,7 +12,7 @@ from helpers.training_scenes import cloud
 from helpers.tuning_scenes import chosen, shuffled
 from PIL import Image
 
-from kissgs.core.progress import Pace
+from kissgs.core.context import Pace
 from kissgs.finetuning.quantized_scene import (
     ENTROPY_FIELDS,
     PAPER_TV_WEIGHTS,

@@ -10,7 +10,7 @@ from helpers.training_scenes import cloud, same
 from helpers.tuning_scenes import FIELDS, choices, chosen, shuffled
 
 from kissgs import Settings, Splats, decompress
-from kissgs.core.progress import Context
+from kissgs.core.context import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.finetuning.planes import TABLES
 from kissgs.finetuning.quantized_scene import QuantizedScene, table_name

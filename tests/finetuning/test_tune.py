@@ -14,7 +14,7 @@ import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
 from kissgs.cameras.views import Views, black
 from kissgs.compaction.popspa import Phase, Popspa, SceneTraining
-from kissgs.core.progress import Context
+from kissgs.core.context import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.evaluation.evaluate import evaluate
 from kissgs.finetuning.quantized_scene import QuantizedScene

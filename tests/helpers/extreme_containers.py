@@ -14,7 +14,7 @@ from helpers import reference_decoder
 from helpers.codec_scenes import rounding, signed_log, stored_forms
 from helpers.extremes import EXTREMES
 from kissgs import Settings, Splats
-from kissgs.core.progress import Context
+from kissgs.core.context import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.io.ply import read_ply

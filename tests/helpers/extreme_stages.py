@@ -13,8 +13,7 @@ from helpers.extreme_containers import BACKGROUND, BY_NAME, balanced, browser, d
 from helpers.reference_training import trained
 from kissgs.compaction.regularizers import erank_loss
 from kissgs.rendering.differentiable import rasterize
-from kissgs.rendering.rasterizer import removal_scores, render
-from kissgs.rendering.tensors import tensors_of
+from kissgs.rendering.rasterizer import removal_scores, render, tensors_of
 from kissgs.training.loop import torch_threads
 
 

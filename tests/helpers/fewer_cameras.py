@@ -18,7 +18,7 @@ def evaluate_smaller(patch, *, searches):
     patch.setattr(cameras, "WIDTH", 96)
     patch.setattr(cameras, "HEIGHT", 72)
     if searches:
-        from kissgs.compaction import budget
+        from kissgs.compaction import search_evaluation
 
-        patch.setattr(budget, "COUNT", 8)
-        patch.setattr(budget, "SIDE", 96)
+        patch.setattr(search_evaluation, "COUNT", 8)
+        patch.setattr(search_evaluation, "SIDE", 96)

@@ -6,7 +6,7 @@ import torch
 from kissgs.core.resources import Workers
 from kissgs.rendering.cpu.frame import draw, removal_scores
 from kissgs.rendering.differentiable import rasterize
-from kissgs.rendering.tensors import tensors_of
+from kissgs.rendering.rasterizer import tensors_of
 
 
 def render_tensors(splats, cameras, device="cpu", backgrounds=None, **parameters):

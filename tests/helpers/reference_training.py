@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from helpers import reference_float64
-from kissgs.core.progress import Context, Pace
+from kissgs.core.context import Context, Pace
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.differentiable import plain_photometric_loss
 from kissgs.training.loop import TrainingPlan, train

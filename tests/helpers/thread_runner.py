@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from pathlib import Path
 
 import kissgs
-from kissgs.core.progress import silent
+from kissgs.core.context import silent
 from kissgs.runners import INTERNAL, LocalRunner, Outcome, RunHandle
 from kissgs.runners.contract import log, report
 from kissgs.runners.item_process import Throttle

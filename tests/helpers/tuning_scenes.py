@@ -7,7 +7,7 @@ import numpy as np
 from helpers.training_scenes import around, cloud
 from kissgs import Settings
 from kissgs.cameras.views import black
-from kissgs.core.progress import Context
+from kissgs.core.context import Context
 from kissgs.planning.planner import plan_encoding
 from kissgs.planning.quantize import EVEN_LEVELS
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity

@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from kissgs import Settings, compress, decompress
-from kissgs.core.progress import silent
+from kissgs.core.context import silent
 from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.formats import FORMATS
 from kissgs.io.ply import read_ply, read_ply_info, write_ply

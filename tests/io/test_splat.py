@@ -131,7 +131,7 @@ DAMAGED = {
     overwritten(36, struct.pack("<f", np.inf)): "has a range of SH coefficients that is not finite; export it again",
     overwritten(4096, b"\xff\xff"): "section 1: it declares 65,535 Gaussians with room for 300; export it again",
     overwritten(4108, b"\xff"): "section 1: its buckets contradict each other; export or download the scene again",
-    overwritten(4136, b"\4"): "section 1: it has SH degree 4; export the scene with degree 3 or lower",
+    overwritten(4136, b"\4"): "section 1 has SH degree 4; export it with degree 3 or lower",
     overwritten(5120, b"\0"): "the buckets of a section hold fewer Gaussians than it; export it again",
 }
 

@@ -13,8 +13,8 @@ from helpers.reference_gltf import NAME, SPZ, attributes, parse_glb
 from helpers.reference_splat import splat_bytes
 from helpers.reference_spz import streams
 
+from kissgs.core.context import silent
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import silent
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.formats import FORMATS
 from kissgs.io import conventions, gltf

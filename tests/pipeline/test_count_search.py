@@ -15,7 +15,7 @@ import kissgs
 from kissgs import Settings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.result import CountTrial
-from kissgs.core.progress import SearchNote
+from kissgs.core.context import SearchNote
 from kissgs.evaluation.results import drop_of
 from kissgs.rendering.rasterizer import render
 

@@ -8,8 +8,8 @@ import pytest
 
 import kissgs
 from kissgs import OutputError, Settings, Splats, StopSearch, UnsupportedError
-from kissgs.compaction.budget import SearchEvaluation
-from kissgs.core.progress import Context
+from kissgs.compaction.search_evaluation import SearchEvaluation
+from kissgs.core.context import Context
 from kissgs.pipeline.goal import Attempt, Goal
 from kissgs.sogxt.encode import encode
 

@@ -10,7 +10,7 @@ from helpers.random_sensitivity import encode_rd, random_sensitivity
 
 import kissgs
 from kissgs import Settings, compress, decompress
-from kissgs.core.progress import Context
+from kissgs.core.context import Context
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.sogxt.encode import encode

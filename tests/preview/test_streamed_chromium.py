@@ -39,10 +39,10 @@ def server(city, monkeypatch):
     """A server whose files of other levels than the coarsest wait for ``server.gate``."""
     find = server_module._Handler._find
 
-    def held(handler):
-        if re.search(r"/[0-2]_\d/", handler.path) and not handler.server.gate.wait(100):
-            raise TimeoutError(handler.path)
-        return find(handler)
+    def held(handler, path):
+        if re.search(r"/[0-2]_\d/", path) and not handler.server.gate.wait(100):
+            raise TimeoutError(path)
+        return find(handler, path)
 
     monkeypatch.setattr(server_module._Handler, "_find", held)
     with serving(streamed_folder(city)) as server:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
+from kissgs.core.context import Context
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import Context
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.images import (
     GAP,

@@ -13,8 +13,7 @@ from helpers.render_scenes import blobs, camera
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.rendering.differentiable import rasterize
-from kissgs.rendering.rasterizer import rasterize_on_cuda
-from kissgs.rendering.tensors import tensors_of
+from kissgs.rendering.rasterizer import rasterize_on_cuda, tensors_of
 
 CONSTANTS = {"near_plane": 0.01, "far_plane": 1e10, "tile_size": 16}
 

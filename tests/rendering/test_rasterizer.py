@@ -12,14 +12,13 @@ from helpers.render_scenes import blobs, camera, one, together
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kissgs.core.context import load_kernels
 from kissgs.core.errors import InvalidSceneError, InvalidViewsError, UnsupportedError
-from kissgs.core.progress import load_kernels
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import frame, tiles
 from kissgs.rendering.differentiable import rasterize
-from kissgs.rendering.rasterizer import BLACK, render
-from kissgs.rendering.tensors import tensors_of
+from kissgs.rendering.rasterizer import BLACK, render, tensors_of
 
 
 def _cuda_is_missing():

@@ -9,8 +9,8 @@ from helpers.render_scenes import blobs, camera, one, together
 from scipy.stats import spearmanr
 
 import kissgs
+from kissgs.core.context import Context
 from kissgs.core.errors import Cancelled
-from kissgs.core.progress import Context
 from kissgs.rendering.rasterizer import removal_scores, render
 
 

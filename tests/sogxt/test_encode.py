@@ -26,8 +26,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from kissgs import Settings, compress, decompress
+from kissgs.core.context import Context
 from kissgs.core.positions import signed_log
-from kissgs.core.progress import Context
 from kissgs.core.splats import clean
 from kissgs.sogxt.encode import encode
 

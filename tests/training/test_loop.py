@@ -8,10 +8,9 @@ import torch
 from helpers.training_scenes import around, cloud, same, targets_of
 
 import kissgs
-from kissgs.core.progress import Context, Pace
+from kissgs.core.context import Context, Pace
 from kissgs.rendering.differentiable import plain_photometric_loss, rasterize
-from kissgs.rendering.rasterizer import render
-from kissgs.rendering.tensors import tensors_of
+from kissgs.rendering.rasterizer import render, tensors_of
 from kissgs.training.loop import TrainingPlan, exponential_lr, image_loss, train
 from kissgs.training.model import GaussianModel
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from kissgs.cameras.views import UP, Vec3, black, rotation_matrices
 from kissgs.core.array_types import Float64, Int
-from kissgs.core.progress import Progress
+from kissgs.core.context import Progress
 from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_C0, Splats
 from kissgs.rendering.camera import Camera, look_at

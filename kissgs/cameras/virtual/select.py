@@ -25,7 +25,7 @@ from kissgs.cameras.virtual.candidates import (
     view_scores,
 )
 from kissgs.core.array_types import Float64, Int
-from kissgs.core.progress import DEFAULT_CONTEXT, Context, Progress, silent
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera, look_at, pinhole

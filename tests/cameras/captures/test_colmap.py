@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from helpers.reference_cameras import MODELS, PINHOLE, assert_camera, poses, write_binary, write_photo, write_text
 
-from kissgs.cameras.captures.load import find_colmap, load_views, read_colmap
+from kissgs.cameras.captures.colmap import find_colmap, read_colmap
+from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.photographs import Distortion
 
 NAMES = ["b.jpg", "with a space.jpg", "sub/folder/a.png"]

@@ -10,8 +10,9 @@ from helpers.reference_cameras import PINHOLE, camera_bytes, image_bytes, poses,
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.cameras.captures import load as loading
-from kissgs.cameras.captures.load import load_views, read_colmap
+from kissgs.cameras.captures import colmap
+from kissgs.cameras.captures.colmap import read_colmap
+from kissgs.cameras.captures.load import load_views
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 
 CAMERAS, IMAGES = {1: PINHOLE}, poses(["a.jpg", "b.jpg"])
@@ -124,7 +125,7 @@ def test_text(tmp_path, sentence):
 
 
 def test_lines_beyond_the_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(loading, "MAX_LINE_BYTES", 100)
+    monkeypatch.setattr(colmap, "MAX_LINE_BYTES", 100)
     write_text(tmp_path, CAMERAS, IMAGES)
     (tmp_path / "images.txt").write_text("1" * 101)
     assert message(tmp_path) == "images.txt, line 1: longer than the limit of 100 bytes; the file is damaged"

@@ -9,8 +9,8 @@ from kissgs.cameras import render as camera_paths
 from kissgs.cameras.render import find_orbit
 from kissgs.cameras.virtual.samples import random_poses, scene_views
 from kissgs.cameras.virtual.select import virtual_views
+from kissgs.core.context import Context
 from kissgs.core.errors import Cancelled, InvalidViewsError
-from kissgs.core.progress import Context
 from kissgs.core.splats import Splats
 from kissgs.rendering.rasterizer import render
 
