@@ -23,7 +23,7 @@ from rich.text import Text
 from kissgs.core.context import Progress as Receiver
 from kissgs.core.context import silent
 from kissgs.core.errors import InvalidSceneError, KissgsError, OutputError, UnsupportedError
-from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, named_manifest, names_folder
+from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, SCENE_ENDINGS, named_manifest, names_folder
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -187,6 +187,10 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
             raise OutputError(f"{len(inputs)} inputs cannot all become {output}; {remedy}")
         return [output]
     if output is not None and not names_folder(str(output) + "/" * is_named_folder):
+        ending = output.suffix.lower()
+        if suffix and ending in (*ENDINGS, *SCENE_ENDINGS):
+            command = "compress" if ending in ENDINGS else "convert"
+            raise OutputError(f"this command writes {suffix}; for {ending}, use kissgs {command}")
         file = f"in {suffix} if it is a file, or " if suffix else ""
         raise OutputError(f"there is no folder {output!s:.100}; end it {file}in a slash to make a folder")
     if output is not None and "-" in inputs:

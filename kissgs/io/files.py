@@ -119,7 +119,7 @@ def move_into_place(made: Path, path: Path) -> None:
         if old is not None and not path.exists():
             old.rename(path)
         elif old is not None:
-            shutil.rmtree(old)
+            shutil.rmtree(old, ignore_errors=True)
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:

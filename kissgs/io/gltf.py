@@ -78,13 +78,11 @@ _NEEDED = {
 }
 """Extensions that are not read, and without which the Gaussians are others, even in files that do not require them."""
 
-_USUAL = {
-    "kernel": "ellipse",
-    "colorSpace": "srgb_rec709_display",
-    "projection": "perspective",
-    "sortingMethod": "cameraDistance",
-}
-"""The only way to draw that is read, by key of the extension."""
+_NEEDED_VALUES = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+"""The only Gaussians that are read, by key of the extension."""
+
+_USUAL = {"projection": "perspective", "sortingMethod": "cameraDistance"}
+"""How they are drawn here, by key of the extension; other ways are left out, with a note."""
 
 TO_PLY: Signs = (-1, -1, 1)
 """Signs from glTF's axes to those of a ``.ply``."""
@@ -126,9 +124,11 @@ class _Document:
         if not isinstance(self.root, dict):
             raise self.invalid("its JSON is no object")
         self._buffers: dict[int, bytes] = {}
-        version = str(self.value(self.root, "asset", dict).get("version", "2.0"))
-        if not version.startswith("2."):
-            raise UnsupportedError(f"{self.name} is glTF of version {version[:20]!r}; export it as glTF 2.0")
+        asset = self.value(self.root, "asset", dict)
+        version, least = (str(asset.get(key, "2.0")) for key in ("version", "minVersion"))
+        if not version.startswith("2.") or least != "2.0":
+            wanted = least if version.startswith("2.") else version
+            raise UnsupportedError(f"{self.name} is glTF of version {wanted[:20]!r}; export it as glTF 2.0")
         for name in map(str, self.value(self.root, "extensionsRequired", list)):
             if name not in _READ and not name.startswith(_OF_SURFACES):
                 raise self.unread(name)
@@ -393,19 +393,28 @@ def _parts(document: _Document) -> tuple[list[_Part], list[str]]:
                 left_out["meshes without Gaussians"] = None
                 continue
             parts.append(part := _part(document, primitive, matrix))
+            left_out |= dict.fromkeys(_not_drawn(document, primitive))
             if part.spz is None:
                 left_out |= dict.fromkeys(name for name in part.attributes if name not in _ATTRIBUTES)
     if not parts:
         raise InvalidSceneError(
-            f"{document.name} has no Gaussians: no mesh of its scene uses {EXTENSION}; name a 3DGS scene"
+            f"{document.name} has no Gaussians: no mesh that its scene shows uses {EXTENSION}; name a 3DGS scene, or "
+            "export it with a node for each mesh"
         )
     return parts, list(left_out)
+
+
+def _not_drawn(document: _Document, primitive: dict[str, Any]) -> list[str]:
+    """Return what a primitive with Gaussians says of drawing them that is not followed."""
+    splatting = document.value(document.extensions(primitive), EXTENSION, dict)
+    orders = [f"{key} {str(splatting[key])[:40]!r}" for key in _USUAL if splatting.get(key, _USUAL[key]) != _USUAL[key]]
+    return [*(key for key in ("indices", "targets") if key in primitive), *orders]
 
 
 def _part(document: _Document, primitive: dict[str, Any], matrix: Float64[np.ndarray, "4 4"]) -> _Part:
     """Check a primitive's extensions and attributes."""
     splatting = document.value(document.extensions(primitive), EXTENSION, dict)
-    for key, usual in _USUAL.items():
+    for key, usual in _NEEDED_VALUES.items():
         if (found := splatting.get(key, usual)) != usual:
             raise UnsupportedError(f"{document.name} has the {key} {str(found)[:40]!r}; export it with {usual!r}")
     attributes = document.value(primitive, "attributes", dict)
@@ -637,7 +646,7 @@ def _json(
     primitive = {
         "mode": 0,  # points
         "attributes": {column.name: i for i, column in enumerate(columns)},
-        "extensions": {EXTENSION: {**_USUAL, **({"extensions": compression} if compression else {})}},
+        "extensions": {EXTENSION: {**_NEEDED_VALUES, **_USUAL, **({"extensions": compression} if compression else {})}},
     }
     root = {
         "asset": {"version": "2.0", "generator": "kissgs"},

@@ -190,6 +190,8 @@ def _recognise(head: bytes, name: str) -> None:
     for magic, hint in _LOOKALIKES.items():
         if start.startswith(magic):
             raise InvalidSceneError(f"{name} is not a PLY file: {hint}")
+    if re.match(rb"ply[ \t]*\r[^\n]", head):
+        raise InvalidSceneError(f"{name} has lines that end in CR alone; save it with the line ends LF or CRLF")
     if not re.match(rb"ply[ \t]*\r?\n", head):
         raise InvalidSceneError(
             f"{name} is not a PLY file: its first line is not 'ply', and no other format is recognised; a .splat needs "

@@ -141,6 +141,7 @@ class Search:
     _pruned: list[Attempt] = field(init=False, default_factory=list)  # losses at points 1, 2 and so on
     _whole: Scene | None = field(init=False, default=None)
     _whole_searched: bool = field(init=False, default=False)
+    _margins: dict[int, float] = field(init=False, default_factory=dict)  # of trained points before any encoding
     _trained: dict[int, Scene] = field(init=False, default_factory=dict)
     _tuner: Tuner | None = field(init=False, default=None)
     _finetuning: FinetuneReport | None = field(init=False, default=None)  # of the latest attempt that has one
@@ -307,7 +308,10 @@ class Search:
         point ``number`` would use up little of what may be lost.
         """
         last = last_number(len(path.whole))
-        while number < last and self.goal.margin(self._try_unencoded(self._train_to(path, number).splats)) >= 0:
+        while number < last:
+            self._margins[number] = self.goal.margin(self._try_unencoded(self._train_to(path, number).splats))
+            if self._margins[number] < 0:
+                break
             number += 1
         return number
 
@@ -357,17 +361,19 @@ class Search:
     def _encode_latest(self, path: TrainingPath) -> None:
         """Encode the latest point of the path without further training, or all Gaussians, where a search was stopped.
 
-        A trained point that leaves less than half of the error to the encoder is left out, as most do that are still
-        to be fine-tuned.
+        For a quality it is the latest trained point that leaves at least half of the error to the encoder: most do not,
+        as they are still to be fine-tuned.
         """
-        latest, self.stopped = path.points[-1], False
+        latest, self.stopped = len(path.points) - 1, False
         self._progress.progress = ignore_stop_search(self._progress.progress)
-        serves = self.goal.by_size
-        if not serves and latest.trained:
-            evaluation = self.compare(latest.splats, self.work.context.stage("evaluate"))
-            serves = self.goal.margin(self.goal.measured(Attempt(len(latest), None, 0), evaluation)) >= 1.0  # half
-        if serves:
-            self._along_lambda(self._untrained(path, latest), most=self.encode_settings.max_encodes)
+        if not self.goal.by_size and path.points[latest].trained and latest not in self._margins:
+            evaluation = self.compare(path.points[latest].splats, self.work.context.stage("evaluate"))
+            figures = self.goal.measured(Attempt(len(path.points[latest]), None, 0), evaluation)
+            self._margins[latest] = self.goal.margin(figures)
+        serving = [number for number, margin in self._margins.items() if margin >= 1.0]  # half
+        number = latest if self.goal.by_size else max(serving, default=None)
+        if number is not None:
+            self._along_lambda(self._untrained(path, path.points[number]), most=self.encode_settings.max_encodes)
         if self.best is None and not self.goal.by_size:
             self._search_all_gaussians(tunes=False)
         self.stopped = True

@@ -52,7 +52,9 @@ def _outcome(task: dict[str, Any], progress: Progress) -> dict[str, Any]:
     try:
         module, _, name = task["function"].partition(":")
         function = getattr(importlib.import_module(module), name)
-        return {"kind": "done", "result": function(task["arguments"], progress)}
+        result = function(task["arguments"], progress)
+        json.dumps(result)  # here, where errors are reported
+        return {"kind": "done", "result": result}
     except KissgsError as error:
         if not isinstance(error.__cause__, MemoryError):
             return {"kind": "error", "code": error.code, "message": str(error)}

@@ -290,7 +290,8 @@ class Driver:
         except TaskCancelledError:
             return Outcome("cancelled", node=node)
         except RayTaskError as error:  # raised by the task itself, outside the item's process
-            message = f"a node of the cluster cannot run kissgs: {first_line(error.cause or error)}"
+            reason = first_line(error.cause or error)
+            message = f"a node of the cluster cannot run kissgs {__version__}: {reason}; install it there"
             return Outcome("error", code=NODE_UNUSABLE, message=message, log=str(error)[-4000:], node=node)
         except RayError as error:
             message = f"the node {node or 'of the work'} was lost {start} times: {first_line(error)}"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +18,7 @@ from kissgs.io.files import move_into_place, path_state, reason_of
 from kissgs.io.streamed import MAX_TREE_BYTES
 from kissgs.sog.encode import FILES
 from kissgs.streaming.build import CHUNK
-from kissgs.streaming.layout import OUT, write_json
+from kissgs.streaming.layout import OUT, continuation, write_json
 from kissgs.streaming.levels import row_bytes
 
 WORK, LOCK = "work.json", "lock"
@@ -91,7 +93,12 @@ def claimed(work: Path, mine: dict[str, Any]) -> Iterator[None]:
             with contextlib.suppress(OSError):  # of a process that was killed
                 shutil.rmtree(left) if left.is_dir() else left.unlink()
         write_json(work / WORK, mine)
-        yield
+        try:
+            yield
+        except OutputError as error:
+            if not any(os.strerror(number).lower() in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
+                raise
+            raise OutputError(f"{error}; once there is room, {continuation(work)}") from error
 
 
 def _locked(lock: BinaryIO) -> bool:

@@ -119,7 +119,7 @@ REFUSED = {
     "decompress bad.zip new.ply": "does not exist; if it is the output, name it with -o new.ply",
     "decompress scene.ply -o new": "there is no folder new; end it in .ply if it is a file, or in a slash",
     "decompress scene.ply -o meta.json": "there is no folder meta.json; end it in .ply",
-    "decompress scene.ply -o a.spz": "there is no folder a.spz; end it in .ply",
+    "decompress scene.ply -o a.spz": "this command writes .ply; for .spz, use kissgs convert",
     "compress scene.ply -o a.sog --unpacked": "there is no folder a.sog; end it in a slash",
     "compress scene.ply scene.ply -o new/": "would become one file",
     "compress scene.ply -o k.ssog --container sog": ".zip or .sog",

@@ -122,7 +122,7 @@ def killed() -> None:
 def test_without_matplotlib_the_table_is_written(
     scene: Path, one: bench.Measurement, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench, "has_torch", lambda: False)
+    monkeypatch.setattr(bench, "find_spec", lambda name: None)
     monkeypatch.setattr(bench, "measured", lambda *_, **__: one)
     done = run("bench", scene, "-p", "fast", "-o", tmp_path / "t.csv")
     assert b"kissgs: no plot without matplotlib, which is missing: pip install 'kissgs[bench]'\n" in done.stderr

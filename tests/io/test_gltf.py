@@ -162,8 +162,10 @@ def test_what_is_left_out_is_named():
     root["scenes"].append({"nodes": [0]})
     root["asset"] = {"version": "2.1"}
     root["extensionsUsed"] = [NAME, "CESIUM_RTC", "KHR_materials_unlit"]
+    root["meshes"][0]["primitives"][0]["indices"] = 0
+    splatting(root)["sortingMethod"] = "zDepth"
     found = read_gltf(glb_bytes(root, buffer))
-    assert found.notes == ("left out: extension CESIUM_RTC, other scenes",)
+    assert found.notes == ("left out: extension CESIUM_RTC, other scenes, indices, sortingMethod 'zDepth'",)
 
 
 def test_quantised_positions():
@@ -220,8 +222,11 @@ CHANGES = {
     "needs the extension 'KHR_draco_mesh_compression', which": changed(
         lambda r: primitive(r)["extensions"].update(KHR_draco_mesh_compression={"bufferView": 0})
     ),
+    "is glTF of version '2.1'; export it as glTF 2.0": changed(
+        lambda r: r.update(asset={"version": "2.0", "minVersion": "2.1"})
+    ),
     "is glTF of version '1.0'; export it as glTF 2.0": changed(lambda r: r.update(asset={"version": "1.0"})),
-    "has no Gaussians: no mesh of its scene uses KHR": changed(lambda r: r["scenes"][0].update(nodes=[])),
+    "has no Gaussians: no mesh that its scene shows uses KHR": changed(lambda r: r["scenes"][0].update(nodes=[])),
     "needs the extension 'EXT_mesh_gpu_instancing', which": changed(
         lambda r: r["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}})
     ),
@@ -233,7 +238,7 @@ CHANGES = {
     "is cut short: it needs": PLAIN[:-1],
     "is GLB of version 1; version 2 is read": PLAIN[:4] + b"\1" + PLAIN[5:],
     "is not valid GLB: its first chunk is not JSON; export it again": PLAIN[:16] + b"BIN\0" + PLAIN[20:],
-    "has no Gaussians: no mesh of its scene uses KHR_gaussian_splatting": changed(
+    "has no Gaussians: no mesh that its scene shows uses KHR_gaussian_splatting": changed(
         lambda r: primitive(r).pop("extensions")
     ),
     "has the kernel 'cube'; export it with 'ellipse'": changed(lambda r: splatting(r).update(kernel="cube")),

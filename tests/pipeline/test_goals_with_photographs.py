@@ -64,16 +64,38 @@ def test_the_same_request_gives_the_same_bytes(tmp_path):
 
 
 def test_training_goes_on_while_the_scene_meets_the_goal(tmp_path):
-    """A scene that is too dark: training gains more than three quarters of the Gaussians lose."""
+    """A scene that is too dark: training gains more than three quarters of the Gaussians lose.
+
+    Where that is stopped, a point that met the goal is encoded.
+    """
+    points = []
     scene = cloud(300)
     dark = replace(scene, sh0=scene.sh0 - 1)
     quick = {"compact": {**QUICK, "max_compactions": 1}, "finetune": {"steps": 20, "view_size": 40}}
     settings = Settings.research("balanced", **quick, **FEW_VIEWS, max_psnr_drop=0.1)
-    found = kissgs.compress(dark, settings=settings, views=photographs(scene, tmp_path))
+    views = photographs(scene, tmp_path)
+
+    def count_points(stage, fraction, note=""):
+        points.extend([stage] if (stage, fraction) == ("score", 1.0) else [])
+
+    found = kissgs.compress(dark, settings=settings, views=views, progress=count_points)
     *_, met, missed = found.report.compaction.trials
     assert met.drop <= 0.1 < missed.drop
     assert [trial.count for trial in found.report.trials] == [met.count]
     assert met.count < 300 / 4
+
+    last = len(points)
+    points.clear()
+
+    def stop_at_the_last_point(stage, fraction, note=""):
+        count_points(stage, fraction)
+        if stage == "sparsify" and len(points) == last:
+            points.append(stage)
+            raise kissgs.StopSearch
+
+    stopped = kissgs.compress(dark, settings=settings, views=views, progress=stop_at_the_last_point)
+    assert stopped.report.compaction.count < 300 / 4
+    assert stopped.report.trials[-1].drop <= 0.1
 
 
 @pytest.mark.quick(0)

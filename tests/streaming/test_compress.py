@@ -341,7 +341,9 @@ def test_a_disk_that_fills_up_does_not_end_the_work_for_good(scene, target, tmp_
         def full(descriptor):
             raise OSError(reason, os.strerror(reason))
 
-        with pytest.raises(OutputError, match=f"^cannot write .*: {os.strerror(reason).lower()}$"):
+        then = "goes on where it was" if stage == "images" else "begins anew"
+        said = f"^cannot write .*: {os.strerror(reason).lower()}; once there is room, the same command {then}$"
+        with pytest.raises(OutputError, match=said):
             compress_streamed(scene, target, settings=FAST, progress=fill)
     assert target.parent.with_name(f"{target.parent.name}.partial").exists() == (stage == "images")
     compress_streamed(scene, target, settings=FAST)
