@@ -66,7 +66,7 @@ _HOMES = {
     "OutputError": "core.errors",
     "PlyInfo": "io.ply",
     "Preset": "settings",
-    "Progress": "core.progress",
+    "Progress": "core.context",
     "ReadOptions": "io.scene_format",
     "Remote": "client",
     "RemoteError": "core.errors",
