@@ -69,9 +69,11 @@ def temporary_folder() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _opened(folder: Path) -> Iterator[int]:
-    """Open a folder that is no link."""
+    """Open a folder of this user that is no link."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
+        if os.fstat(descriptor).st_uid != os.geteuid():  # root may open all
+            raise PermissionError(f"{folder} is another user's")
         yield descriptor
     finally:
         os.close(descriptor)

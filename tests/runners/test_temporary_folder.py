@@ -106,6 +106,14 @@ def test_links_and_other_files_stay(temporary, tmp_path):
         assert len(list(temporary.iterdir())) == 3
 
 
+def test_folders_of_other_users_stay(temporary, monkeypatch):
+    (temporary / "kissgs-item-other").mkdir()
+    user = os.geteuid()
+    monkeypatch.setattr(os, "geteuid", lambda: user + 1)
+    with temporary_folder():
+        assert (temporary / "kissgs-item-other").is_dir()
+
+
 def test_no_folder_can_be_made(temporary, monkeypatch):
     def refuse(*words, **options):
         raise OSError(28, "No space left on device")
