@@ -6,7 +6,7 @@ import contextlib
 import re
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import (
     BaseModel,
@@ -79,7 +79,7 @@ class TrainingViewSettings(StageSettings):
     """Values that compaction and fine-tuning share: loss, training views and seed."""
 
     ssim_weight: Share = of_preset(
-        SSIM_WEIGHT, f"Weight of 1 - SSIM in the loss; {SSIM_GOAL_WEIGHT} with max_ssim_drop."
+        SSIM_WEIGHT, f"Weight of 1 - SSIM in the loss; {SSIM_GOAL_WEIGHT} with max_ssim_drop or quality."
     )
     mse_weight: Weight = of_preset(5.0, "Weight of the mean squared error; L1 has the rest of 1 beside SSIM.")
     synthetic_view_share: Annotated[float, Field(ge=0, le=0.9)] = of_preset(
@@ -182,7 +182,24 @@ def _normalize_size(size: object) -> object:
 
 Size = Annotated[ByteSize, BeforeValidator(_normalize_size)]
 
-GOALS = ("psnr", "target_size", "max_psnr_drop", "max_ssim_drop")
+GOALS = ("psnr", "target_size", "max_psnr_drop", "max_ssim_drop", "quality")
+
+
+class QualityLimits(NamedTuple):
+    """Largest losses of a container that has a quality, by the metrics of :class:`kissgs.Evaluation`."""
+
+    psnr: float  # decibels
+    ssim: float
+    detail: float  # of SSIM in patches, mean of the worst 1 %
+    patch: float  # of SSIM in the worst patch
+
+
+QUALITIES = {
+    "same": QualityLimits(0.1, 0.003, 0.05, 0.09),
+    "high": QualityLimits(0.25, 0.0075, 0.1, 0.18),
+    "good": QualityLimits(0.5, 0.015, 0.15, 0.27),
+}
+"""Limits of each value of the setting ``quality``."""
 
 UNIFORM_ONLY = (
     *("shared_step_size", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),
@@ -220,6 +237,11 @@ class EncodeSettings(StageSettings):
         None,
         "Search for the smallest container that loses at most this SSIM to held-out photographs; without a "
         "capture to renderings of the scene, at poses from which they might have been taken.",
+    )
+    quality: Literal["same", "high", "good"] | None = setting(
+        None,
+        "Search for the smallest container of this quality: limits on the losses of PSNR, of SSIM, and of SSIM in "
+        "patches of 32x32 pixels, where lettering is lost first; max_psnr_drop and max_ssim_drop replace those two.",
     )
     max_encodes: Annotated[int, Field(ge=1, le=100)] = setting(
         10, "With a goal: largest number of containers made of one scene, beside fine-tuned ones."
@@ -290,7 +312,7 @@ class EncodeSettings(StageSettings):
 
     @property
     def has_goal(self) -> bool:
-        """Whether a size, a PSNR or a maximum loss of PSNR or SSIM is to be met."""
+        """Whether a size, a PSNR, a quality or a maximum loss of PSNR or SSIM is to be met."""
         return any(getattr(self, name) is not None for name in GOALS)
 
     @model_validator(mode="after")
@@ -533,8 +555,8 @@ class Settings(StageSettings):
             )
         if compact.auto_count and not (self.encode.has_goal or self.time_only):
             raise ValueError(
-                "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop, psnr or a time limit, or the "
-                "number of Gaussians to keep"
+                "auto_count needs a goal: give quality, target_size, max_psnr_drop, max_ssim_drop, psnr or a time "
+                "limit, or the number of Gaussians to keep"
             )
         return self
 
@@ -627,7 +649,7 @@ def _shared_by_trainings(encode: Any) -> dict[str, Any]:  # noqa: ANN401
     if isinstance(encode, dict):
         with contextlib.suppress(ValidationError):  # reported once, for the encoder
             shared["seed"] = TypeAdapter(Seed).validate_python(encode.get("seed", 0))
-        if encode.get("max_ssim_drop") is not None:
+        if encode.get("max_ssim_drop") is not None or encode.get("quality") is not None:
             shared["ssim_weight"] = SSIM_GOAL_WEIGHT
     return shared
 

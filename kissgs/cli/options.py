@@ -231,9 +231,14 @@ class EncodingOptions:
         float | None,
         typer.Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
     ] = None
-    max_ssim_drop: Annotated[
-        float | None,
-        typer.Option(metavar="SSIM", help="Find the smallest container that loses at most this SSIM, such as 0.003."),
+    quality: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            parser=one_of("--quality", "same", "high", "good"),
+            help="Find the smallest container that looks the same as the scene, or has high or good quality: limits on "
+            "the losses of PSNR, SSIM and detail.",
+        ),
     ] = None
     compact: Annotated[
         Values | None,
@@ -269,7 +274,7 @@ class EncodingOptions:
             finetune=self.finetune,
             time=time,
             seed=seed,
-            **{name: getattr(self, name) for name in ("psnr", "target_size", "max_psnr_drop", "max_ssim_drop")},
+            **{name: getattr(self, name) for name in ("psnr", "target_size", "max_psnr_drop", "quality")},
         )
 
 

@@ -35,8 +35,7 @@ class CountTrial:
 
     count: int
     drop: float  # of PSNR as goals count it, decibels
-    ssim_drop: float | None = None  # None where that is no goal
-    ssim_decides: bool = False  # whether the limit of SSIM leaves the least margin
+    decisive: str = ""  # the loss with the least margin to its limit, in words; empty for that of PSNR
 
     def summary(self) -> str:
         """Return the loss that decides in one phrase: "50,000 Gaussians lose 0.120 dB"."""
@@ -44,8 +43,7 @@ class CountTrial:
 
     def loss(self) -> str:
         """Return the loss that decides: "0.120 dB" or "0.003 of SSIM"."""
-        decides = self.ssim_decides and self.ssim_drop is not None
-        return f"{self.ssim_drop:.3g} of SSIM" if decides else f"{self.drop:.3f} dB"
+        return self.decisive or f"{self.drop:.3f} dB"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from decimal import ROUND_CEILING, Context
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from kissgs.evaluation.detail import Detail
 from kissgs.evaluation.results import MAX_VIEW_PSNR, as_json, drop_of, over_scene, psnr_of, ssim_drop_of
-from kissgs.settings import EncodeSettings
+from kissgs.settings import QUALITIES, EncodeSettings
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -43,8 +45,8 @@ class Attempt:
             (:func:`kissgs.evaluation.results.psnr_of`); without a capture in other views than ``drop``, in those of
             ``worst`` and ``fifth_percentile``. None, as all that follow, where the goal is a size.
         drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.results.drop_of`).
-        ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.results.ssim_drop_of`); None where that is
-            no goal.
+        ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.results.ssim_drop_of`).
+        detail: losses of SSIM in patches, in the views of ``drop``.
         worst: PSNR of the worst view, decibels.
         fifth_percentile: fifth percentile of the views' PSNR, decibels.
         against: what ``drop`` is a loss against: "photos", or "renderings", from which it is estimated.
@@ -57,6 +59,7 @@ class Attempt:
     psnr: float | None = None
     drop: float | None = None
     ssim_drop: float | None = None
+    detail: Detail | None = None
     worst: float | None = None
     fifth_percentile: float | None = None
     against: str | None = None
@@ -73,14 +76,15 @@ class Attempt:
         """Whether its levels were fine-tuned."""
         return self.container is not None and self.container.finetuning is not None
 
-    def with_evaluation(self, evaluation: Evaluation, *, ssim: bool = False) -> Attempt:
-        """Return a copy with the figures of an evaluation, also those of SSIM if requested."""
+    def with_evaluation(self, evaluation: Evaluation) -> Attempt:
+        """Return a copy with the figures of an evaluation."""
         scene = over_scene(evaluation)
         return replace(
             self,
             psnr=psnr_of(evaluation),
             drop=drop_of(evaluation),
-            ssim_drop=ssim_drop_of(evaluation) if ssim else None,
+            ssim_drop=ssim_drop_of(evaluation),
+            detail=evaluation.detail,
             worst=scene.worst.comparison.candidate_vs_reference.psnr,
             fifth_percentile=scene.fifth_percentile,
             against=evaluation.against,
@@ -98,14 +102,17 @@ class Attempt:
             None if self.psnr is None else f"{self.psnr:.2f} dB",
             None if self.drop is None else f"drop {self.drop:.3f} dB{against}",
             None if self.ssim_drop is None else f"SSIM drop {self.ssim_drop:.3g}",
+            None if self.detail is None else f"{-self.detail.worst_percent:.3g} in the worst 1 % of patches",
             None if self.worst is None else f"worst view {self.worst:.1f} dB",
         ]
         return ", ".join(filter(None, parts))
 
     def as_dict(self) -> dict[str, Any]:
         """Return all figures for JSON: infinity as null, NaN (a failed rendering) as the string ``"NaN"``."""
-        values = {name: getattr(self, name) for name in self.__slots__ if name != "container"}
-        return {name: as_json(value) if isinstance(value, float) else value for name, value in values.items()}
+        values = {name: getattr(self, name) for name in self.__slots__ if name not in ("container", "detail")}
+        numbers = {name: as_json(value) if isinstance(value, float) else value for name, value in values.items()}
+        detail = None if self.detail is None else {name: as_json(each) for name, each in asdict(self.detail).items()}
+        return {**numbers, "detail": detail}
 
 
 TRAINED_NEAR, TRAINED_SIZE_NEAR, MOST_NEAR = 4.0, 2.5, 0.4
@@ -114,11 +121,20 @@ largest such margin: with it, three quarters of an allowed drop are used. Anothe
 bytes."""
 
 
+LOSSES = {
+    "max_psnr_drop": "dB",
+    "max_ssim_drop": "of SSIM",
+    "detail": "of SSIM in the worst 1 % of patches",
+    "patch": "of SSIM in the worst patch",
+}
+"""Limits of losses, with what follows the number in a sentence."""
+
+
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A limit that one setting names."""
+    """A limit of one figure."""
 
-    setting: str
+    setting: str  # its name, if the goal is not a quality
     value: float  # bytes, decibels, or a difference of SSIM
     slope: float  # typical change of the margin per doubling of lambda
     near: float  # margin that is small enough to end a search
@@ -134,8 +150,17 @@ class Limit:
                 return attempt.psnr
             case "max_psnr_drop":
                 return attempt.drop
-            case _:
+            case "max_ssim_drop":
                 return attempt.ssim_drop
+            case "detail":
+                return None if attempt.detail is None else -attempt.detail.worst_percent
+            case _:
+                return None if attempt.detail is None else -attempt.detail.worst
+
+    def loss(self, attempt: Attempt, digits: Callable[[float], str] = "{:.3g}".format) -> str:
+        """Return what is limited of an attempt in words, such as "0.003 of SSIM"; empty for bytes and a PSNR."""
+        found = self.figure(attempt)
+        return "" if found is None or self.setting not in LOSSES else f"{digits(found)} {LOSSES[self.setting]}"
 
     def margin(self, attempt: Attempt) -> float:
         """Return by how much an attempt stays within the limit: at least 0 where it is met.
@@ -174,10 +199,12 @@ class Goal:
     Attributes:
         limits: what the container must meet: its size, or a PSNR, a drop of PSNR, one of SSIM, or several of these.
         most_bytes: for a quality: bytes that the smallest container with it may have at most; None for any number.
+        quality: value of the setting of that name.
     """
 
     limits: tuple[Limit, ...]
     most_bytes: int | None = None
+    quality: str | None = None
 
     @classmethod
     def of(cls, settings: EncodeSettings) -> Goal:
@@ -186,29 +213,36 @@ class Goal:
         Near is 3 % of a size, 0.1 dB of a PSNR, 0.02 dB of a drop of PSNR and 5 % of a drop of SSIM, for which a
         container takes some 3 % of bytes.
         """
-        limits, size = list[Limit](), settings.target_size
+        limits, size, quality = list[Limit](), settings.target_size, QUALITIES.get(settings.quality or "")
+        psnr_drop, ssim_drop = settings.max_psnr_drop, settings.max_ssim_drop
+        if quality is not None:
+            psnr_drop = quality.psnr if psnr_drop is None else psnr_drop
+            ssim_drop = quality.ssim if ssim_drop is None else ssim_drop
         if settings.psnr is not None:
             limits.append(Limit("psnr", settings.psnr, slope=-1.5, near=0.1, per_halving=math.nan))
-        if settings.max_psnr_drop is not None:
-            drop = settings.max_psnr_drop
-            near = -math.log2(max(1 - 0.02 / drop, 0.5))
-            limits.append(Limit("max_psnr_drop", drop, slope=-0.5, near=near, per_halving=0.32, quarter_loss=0.1))
-        if settings.max_ssim_drop is not None:
-            drop, near = settings.max_ssim_drop, -math.log2(0.95)
-            limits.append(Limit("max_ssim_drop", drop, slope=-0.6, near=near, per_halving=0.01, quarter_loss=0.007))
+        if psnr_drop is not None:
+            near = -math.log2(max(1 - 0.02 / psnr_drop, 0.5))
+            limits.append(Limit("max_psnr_drop", psnr_drop, slope=-0.5, near=near, per_halving=0.32, quarter_loss=0.1))
+        ssim = partial(Limit, slope=-0.6, near=-math.log2(0.95))
+        if ssim_drop is not None:
+            limits.append(ssim("max_ssim_drop", ssim_drop, per_halving=0.01, quarter_loss=0.007))
+        if quality is not None:
+            limits.append(ssim("detail", quality.detail, per_halving=0.04))
+            limits.append(ssim("patch", quality.patch, per_halving=0.06))
         if not limits and size is not None:
             limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), per_halving=0.75))
             size = None
-        return cls(tuple(limits), size)
+        return cls(tuple(limits), size, settings.quality)
 
     @property
     def by_size(self) -> bool:
         """Whether the goal is a size, so that no rendering is needed to evaluate it."""
         return self.limits[0].setting == "target_size"
 
-    def measured(self, attempt: Attempt, evaluation: Evaluation) -> Attempt:
-        """Return a copy of an attempt with the figures of its evaluation, those of SSIM only if they decide."""
-        return attempt.with_evaluation(evaluation, ssim=self.limits[-1].setting == "max_ssim_drop")
+    @property
+    def psnr_drop(self) -> float | None:
+        """The largest drop of PSNR, decibels; None if it is not limited."""
+        return next((limit.value for limit in self.limits if limit.setting == "max_psnr_drop"), None)
 
     def decisive(self, attempt: Attempt) -> Limit:
         """Return the limit to which an attempt has the least margin."""
@@ -245,8 +279,9 @@ class Goal:
         first = next(iter(missed))
         if first.setting == "psnr":  # one thing at a time
             missed = {first: missed[first]}
-        units = {"psnr": " dB", "max_psnr_drop": " dB", "max_ssim_drop": ""}
-        wanted = " and ".join(f"{limit.setting} {limit.value:g}{units[limit.setting]}" for limit in missed)
+        units = {"psnr": " dB", "max_psnr_drop": " dB"}
+        names = [f"{limit.setting} {limit.value:g}{units.get(limit.setting, '')}" for limit in missed]
+        wanted = f"quality {self.quality}" if self.quality else " and ".join(names)
         found = [math.nan if figure is None else figure for figure in missed.values()]
         if any(map(math.isnan, found)):
             return (
@@ -261,11 +296,9 @@ class Goal:
             return f"{wanted} cannot be met: the finest container found has {highest:.2f} dB; ask for at most that" + (
                 f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if limit > MAX_VIEW_PSNR else ""
             )
-        losses = " and ".join(
-            f"{_rounded_up(drop)}{' dB' if limit.setting == 'max_psnr_drop' else ' of SSIM'}"
-            for limit, drop in zip(missed, found, strict=True)
-        )
-        return f"{wanted} cannot be met: the finest container found loses {losses}; allow at least that"
+        losses = " and ".join(limit.loss(finest, _rounded_up) for limit in missed)
+        mend = "choose a lower quality" if self.quality else "allow at least that"
+        return f"{wanted} cannot be met: the finest container found loses {losses}; {mend}"
 
 
 def _rounded_up(value: float) -> str:

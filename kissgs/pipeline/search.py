@@ -320,7 +320,7 @@ class Search:
 
         The larger and the more detailed a scene is, the less is recovered in a time.
         """
-        allowed = self.encode_settings.max_psnr_drop
+        allowed = self.goal.psnr_drop
         if allowed is None:  # PSNR does not tell what becomes of other goals
             return True
         point = self._train_to(path, self.first[0])
@@ -368,7 +368,7 @@ class Search:
         self._progress.progress = ignore_stop_search(self._progress.progress)
         if not self.goal.by_size and path.points[latest].trained and latest not in self._margins:
             evaluation = self.compare(path.points[latest].splats, self.work.context.stage("evaluate"))
-            figures = self.goal.measured(Attempt(len(path.points[latest]), None, 0), evaluation)
+            figures = Attempt(len(path.points[latest]), None, 0).with_evaluation(evaluation)
             self._margins[latest] = self.goal.margin(figures)
         serving = [number for number, margin in self._margins.items() if margin >= 1.0]  # half
         number = latest if self.goal.by_size else max(serving, default=None)
@@ -397,9 +397,8 @@ class Search:
     def _try_unencoded(self, splats: Splats) -> Attempt:
         """Return the figures of a scene that is not encoded, and record them for the report."""
         evaluation = self.compare(splats, self.work.context.stage("evaluate"))
-        found = self.goal.measured(Attempt(len(splats), None, 0), evaluation)
-        ssim_decides = self.goal.decisive(found).setting == "max_ssim_drop"
-        self.tried.append(CountTrial(len(splats), drop_of(evaluation), found.ssim_drop, ssim_decides))
+        found = Attempt(len(splats), None, 0).with_evaluation(evaluation)
+        self.tried.append(CountTrial(len(splats), drop_of(evaluation), self.goal.decisive(found).loss(found)))
         return found
 
     def _train_to(self, path: TrainingPath, number: int) -> PathPoint:
@@ -528,7 +527,7 @@ class Search:
         self._overhead = size - sum(images)
         attempt = Attempt(len(scene), made.encoded.rd_lambda, size, container=made)
         if not self.goal.by_size:
-            attempt = self.goal.measured(attempt, self._evaluate(made))
+            attempt = attempt.with_evaluation(self._evaluate(made))
         if tuner is None:
             self._longest = max(self._longest, time.perf_counter() - began)
         self._finetuning = made.finetuning or self._finetuning
@@ -600,7 +599,7 @@ class Search:
         found = best.made.compacted or unchanged(self.work.splats, self._reason_to_keep_all())
         trained = found.report.target_source == "photos" or best.trained
         beyond = BEYOND_PHOTOGRAPHS if trained and best.made.compacted and self.photographs else ""
-        estimates = bool(self.tried) and self.encode_settings.max_psnr_drop is None
+        estimates = bool(self.tried) and self.goal.psnr_drop is None
         estimated = estimate_note(self.compactor.supervision) if estimates else ""
         note = "; ".join(filter(None, [found.report.note, beyond, estimated]))
         return replace(found, report=replace(found.report, trials=tuple(self.tried), note=note))
@@ -613,7 +612,7 @@ class Search:
 
     def note(self, best: Attempt) -> str:
         """Return a note: losses are estimates, or the finest container of the scene is below the target size."""
-        if self.encode_settings.max_psnr_drop is not None and best.against == "renderings":
+        if self.goal.psnr_drop is not None and best.against == "renderings":
             return ESTIMATED_DROP
         margin, target = self.goal.margin(best), self.target_size
         finest = best.rd_lambda == 2.0 ** LOG2_LAMBDA_RANGE[0]

@@ -7,6 +7,7 @@ import pytest
 
 from kissgs import Settings
 from kissgs.core.root_finding import find_root
+from kissgs.evaluation.detail import Detail
 from kissgs.pipeline.curves import LOG2_LAMBDA_RANGE
 from kissgs.pipeline.goal import Attempt, Goal
 
@@ -32,6 +33,42 @@ def test_an_infinite_drop_meets_no_goal():
 def test_of_two_drops_both_must_hold(drop, ssim_drop, met):
     goal = goal_of(max_psnr_drop=0.1, max_ssim_drop=0.003)
     assert (goal.margin(Attempt(1, 1e-9, 10, drop=drop, ssim_drop=ssim_drop)) >= 0) == met
+
+
+SAME = {"drop": 0.1, "ssim_drop": 0.003, "detail": Detail(worst=-0.09, worst_percent=-0.05, share_below=0.005)}
+"""Figures of a container that just meets the quality "same", as docs/guide/goals.md states it."""
+
+
+@pytest.mark.parametrize(
+    ("changes", "met"),
+    [
+        ({}, True),
+        ({"drop": 0.101}, False),
+        ({"ssim_drop": 0.00301}, False),
+        ({"detail": Detail(worst=-0.0901, worst_percent=-0.05, share_below=0.005)}, False),
+        ({"detail": Detail(worst=-0.09, worst_percent=-0.0501, share_below=0.005)}, False),
+        ({"detail": Detail(worst=math.nan, worst_percent=math.nan, share_below=math.nan)}, False),
+        ({"detail": Detail(worst=0.01, worst_percent=0.02, share_below=0.0)}, True),
+    ],
+)
+def test_a_quality_limits_psnr_ssim_and_detail_together(changes, met):
+    attempt = Attempt(1, 1e-9, 10, **{**SAME, **changes})
+    assert (goal_of(quality="same").margin(attempt) >= 0) == met
+    assert goal_of(quality="good").margin(attempt) >= 0 or math.isnan(attempt.detail.worst)
+
+
+def test_given_limits_replace_those_of_a_quality():
+    goal = goal_of(quality="same", max_psnr_drop=0.2)
+    assert goal.margin(Attempt(1, 1e-9, 10, **{**SAME, "drop": 0.2})) >= 0
+    assert goal.margin(Attempt(1, 1e-9, 10, **{**SAME, "drop": 0.2, "ssim_drop": 0.0031})) < 0
+
+
+def test_a_quality_that_cannot_be_met_is_named_with_all_that_is_missed():
+    lost = Attempt(1, 1e-9, 10, **{**SAME, "drop": 0.12, "detail": Detail(-0.1999, -0.04, 0.01)})
+    assert goal_of(quality="same").failure_message([lost], suggest_compaction=False) == (
+        "quality same cannot be met: the finest container found loses 0.12 dB and 0.2 of SSIM in the worst patch; "
+        "choose a lower quality"
+    )
 
 
 @pytest.mark.parametrize("drops", [(math.nan, 0.001), (0.05, math.nan), (math.nan, math.nan)])

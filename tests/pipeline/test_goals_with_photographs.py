@@ -15,7 +15,9 @@ from kissgs.pipeline.limited_time import SearchTime
 from kissgs.rendering.sensitivity import WeightedCameras
 
 
-@pytest.mark.parametrize("goal", [{"max_ssim_drop": 0.05}, {"max_psnr_drop": 0.5}, {"target_size": 6200}])
+@pytest.mark.parametrize(
+    "goal", [{"max_ssim_drop": 0.05}, {"max_psnr_drop": 0.5}, {"quality": "good"}, {"target_size": 6200}]
+)
 @pytest.mark.quick(1)
 def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal):
     scene = cloud(300)
@@ -34,6 +36,11 @@ def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal
         assert kept.drop <= 0.5
     elif "max_ssim_drop" in goal:
         assert kept.ssim_drop <= 0.05
+    elif "quality" in goal:
+        detail = found.report.evaluation.detail
+        assert mean.reference.psnr - mean.candidate.psnr <= 0.5
+        assert mean.reference.ssim - mean.candidate.ssim <= 0.015
+        assert (detail.worst_percent, detail.worst) >= (-0.15, -0.27)
     else:
         assert len(found.to_zip()) <= 6200
     report, decoded = found.report, kissgs.decompress(found.files)
@@ -95,7 +102,7 @@ def test_training_goes_on_while_the_scene_meets_the_goal(tmp_path):
 
     stopped = kissgs.compress(dark, settings=settings, views=views, progress=stop_at_the_last_point)
     assert stopped.report.compaction.count < 300 / 4
-    assert stopped.report.trials[-1].drop <= 0.1
+    assert min(trial.bytes for trial in stopped.report.trials if trial.drop <= 0.1) == len(stopped.to_zip())
 
 
 @pytest.mark.quick(0)
@@ -156,6 +163,7 @@ def test_what_settings_leave_open(given, compacts, tunes):
     [
         ({"max_psnr_drop": 0.1}, {}, (0.3, 0.3)),
         ({"max_ssim_drop": 0.01}, {}, (0.4, 0.4)),
+        ({"quality": "high"}, {}, (0.4, 0.4)),
         ({"max_psnr_drop": 0.1, "max_ssim_drop": 0.01}, {"compact": {"ssim_weight": 0.1}}, (0.1, 0.4)),
     ],
 )

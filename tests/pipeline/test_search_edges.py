@@ -91,7 +91,7 @@ def test_no_goal_is_met_if_an_object_is_lost():
     found = SearchEvaluation(both, None)(kissgs.decompress(one.files))
     for goal in ({"psnr": 30.0}, {"max_psnr_drop": 2.0}):
         limits = Goal.of(settings(**goal).encode)
-        attempt = limits.measured(Attempt(len(SCENE), None, 0), found)
+        attempt = Attempt(len(SCENE), None, 0).with_evaluation(found)
         assert limits.margin(attempt) < 0
         assert attempt.worst < 20
         assert f"worst view {attempt.worst:.1f} dB" in attempt.summary()
