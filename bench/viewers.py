@@ -2,10 +2,10 @@
 
     python bench/viewers.py fox.ply balanced.sog other.sog --views fox -o fox.csv
 
-Each drawing of a file is compared with the drawing of the scene by the same renderer: a viewer or kissgs.render. Viewers
-have their own settings, or with --exact those of the original rasteriser where they can. Row "scene.ply" compares the
-viewer with kissgs.render. "reordered.ply" is the scene with its rows shuffled: what the order of Gaussians alone
-changes. Needs Chromium, and what scripts/setup dev installs. A contact sheet, NAME.webp, is written beside NAME.csv.
+Each drawing of a file is compared with the drawing of the scene by the same renderer: a viewer or kissgs.render. The
+viewers have their own settings, or with --exact those of the original rasteriser where they can. Row "scene.ply"
+compares the viewer with kissgs.render. "reordered.ply" is the scene with its rows shuffled: what the order of Gaussians
+alone changes. Needs Chromium, and what scripts/setup dev installs. NAME.csv gets a contact sheet, NAME.webp, beside it.
 """
 
 from __future__ import annotations
@@ -96,9 +96,14 @@ def sheet_of(table: Path) -> Path:
 
 
 def chosen_cameras(scene: Splats, views: Views | None, count: int, size: Sequence[int]) -> list[Camera]:
-    """Return drawn cameras, or ones spread over the capture's held-out views, which keep the shape of their pixels."""
+    """Return drawn cameras around the scene and parts of it, or ones spread over the capture's held-out views.
+
+    Other drawn cameras have Gaussians beside or around them, which each viewer draws, cuts or omits in its own way. A
+    capture's images have the width of ``size`` and keep their aspect ratio.
+    """
     if views is None:
-        return [view.camera.resized(*size) for view in evaluation_views(scene).test[:count]]
+        drawn = [view for view in evaluation_views(scene).test if view.name.endswith(("far", "around"))]
+        return [view.camera.resized(*size) for view in drawn[:count]]
     moved = in_scene_frame(scene, views)
     cameras = [view.camera for view in moved.test or moved.train]
     spread = [cameras[n] for n in np.unique(np.linspace(0, len(cameras) - 1, count).astype(int))]
@@ -151,7 +156,7 @@ def contact_sheet(files: Sequence[Drawn]) -> Image.Image:
             wanted, tiles = own[camera], [tile(own[camera], f"{name}: scene")]
             for drawn in files[2:]:
                 image = drawn.images[name][camera] if name in drawn.images else np.zeros_like(wanted)
-                error = heat_map(rms_difference(np.float32(image), np.float32(wanted)), FULL_ERROR) / 255
+                error = heat_map(rms_difference(image.astype(np.float32), wanted.astype(np.float32)), FULL_ERROR) / 255
                 tiles += [tile(image, f"{name}: {drawn.name}"), tile(error, f"error, 0 to {FULL_ERROR}")]
             lines.append(np.concatenate(tiles, axis=1))
     return Image.fromarray(np.concatenate(lines, axis=0))
