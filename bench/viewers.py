@@ -96,13 +96,13 @@ def sheet_of(table: Path) -> Path:
 
 
 def chosen_cameras(scene: Splats, views: Views | None, count: int, size: Sequence[int]) -> list[Camera]:
-    """Return drawn cameras around the scene and parts of it, or ones spread over the capture's held-out views.
+    """Return drawn cameras that look at the scene from outside, or ones spread over the capture's held-out views.
 
     Other drawn cameras have Gaussians beside or around them, which each viewer draws, cuts or omits in its own way. A
     capture's images have the width of ``size`` and keep their aspect ratio.
     """
     if views is None:
-        drawn = [view for view in evaluation_views(scene).test if view.name.endswith(("far", "around"))]
+        drawn = [view for view in evaluation_views(scene).test if view.name.endswith("far")]
         return [view.camera.resized(*size) for view in drawn[:count]]
     moved = in_scene_frame(scene, views)
     cameras = [view.camera for view in moved.test or moved.train]
