@@ -5,7 +5,7 @@
 Each drawing of a file is compared with the drawing of the scene by the same renderer: a viewer or kissgs.render. The
 viewers have their own settings, or with --exact those of the original rasteriser where they can. Row "scene.ply"
 compares the viewer with kissgs.render. "reordered.ply" is the scene with its rows shuffled: what the order of Gaussians
-alone changes. Needs Chromium, and what scripts/setup dev installs. NAME.csv gets a contact sheet, NAME.webp, beside it.
+alone changes. Needs Chromium, and what scripts/setup dev installs. NAME.csv gets a contact sheet, NAME.png, beside it.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def main() -> None:
     scene = clean(load(given.scene))[0]
     shuffled = scene.select(np.random.Generator(np.random.PCG64(0)).permutation(len(scene)))
     files = [Drawn("scene.ply", as_ply(scene), scene), Drawn("reordered.ply", as_ply(shuffled), shuffled)]
-    files += [Drawn(path.name, path.read_bytes(), clean(load(path))[0]) for path in given.files]
+    files += [Drawn(splats=clean(load(path))[0], name=path.name, data=path.read_bytes()) for path in given.files]
     draw(files, chosen_cameras(scene, given.views, given.cameras, given.size), given.exact)
     table = list(rows(files))
     head(*map(str, table[0]))
@@ -77,7 +77,7 @@ def main() -> None:
     if given.output:
         text, image = io.StringIO(), io.BytesIO()
         csv.writer(text, lineterminator="\n").writerows(table)
-        contact_sheet(files).save(image, "WEBP", quality=85)
+        contact_sheet(files).save(image, "PNG")
         for path, data in ((given.output, text.getvalue().encode()), (sheet_of(given.output), image.getvalue())):
             with atomic_file(path, overwrite=True) as file:
                 file.write(data)
@@ -92,7 +92,7 @@ def as_ply(splats: Splats) -> bytes:
 
 def sheet_of(table: Path) -> Path:
     """Return the path of the contact sheet beside a table."""
-    return table.with_suffix(".webp")
+    return table.with_suffix(".png")
 
 
 def chosen_cameras(scene: Splats, views: Views | None, count: int, size: Sequence[int]) -> list[Camera]:

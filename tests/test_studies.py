@@ -101,7 +101,7 @@ def test_viewers_are_compared_with_their_own_drawing_of_the_scene(tmp_path: Path
         brightness = 10 ** (-float(table["grey.ply"][f"{renderer} PSNR"]) / 20)
         assert 0.05 < brightness < 0.5, "the images are half as bright, and black where nothing is"
         assert float(table["scene.ply"][f"{renderer} PSNR"] or 60) > 20, "mirrored or shifted images have less"
-    with Image.open(tmp_path / "table.webp") as sheet:
+    with Image.open(tmp_path / "table.png") as sheet:
         assert sheet.size == (5 * 32, 2 * 3 * 24)
 
 
