@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import math
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.viewers import CHROMIUM, PLAYCANVAS, SPARK
+from helpers.web_tools import DECODER, ROOT
+from PIL import Image
 
 import kissgs
 from bench import paper_parts
@@ -17,7 +22,7 @@ from bench.common import at_quality_offset, bytes_at, saving
 from bench.external import measure_external
 from bench.rendering import resampled
 from kissgs.core.context import Context
-from kissgs.core.splats import ATTRIBUTES
+from kissgs.core.splats import ATTRIBUTES, SH_C0
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import encode
 
@@ -72,6 +77,32 @@ def test_an_external_codec_is_measured_without_this_process(tmp_path: Path) -> N
     tool.write_text("import sys; sys.exit('out of splats')")
     with pytest.raises(kissgs.KissgsError, match=r"scene.ply to \.spz: out of splats"):
         measure_external(scene, "spz", [sys.executable, str(tool)])
+
+
+@pytest.mark.quick(0)
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+@pytest.mark.skipif(not all((DECODER / each).exists() for each in (SPARK, PLAYCANVAS)), reason="scripts/setup dev")
+def test_viewers_are_compared_with_their_own_drawing_of_the_scene(tmp_path: Path) -> None:
+    """A copy of the scene is drawn exactly alike; one whose colours are all halved has a known error everywhere."""
+    scene = kissgs.sample_scene(300, sh_degree=0)
+    white = replace(scene, sh0=np.full_like(scene.sh0, 0.5 / SH_C0))
+    grey = replace(scene, sh0=np.zeros_like(scene.sh0))
+    for name, splats in {"white": white, "same": white, "grey": grey}.items():
+        kissgs.save(splats, tmp_path / f"{name}.ply")
+    files = (tmp_path / f"{name}.ply" for name in ("white", "same", "grey"))
+    options = "--cameras", "2", "--size", "64", "48", "-o", tmp_path / "table.csv"
+    command = sys.executable, "-m", "bench.viewers", *files, *options
+    done = subprocess.run(command, check=False, cwd=ROOT, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    table = {row["file"]: row for row in csv.DictReader((tmp_path / "table.csv").read_text().splitlines())}
+    for renderer in ("kissgs", "spark", "playcanvas"):
+        assert table["same.ply"][f"{renderer} PSNR"] == "60.00"
+        assert float(table["same.ply"][f"{renderer} SSIM"]) == 1
+        brightness = 10 ** (-float(table["grey.ply"][f"{renderer} PSNR"]) / 20)
+        assert 0.05 < brightness < 0.5, "the images are half as bright, and black where nothing is"
+        assert float(table["scene.ply"][f"{renderer} PSNR"] or 60) > 20, "mirrored or shifted images have less"
+    with Image.open(tmp_path / "table.png") as sheet:
+        assert sheet.size == (5 * 32, 2 * 3 * 24)
 
 
 def test_parts_of_the_paper_that_only_save_bytes_change_nothing_else() -> None:

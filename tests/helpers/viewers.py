@@ -123,10 +123,10 @@ def is_failure(message):
 
 
 @contextlib.contextmanager
-def opened(name, browser):
+def opened(name, browser, query=""):
     """Yield a viewer, "spark", "playcanvas" or our "streaming", and the site that its page is from.
 
-    No script may fail meanwhile.
+    The query "?defaults" leaves a viewer's own settings. No script may fail meanwhile.
     """
     needed, how = (PLAYCANVAS, "scripts/setup dev") if name == "playcanvas" else (SPARK, "scripts/vendor")
     if not (DECODER / needed).exists():
@@ -138,7 +138,7 @@ def opened(name, browser):
     page = browser.new_page()
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda message: errors.append(message.text) if is_failure(message) else None)
-    page.goto(f"{site.url}/")
+    page.goto(f"{site.url}/{query}")
     page.wait_for_function("() => 'draw' in window")
     yield Viewer(name, page), site
     page.close()

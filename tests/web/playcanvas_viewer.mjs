@@ -1,4 +1,7 @@
-/** The PlayCanvas engine, for the tests of files in viewers: `draw` shows a file to cameras and returns the pixels. */
+/**
+ * The PlayCanvas engine, for the tests of files in viewers: `draw` shows a file to cameras and returns the pixels. With
+ * its own settings if the address ends in `?defaults`, else with floats for colours and SH.
+ */
 
 import * as pc from "playcanvas";
 import { bytesOf, canvas, textOf } from "./viewer_page.mjs";
@@ -9,7 +12,7 @@ const app = new pc.Application(canvas, {
 app.graphicsDevice.maxPixelRatio = 1;
 app.setCanvasFillMode(pc.FILLMODE_NONE);
 app.setCanvasResolution(pc.RESOLUTION_FIXED, 64, 64);
-app.scene.gsplat.dataFormat = pc.GSPLATDATA_LARGE;
+if (location.search !== "?defaults") app.scene.gsplat.dataFormat = pc.GSPLATDATA_LARGE;
 app.start();
 
 /** Wait for a frame with all Gaussians loaded, and sorted for a camera that is new. */

@@ -1,4 +1,7 @@
-/** Spark, for the tests of files in viewers: `draw` shows a file to cameras and returns the pixels. */
+/**
+ * Spark, for the tests of files in viewers: `draw` shows a file to cameras and returns the pixels. With its own settings
+ * if the address ends in `?defaults`, else with those of the original rasteriser.
+ */
 
 import * as THREE from "three";
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
@@ -14,13 +17,15 @@ const TYPES = {
   splat: SplatFileType.SPLAT,
 };
 
+const own = location.search === "?defaults";
 const renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
 renderer.setPixelRatio(1);
-const spark = new SparkRenderer({ renderer, ...CLASSIC });
+const spark = new SparkRenderer({ renderer, ...(own ? {} : CLASSIC) });
 const camera = new THREE.PerspectiveCamera();
 
 window.draw = async ({ file, ending, cameras, background }) => {
-  const mesh = new SplatMesh({ fileBytes: bytesOf(file), fileType: TYPES[ending], splatEncoding: WIDE_RANGES });
+  const ranges = own ? {} : { splatEncoding: WIDE_RANGES };
+  const mesh = new SplatMesh({ fileBytes: bytesOf(file), fileType: TYPES[ending], ...ranges });
   await mesh.initialized;
   if (ending !== "spz") mesh.quaternion.set(1, 0, 0, 0); // y down, as all other files have it
   const scene = new THREE.Scene();
