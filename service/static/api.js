@@ -4,7 +4,7 @@
  * @typedef {{stage: string, fraction: number, note?: string}} Progress
  * @typedef {{title: string, detail: string, code: string, status: number, retryable: boolean}} ProblemDocument
  * @typedef {{target_size?: number | null, max_psnr_drop?: number | null, max_ssim_drop?: number | null,
- *   psnr?: number | null}} Goals
+ *   psnr?: number | null, quality?: string | null}} Goals
  * @typedef {{ratio?: number | null, count?: number | null, max_psnr_drop?: number | null,
  *   auto_count?: boolean | null}} Budget
  * @typedef {{preset: string, format?: string, evaluate: boolean, origin?: string | null, time_limit?: number | null,

@@ -1,4 +1,4 @@
-/** The goal of a compression: none, a maximum size, a maximum PSNR loss, or the goals of an earlier job. */
+/** The goal of a compression: none, a quality, a maximum size or PSNR loss, or the goals of an earlier job. */
 
 import { byId } from "./dom.js";
 import { goalLabels, goalsOf } from "./labels.js";
@@ -71,7 +71,8 @@ export function goalField() {
       const [name = "", ...others] = Object.keys(goals);
       if (name && (others.length > 0 || !GOALS[name])) {
         earlier.value = JSON.stringify(goals);
-        goal.add(earlier);
+        goal.value = earlier.value; // of an option of the list, such as a quality
+        if (!goal.value) goal.add(earlier);
         goal.value = earlier.value;
       } else {
         goal.value = name;

@@ -15,8 +15,9 @@ const STATES = {
   expired: "expired",
 };
 
-/** Labels of goals of the encoder. @type {Record<string, (value: number) => string>} */
+/** Labels of goals of the encoder. @type {Record<string, (value: any) => string>} */
 const GOALS = {
+  quality: (/** @type {string} */ quality) => (quality === "same" ? "looks the same" : `${quality} quality`),
   target_size: (size) => `at most ${bytes(size)}`,
   max_psnr_drop: (drop) => `at most ${drop} dB PSNR loss`,
   max_ssim_drop: (drop) => `at most ${drop} SSIM loss`,
@@ -64,7 +65,7 @@ export const stateLabel = (state) => STATES[state] ?? state;
 /**
  * Return the goals among settings of the encoder.
  * @param {import("./api.js").Goals} encode
- * @returns {Record<string, number>}
+ * @returns {Record<string, any>}
  */
 export const goalsOf = (encode) => given(encode, Object.keys(GOALS));
 

@@ -168,6 +168,7 @@ SEVERAL_GOALS = {
 }
 REPEATED = {
     "psnr": {"encode": {"psnr": 38}, "finetune": {"enabled": True}},
+    "quality": {"encode": {"quality": "same"}},
     "loss and time": {"encode": {"max_psnr_drop": 0.25}, "time_limit": "1min"},
     "share": {"preset": "fast", "compact": {"ratio": 0.125}},
     "count": {"preset": "small", "compact": {"count": 120}},
