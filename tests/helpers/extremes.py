@@ -51,7 +51,7 @@ class Extreme:
     bounds: Mapping[str, float] = field(default_factory=dict)
     as_ply: bool = False
 
-    def bound(self, stage: str) -> float:
+    def bound(self, stage):
         """Return the error bound of a stage."""
         return {**BOUNDS, **self.bounds}[stage]
 

@@ -2,10 +2,9 @@
 
 import os
 import tracemalloc
-from collections.abc import Callable
 
 
-def takes_less_than(limit: float, call: Callable[[], object]) -> bool:
+def takes_less_than(limit, call):
     """Whether Python and NumPy hold fewer than ``limit`` bytes while ``call`` runs.
 
     It runs twice: here, so that it may return or raise something, and in a process of its own, where no other thread

@@ -122,14 +122,14 @@ def run(context, job, outcome, meanwhile=None):
 
 
 def test_the_pause_after_a_lost_start_grows(context, monkeypatch):
-    monkeypatch.setattr(worker_module, "LOST_SECONDS", 0.2)
+    monkeypatch.setattr(worker_module, "LOST_SECONDS", 0.02)
     job_id, pauses = add_a_job(context), []
     for start in range(1, context.settings.job_starts + 1):
         job = context.store.claim()
         assert job.starts == start
         pauses.append(run(context, job, LOST))
     assert context.store.get(job_id).state == State.FAILED
-    assert all(pause >= 0.2 * 2**start for start, pause in enumerate(pauses[:-1]))
+    assert all(pause >= 0.02 * 2**start for start, pause in enumerate(pauses[:-1]))
 
 
 @pytest.mark.parametrize("end", ["a stop", "a cancellation"])
