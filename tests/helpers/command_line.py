@@ -1,7 +1,4 @@
-"""The command ``kissgs``, run in this process, so that all tests share imported modules and loaded kernels.
-
-Tests of signals, pipes and start-up run the executable ``KISSGS`` as a separate process.
-"""
+"""The command ``kissgs``, run in this process; for signals and pipes, the executable ``KISSGS``."""
 
 import contextlib
 import faulthandler

@@ -27,11 +27,7 @@ Checkpoint.due = property(lambda self: True)  # after every step
 
 
 class HeldTraining:
-    """Training that saves a checkpoint after every step (compaction: and before the first), and waits after one.
-
-    Attributes:
-        program: Python code to run in the process that trains, before anything else.
-    """
+    """Training that saves a checkpoint after every step, and waits after one; its process runs ``program`` first."""
 
     def __init__(self, folder, saves):
         """Let it wait after so many ``saves``; ``folder`` belongs to it."""

@@ -124,10 +124,7 @@ def is_failure(message):
 
 @contextlib.contextmanager
 def opened(name, browser):
-    """Yield a viewer, "spark", "playcanvas" or our "streaming", and the site that its page is from.
-
-    No script may fail meanwhile.
-    """
+    """Yield a viewer, "spark", "playcanvas" or our "streaming", and its site; no script may fail meanwhile."""
     needed, how = (PLAYCANVAS, "scripts/setup dev") if name == "playcanvas" else (SPARK, "scripts/vendor")
     if not (DECODER / needed).exists():
         pytest.skip(f"{how} has not run")

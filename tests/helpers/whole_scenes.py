@@ -1,7 +1,4 @@
-"""Scenes with parts that are easily overlooked, and cameras that see all parts.
-
-The cameras are independent of those of the encoder and the evaluation.
-"""
+"""Scenes with parts that are easily overlooked, and cameras, independent of kissgs's own, that see all parts."""
 
 from dataclasses import replace
 
@@ -157,10 +154,7 @@ def cameras(splats, count=32, seed=11, size=(160, 120)):
     sizes = np.exp(splats.scales.max(axis=1).astype(np.float64))
 
     def steady(draw):
-        """Return the next camera whose image does not depend strongly on tiny changes of positions.
-
-        It does inside a Gaussian, and if one next to the camera is close to the near plane.
-        """
+        """Return the next camera that is not in a Gaussian, nor next to one that is close to the near plane."""
         while True:
             camera = draw()
             away = np.linalg.norm(means - camera.position, axis=1)

@@ -77,8 +77,7 @@ def test_bits_of_a_vector():
 
 
 @pytest.mark.parametrize(
-    ("largest", "expected"),
-    [(0, [0, 1, 0, 0]), (1, [1, 0, 0, 0]), (2, [1, 0, 0, 0]), (3, [1, 0, 0, 0])],
+    ("largest", "expected"), [(0, [0, 1, 0, 0]), (1, [1, 0, 0, 0]), (2, [1, 0, 0, 0]), (3, [1, 0, 0, 0])]
 )
 def test_bits_of_a_rotation(largest, expected):
     """The first of the others at its end, sqrt(1/2); the largest has the rest, all but two half steps."""

@@ -1,8 +1,6 @@
 """Agreement with readers and writers that others wrote (docs/reference/formats.md lists all such tests).
 
-Oracles: splat-transform (``.ply``, ``.compressed.ply``, SOG), the library of ``.spz``, GaussianSplats3D (``.ksplat``,
-``.splat``), three.js, Cesium and Khronos' validator (``.glb``). Scenes have degrees 0 to 3 and the ends of every
-attribute.
+Scenes have degrees 0 to 3 and the ends of every attribute.
 """
 
 import csv

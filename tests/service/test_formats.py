@@ -99,8 +99,6 @@ def test_the_limits_name_the_formats(service):
     assert limits["containers"] == ["sogxt", "sog"]
 
 
-# The option ``format`` ----------------------------------------------------------------------------------------------
-
 SOG = json.dumps({"preset": "fast", "format": "sog"})
 
 

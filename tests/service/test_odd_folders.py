@@ -116,9 +116,6 @@ def test_recovery_follows_no_links(tmp_path):
     assert [listing(tmp_path / job) for job in jobs] == before
 
 
-# Results that cannot be stored ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("no_variables")
 def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
     """A folder that was not empty once blocked its worker for ever."""
@@ -141,9 +138,6 @@ def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
         context.storage.jobs.rename(tmp_path / "away")  # which may come back
         assert not any(map(is_permanent, errors))
         (tmp_path / "away").rename(context.storage.jobs)
-
-
-# Folders that disappear ----------------------------------------------------------------------------------
 
 
 def test_readiness(start, monkeypatch):

@@ -1,7 +1,4 @@
-"""How starts of jobs end: lost, not possible now, or recorded by a database that fails in between.
-
-Oracles: the outcomes and the log, the times that the guide states, and what one undisturbed record leaves.
-"""
+"""How starts of jobs end. Oracles: the log, the times that the guide states, and what an undisturbed record leaves."""
 
 import asyncio
 import logging
@@ -25,9 +22,6 @@ pytestmark = pytest.mark.usefixtures("no_variables")
 def context(tmp_path):
     with service(tmp_path / "data") as it:
         yield it
-
-
-# What a cluster answers ---------------------------------------------------------------------------------------------
 
 
 class Cluster:
@@ -95,8 +89,6 @@ def test_a_reason_of_the_runner_reaches_the_worker():
     outcome = outcome_on(Cluster(Outcome("lost", code="not-started", message="no more processes")))
     assert outcome == postponed("no more processes")
 
-
-# Pauses -------------------------------------------------------------------------------------------------------------
 
 LOST = Outcome("lost", code="crashed", message="the machine was lost")
 
@@ -169,8 +161,6 @@ def test_starts_that_are_not_possible_are_logged_once_and_rarely_tried(context, 
     run(context, context.store.claim(), reason)
     assert pauses[-1] == 1
 
-
-# Records ------------------------------------------------------------------------------------------------------------
 
 SUMMARY = {"count": 3, "seconds": {"total": 1.0}, "cpu_seconds": 1.0, "container": {"bytes": 2}, "files": {}}
 DONE = Outcome("done", SUMMARY)

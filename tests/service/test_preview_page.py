@@ -459,6 +459,3 @@ def test_without_the_vendor_folder(preview, service, xt):
     assert "Column 0, row 0" in tab.page.locator(".readout").inner_text()
     assert tab.page.locator("#problem").is_visible()
     tab.expect_errors("^404 .*vendor", "Failed to load resource.*404")
-
-
-# Files of SOG --------------------------------------------------------------------------------------------------------
