@@ -12,16 +12,17 @@ import numpy as np
 
 from kissgs.cameras.photographs import orientation
 from kissgs.cameras.views import Similarity, View, Views
-from kissgs.core.array_types import Float32, Shaped
+from kissgs.core.array_types import Float32, Float64, Shaped
 from kissgs.core.context import DEFAULT_CONTEXT, Context, Device, Progress, load_kernels, silent
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 from kissgs.core.positions import Origin, with_origin
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
+from kissgs.evaluation.detail import PatchChanges
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison
 from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.metrics import Flip, Lpips, ms_ssim, psnr, ssim
+from kissgs.rendering.metrics import Flip, Lpips, ms_ssim, psnr, ssim_with_patches
 from kissgs.rendering.rasterizer import drawn_opacities, render
 
 # Whether a capture belongs to a scene: renderings are compared with some photographs, since a capture of another scene,
@@ -208,7 +209,8 @@ NOTHING_VISIBLE = "no rendering shows any of the reference, so these values mean
 """Note of an evaluation whose views all miss the reference."""
 
 Rendering = Float32[np.ndarray, "H W 3"]
-Measure = Callable[[np.ndarray, np.ndarray], ImageMetrics]
+Measure = Callable[[np.ndarray, np.ndarray], tuple[ImageMetrics, Float64[np.ndarray, "h w"]]]
+"""Returns the metrics of an image against a target, and the SSIM of each patch."""
 
 
 def evaluate(
@@ -321,8 +323,10 @@ def _compare_views(
             reference_images[done] = image
         other = render_clamped(candidate, view.camera, background, context)
         blank = blank and bool((image == np.clip(background, 0, 1)).all())
-        comparison = _compare(image, other, view.load_photo() if photographed else None, measure)
-        compared.append(ViewComparison(view=view, comparison=comparison, origin=reference.origin))
+        comparison, changes = _compare(image, other, view.load_photo() if photographed else None, measure)
+        compared.append(
+            ViewComparison(view=view, comparison=comparison, patch_changes=changes, origin=reference.origin)
+        )
     return Evaluation(
         against="photos" if photographed else "renderings",
         split=used,
@@ -354,13 +358,11 @@ def _measure(flip: bool, lpips: bool, device: Device) -> Measure:
     if lpips:
         perceptual["lpips"] = Lpips(device)
 
-    def measure(image: np.ndarray, target: np.ndarray) -> ImageMetrics:
-        return ImageMetrics(
-            psnr=psnr(image, target),
-            ssim=ssim(image, target),
-            ms_ssim=ms_ssim(image, target),
-            **{name: distance(image, target) for name, distance in perceptual.items()},
-        )
+    def measure(image: np.ndarray, target: np.ndarray) -> tuple[ImageMetrics, Float64[np.ndarray, "h w"]]:
+        mean, patches = ssim_with_patches(image, target)
+        others = {name: distance(image, target) for name, distance in perceptual.items()}
+        metrics = ImageMetrics(psnr=psnr(image, target), ssim=mean, ms_ssim=ms_ssim(image, target), **others)
+        return metrics, patches
 
     return measure
 
@@ -384,13 +386,14 @@ def _compare(
     candidate: Float32[np.ndarray, "H W 3"],
     photo: Shaped[np.ndarray, "H W 3"] | None,
     measure: Measure,
-) -> Comparison:
-    vs_reference = measure(candidate, reference)
+) -> tuple[Comparison, PatchChanges]:
+    vs_reference, patches = measure(candidate, reference)
     if photo is None:
-        return Comparison(reference=None, candidate=vs_reference, candidate_vs_reference=vs_reference)
-    return Comparison(
-        reference=measure(reference, photo), candidate=measure(candidate, photo), candidate_vs_reference=vs_reference
-    )
+        comparison = Comparison(reference=None, candidate=vs_reference, candidate_vs_reference=vs_reference)
+        return comparison, patches - 1
+    (before, patches_before), (after, patches_after) = measure(reference, photo), measure(candidate, photo)
+    comparison = Comparison(reference=before, candidate=after, candidate_vs_reference=vs_reference)
+    return comparison, patches_after - patches_before
 
 
 def _have_photos(views: Sequence[View]) -> bool:

@@ -17,9 +17,11 @@ from PIL import Image
 from kissgs.core.array_types import Float32, Float64, UInt8
 from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
+from kissgs.evaluation.detail import LARGE_LOSS
 from kissgs.evaluation.evaluate import background_of, render_clamped
 from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison, format_metric
 from kissgs.rendering.images import to_bytes
+from kissgs.rendering.metrics import PATCH, patch_edges
 
 # Error maps: differences of two images per pixel, as colours, and the crop with the largest error.
 
@@ -105,6 +107,12 @@ def _cards(evaluation: Evaluation, before: int | None, after: int | None) -> Ite
     yield "PSNR, candidate to reference", f"{psnr} dB", f"of their renderings; {others}"
     worst = evaluation.worst.comparison.candidate_vs_reference.texts()["PSNR"]
     yield "PSNR, worst view", f"{worst} dB", f"{format_metric(evaluation.fifth_percentile, 2)} dB is the 5th percentile"
+    detail = evaluation.detail
+    remark = (
+        f"to {'photographs' if mean.reference else 'the reference'}, patches of {PATCH}×{PATCH} pixels; worst one "
+        f"{_signed(detail.worst)}, {format_metric(100 * detail.share_below, 2)} % lose more than {LARGE_LOSS}"
+    )
+    yield "SSIM, worst 1 % of patches", _signed(detail.worst_percent), remark
     counts = f"{evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians"
     if before and after:
         change = f"{before / after:.1f}× smaller" if before >= after else f"{after / before:.1f}× larger"
@@ -125,6 +133,11 @@ def _worst_views(evaluation: Evaluation) -> str:
 def _change(comparison: Comparison) -> str:
     """Return the change of the PSNR to the photograph as HTML."""
     return "" if comparison.change is None else _red_if_negative(format_metric(comparison.change, 2, signed=True))
+
+
+def _signed(change: float) -> str:
+    """Return a change of SSIM as HTML."""
+    return _red_if_negative(format_metric(change, 4, signed=True))
 
 
 def _red_if_negative(text: str) -> str:
@@ -161,6 +174,9 @@ MAX_VIEWS = 12
 MAX_SURROUNDINGS = 4
 """Largest number of views of the surroundings shown with images."""
 
+MAX_PATCHES = 6
+"""Largest number of patches shown, those that lose most SSIM."""
+
 MAX_SIDE = 1280
 """Longer side of the large images, pixels; larger ones are reduced."""
 
@@ -196,12 +212,9 @@ def html_report(
     full, sections = full_scale(lowest.comparison.candidate_vs_reference.psnr), []
     for done, (anchor, group, compared) in enumerate(entries):
         context.progress("html", done / len(entries))
-        view, background = compared.view, background_of(compared.view, group.background)
-        renderings = [
-            render_clamped(scene.splats, view.camera, background, context) for scene in (reference, candidate)
-        ]
-        photo = view.load_photo() if group.against == "photos" else None
+        renderings, photo = _images(group, compared, (reference, candidate), context)
         sections.append(_section(anchor, compared, renderings, photo, full))
+    patches = _worst_patches(evaluation, (reference, candidate), context)
     context.progress("html", 1.0)
     images = "Their images are" if len(shown) == len(evaluation.views) else f"Images of the worst {len(shown)} are"
     summary = f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}. {images} below, the "
@@ -219,7 +232,7 @@ def html_report(
         ),
         table=_views_table(evaluation, shown),
         worst_views=escape(_worst_views(evaluation)),
-        sections="\n".join(sections),
+        sections="\n".join([patches, *sections]),
         colours=", ".join("#" + bytes(color).hex() for color in INFERNO),
         quality=QUALITY,
         max_side=MAX_SIDE,
@@ -229,6 +242,71 @@ def html_report(
 def _worst_first(evaluation: Evaluation) -> list[int]:
     """Return the indices of all views, that of the lowest PSNR first."""
     return sorted(range(len(evaluation.views)), key=lambda i: evaluation.views[i].ranking_psnr)
+
+
+Patch = tuple[int, int, int]
+"""Index of a view, and row and column of a patch in it."""
+
+
+def _patches_to_show(evaluation: Evaluation) -> list[Patch]:
+    """Return the patches that lose most, the worst first, none beside another; without any loss, none."""
+    remaining = [np.where(np.isnan(view.patch_changes), -np.inf, view.patch_changes) for view in evaluation.views]
+    found = list[Patch]()
+    while len(found) < MAX_PATCHES:
+        i = min(range(len(remaining)), key=lambda each: remaining[each].min())
+        row, column = map(int, np.unravel_index(remaining[i].argmin(), remaining[i].shape))
+        if remaining[i][row, column] >= 0:
+            break
+        remaining[i][max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = np.inf
+        found.append((i, row, column))
+    return found
+
+
+def _worst_patches(evaluation: Evaluation, scenes: Sequence[ReportScene], context: Context) -> str:
+    """Return a section with crops around the patches that lose most detail; empty without any loss."""
+    patches, figures = _patches_to_show(evaluation), dict[Patch, str]()
+    for i in dict.fromkeys(i for i, _, _ in patches):
+        compared = evaluation.views[i]
+        renderings, photo = _images(evaluation, compared, scenes, context)
+        layers = {} if photo is None else {"photograph": photo}
+        layers |= zip(("reference", "candidate"), map(to_bytes, renderings), strict=True)
+        figures |= {patch: _patch(compared, patch, layers) for patch in patches if patch[0] == i}
+    if not patches:
+        return ""
+    target = "the reference" if evaluation.against == "renderings" else "the photograph"
+    return (
+        '<section class="card"><h2>Patches that lose most detail</h2><p class="numbers">The square marks a patch of '
+        f"{PATCH}×{PATCH} pixels; the figure is its change of SSIM to {target}.</p>"
+        f'<div class="patches">{"".join(figures[patch] for patch in patches)}</div></section>'
+    )
+
+
+def _patch(compared: ViewComparison, patch: Patch, layers: dict[str, UInt8[np.ndarray, "H W 3"]]) -> str:
+    """Return a patch and as much on either side of it, cut from each of these images of a view."""
+    view, place = compared.view, patch[1:]
+    sides, crop, inside = (view.camera.height, view.camera.width), list[slice](), list[slice]()
+    for number, length in zip(place, sides, strict=True):
+        start, stop = map(int, patch_edges(length)[number : number + 2])
+        crop.append(_interval((start + stop) // 2, 3 * PATCH, length))
+        inside.append(slice(start - crop[-1].start, stop - crop[-1].start))
+    rows, columns = crop
+    mark = _mark((inside[0], inside[1]), (rows.stop - rows.start, columns.stop - columns.start))
+    name = escape(view.name)
+    images = [
+        _figure(_lossless(pixels[rows, columns]), f"{layer}, part of {name}", layer, mark)
+        for layer, pixels in layers.items()
+    ]
+    change = _signed(float(compared.patch_changes[place[0], place[1]]))
+    return f'<div><h3>{name} <small>{change}</small></h3><div class="crops">{"".join(images)}</div></div>'
+
+
+def _images(
+    evaluation: Evaluation, compared: ViewComparison, scenes: Sequence[ReportScene], context: Context
+) -> tuple[list[Float32[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W 3"] | None]:
+    """Return the renderings of both scenes from a view, and its photograph if it was compared with that."""
+    view, background = compared.view, background_of(compared.view, evaluation.background)
+    renderings = [render_clamped(scene.splats, view.camera, background, context) for scene in scenes]
+    return renderings, view.load_photo() if evaluation.against == "photos" else None
 
 
 def _section(

@@ -12,6 +12,8 @@ import numpy as np
 from kissgs.cameras.views import View
 from kissgs.core.array_types import Float32
 from kissgs.core.positions import WORLD, Origin
+from kissgs.evaluation.detail import LARGE_LOSS, Detail, PatchChanges
+from kissgs.rendering.metrics import PATCH
 
 
 def format_metric(value: float, digits: int, *, signed: bool = False) -> str:
@@ -101,6 +103,7 @@ class ViewComparison:
 
     view: View
     comparison: Comparison
+    patch_changes: PatchChanges
     origin: Origin = WORLD
 
     @property
@@ -215,13 +218,28 @@ class Evaluation:
         return lower if math.isinf(upper) else lower + (rank - math.floor(rank)) * (upper - lower)
 
     @property
+    def detail(self) -> Detail:
+        """Changes of SSIM in the patches of all views: to photographs, without them to the reference's renderings."""
+        return Detail.of([view.patch_changes for view in self.views])
+
+    @property
+    def _detail_text(self) -> str:
+        detail, target = self.detail, "photographs" if self.against == "photos" else "the reference"
+        return (
+            f"SSIM to {target} in patches of {PATCH}x{PATCH} pixels: "
+            f"{format_metric(detail.worst_percent, 4, signed=True)} in the worst 1 %, "
+            f"{format_metric(detail.worst, 4, signed=True)} in the worst one, "
+            f"{format_metric(100 * detail.share_below, 2)} % lose more than {LARGE_LOSS}"
+        )
+
+    @property
     def extremes(self) -> str:
-        """Worst view and its pose, fifth percentile, and share of the scene that is shown, as text."""
+        """Worst view and its pose, fifth percentile, detail, and share of the scene that is shown, as text."""
         worst = self.worst
         lowest = worst.comparison.candidate_vs_reference.psnr
         text = (
             f"worst view {format_metric(lowest, 1)} dB ({worst.view.name}, {worst.pose}), "
-            f"5th percentile {format_metric(self.fifth_percentile, 1)} dB"
+            f"5th percentile {format_metric(self.fifth_percentile, 1)} dB; {self._detail_text}"
         )
         if self.shown is not None:
             text += f"; the views show {math.floor(100 * self.shown)} % of the scene"
@@ -241,6 +259,7 @@ class Evaluation:
             "mean": self.mean.as_dict(),
             "worst": self.worst.pose_as_dict(),
             "fifth_percentile": as_json(self.fifth_percentile),
+            "detail": {name: as_json(value) for name, value in asdict(self.detail).items()},
             "shown": self.shown,
             "surroundings": None if self.surroundings is None else self.surroundings.as_dict(),
         }

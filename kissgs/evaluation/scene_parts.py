@@ -12,7 +12,7 @@ from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.io.conventions import spread_bits
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.cpu.frame import differentiate_footprints, draw, sums_of_slots
+from kissgs.rendering.cpu.frame import color_gradients, draw, sums_of_slots
 from kissgs.rendering.cpu.records import Frame
 from kissgs.rendering.rasterizer import drawn_opacities
 
@@ -221,11 +221,9 @@ MAX_SIDE = 160
 
 def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     """Return the blending weight of each Gaussian, alpha times the transmittance in front of it, summed over pixels."""
-    height, width = frame.transmittance.shape
-    ones, zeros = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
-    ones[:, :, 0] = 1  # so the gradient with respect to a red value is the sum of weights
-    v_slots, slots, _ = differentiate_footprints(frame, ones, zeros, pool)
-    return sums_of_slots(frame, slots, np.ascontiguousarray(v_slots[:, 6]))
+    # The gradient of the sum of all values by a red one is the sum of the weights.
+    v_slots, slots = color_gradients(frame, np.ones_like(frame.image), pool)
+    return sums_of_slots(frame, slots, np.ascontiguousarray(v_slots[:, 0]))
 
 
 def share_shown(splats: Splats, cameras: Sequence[Camera], *, threads: int = 0) -> float:

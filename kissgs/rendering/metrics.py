@@ -10,7 +10,7 @@ import warnings
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Shaped
+from kissgs.core.array_types import Float32, Float64, Int, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.resources import Workers
 
@@ -22,6 +22,9 @@ WINDOW = 11
 
 SCALE_WEIGHTS = 0.0448, 0.2856, 0.3001, 0.2363, 0.1333
 """Exponents of MS-SSIM's five scales, from full resolution to a sixteenth of it, as published."""
+
+PATCH = 32
+"""Side of the patches over which :func:`ssim_with_patches` averages, pixels."""
 
 TILE_PIXELS = 160
 """Width of a tile, pixels: the largest that the ring buffers of the kernel hold."""
@@ -45,10 +48,27 @@ def ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."])
     padding with zeros, C1 = 0.01², C2 = 0.03². Wang et al., "Image Quality Assessment: From Error Visibility to
     Structural Similarity", IEEE Transactions on Image Processing 13 (2004).
     """
+    return ssim_with_patches(image, reference)[0]
+
+
+def ssim_with_patches(
+    image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]
+) -> tuple[float, Float64[np.ndarray, "h w"]]:
+    """Return :func:`ssim`, and its mean over each patch between the :func:`patch_edges` of rows and of columns."""
     a, b = image_pair(image, reference)
-    with Workers(1) as pool:
-        sums = differences_and_ssim(a[None], b[None], pool)
-    return float(sums[2]) / a.size
+    heights, widths = (np.diff(patch_edges(length)) for length in a.shape[:2])
+    sums = _similarity_sums(a, b, (len(heights), len(widths)))[:, :, 0].sum(axis=2)
+    return float(sums.sum()) / a.size, sums / (3 * np.outer(heights, widths))
+
+
+def patch_edges(length: int) -> Int[np.ndarray, " n"]:
+    """Return where patches begin along a side of this many pixels, and its end: every :data:`PATCH` pixels.
+
+    A remainder of at least half a patch is one of its own; a smaller one belongs to the patch before it, if any.
+    """
+    edges = PATCH * np.arange(max(1, (length + PATCH // 2) // PATCH) + 1)
+    edges[-1] = length
+    return edges
 
 
 def ms_ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
@@ -82,15 +102,21 @@ def ms_ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "...
 
 def _mean_similarities(a: Float32[np.ndarray, "H W 3"], b: Float32[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "2 3"]:
     """Return the means of SSIM and of its second factor over all windows inside the images, for each channel."""
+    sums = _similarity_sums(a, b, (1, 1), WINDOW // 2)[0, 0]
+    return sums / ((a.shape[0] - WINDOW + 1) * (a.shape[1] - WINDOW + 1))
+
+
+def _similarity_sums(
+    a: Float32[np.ndarray, "H W 3"], b: Float32[np.ndarray, "H W 3"], patches: tuple[int, int], inset: int = 0
+) -> Float64[np.ndarray, "h w 2 3"]:
+    """Return sums of SSIM and of its second factor for each patch and channel; a border of ``inset`` is left out."""
     from kissgs.rendering import ssim_kernels
 
-    height, width = a.shape[0] - WINDOW + 1, a.shape[1] - WINDOW + 1
-    sums = np.zeros((2, 3))
-    for tile in _tiles(height, width):
-        ssim_kernels.similarity_tile(
-            a.reshape(len(a), -1), b.reshape(len(b), -1), tile + np.repeat([WINDOW // 2, WINDOW // 2 * 3], 2), sums
-        )
-    return sums / (height * width)
+    sums = np.zeros((*patches, 2, 3))
+    rows = a.reshape(len(a), -1), b.reshape(len(b), -1)
+    for tile in _tiles(a.shape[0] - 2 * inset, a.shape[1] - 2 * inset):
+        ssim_kernels.similarity_tile(*rows, tile + np.repeat([inset, 3 * inset], 2), sums)
+    return sums
 
 
 def _halved(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "h w 3"]:

@@ -1,4 +1,4 @@
-"""Numba kernels of SSIM and of plain differences: sums over a tile and, in the same pass, gradients; sums for MS-SSIM.
+"""Numba kernels of SSIM and of plain differences: sums over a tile and, in the same pass, gradients; sums for metrics.
 
 SSIM needs the images x and y only as their sum s = x + y and difference d = x - y. With G the blur, S = G s,
 D = G d, p = G s² - S² and q = G d² - D² (four blurs instead of five),
@@ -228,25 +228,32 @@ def ssim_tile(
         _gradient(blurred, ring[oldest * 1152 + 30 :], l1, l2, ssim, gradient[y, left:right])
 
 
-@compiled("void(float32[:, ::1], float32[:, ::1], int64[::1], float64[:, ::1])")
+@compiled("void(float32[:, ::1], float32[:, ::1], int64[::1], float64[:, :, :, ::1])")
 def similarity_tile(image: np.ndarray, target: np.ndarray, tile: np.ndarray, sums: np.ndarray) -> None:
-    """Add the sums of SSIM and of its factor structure over one tile, for each channel, to ``(2, 3)``.
+    """Add the sums of SSIM and of its factor structure over one tile, for each patch and channel, to ``(h, w, 2, 3)``.
 
-    The tile, as for :func:`ssim_tile`, lies at least five pixels inside the image, so that all windows do.
+    The tile is as for :func:`ssim_tile`. Patches of 32x32 pixels start at the top left of the image, and the last ones
+    take what remains of it; a single patch is the whole image.
     """
+    height, width = image.shape
     top, bottom, left, right = tile
+    first, last = max(left - 15, 0), min(right + 15, width)  # columns inside the image; the others stay zero
     ring = np.zeros(22 * 1152, dtype=np.float32)
     moments = np.zeros(4 * 576, dtype=np.float32)
     maps = np.zeros((2, right - left), dtype=np.float32)
     for step in range(bottom - top + 10):
-        y = top - 5 + step
-        row = slice(left - 15, right + 15)
-        _sum_and_difference(image[y, row], target[y, row], ring[step % 11 * 1152 :])
+        slot, y = step % 11, top - 5 + step
+        if 0 <= y < height:
+            _sum_and_difference(image[y, first:last], target[y, first:last], ring[slot * 1152 + first - left + 15 :])
+        else:
+            _clear(ring, slot, 1152)
         if step < 10:
             continue
         _moments(ring[(step + 1) % 11 * 1152 :], right - left + 30, moments)
         _similarities(moments, maps[0], maps[1])
+        row = min((y - 5) // 32, sums.shape[0] - 1)
         for j in range(0, right - left, 3):
+            column = min((left + j) // 96, sums.shape[1] - 1)
             for channel in range(3):
-                sums[0, channel] += np.float64(maps[0, j + channel])
-                sums[1, channel] += np.float64(maps[1, j + channel])
+                sums[row, column, 0, channel] += np.float64(maps[0, j + channel])
+                sums[row, column, 1, channel] += np.float64(maps[1, j + channel])

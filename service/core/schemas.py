@@ -171,8 +171,8 @@ class JobStatus(ApiModel):
     evaluation: dict[str, Any] | None = Field(
         None,
         description="PSNR, SSIM and MS-SSIM against renderings of the upload, from cameras sampled over the whole "
-        "scene: means, the worst view and its camera position, the fifth percentile of PSNR, and the share of the "
-        "scene that the views show. A PSNR of null is infinite.",
+        "scene: means, the worst view and its camera position, the fifth percentile of PSNR, changes of SSIM in "
+        "patches (detail), and the share of the scene that the views show. A PSNR of null is infinite.",
     )
     finetuning: dict[str, Any] | None = Field(
         None, description="PSNR and bytes before and after fine-tuning, and whether its result was kept."

@@ -52,7 +52,7 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
         evaluation = report["evaluation"]
         summary["evaluation"] = {
             **evaluation["mean"]["candidate_vs_reference"],
-            **{name: evaluation[name] for name in ("worst", "fifth_percentile", "shown")},
+            **{name: evaluation[name] for name in ("worst", "fifth_percentile", "detail", "shown")},
         }
     _write(folder / "summary.json", json.dumps(summary).encode())
     return summary

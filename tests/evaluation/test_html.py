@@ -20,6 +20,7 @@ from kissgs.evaluation.evaluate import compare_images, evaluate
 from kissgs.evaluation.html import (
     FULL_SCALES,
     INFERNO,
+    MAX_PATCHES,
     MAX_SURROUNDINGS,
     MAX_VIEWS,
     WINDOW,
@@ -99,8 +100,8 @@ def test_every_view_has_images_without_photographs():
     ids = [section["id"] for section in page.of("section") if "id" in section]
     by_psnr = np.argsort([each.comparison.candidate_vs_reference.psnr for each in found.views])
     assert ids == [f"view-{i}" for i in by_psnr]
-    assert len(page.images) == 3 * (3 + 3)
-    first = page.images[:6]
+    assert len(page.images) == 3 * 2 + 3 * (3 + 3), "the worst patch of each view, which has two; then the views"
+    first = page.images[6:12]
     assert all(image.shape == (40, 60, 3) for image in first)
     view, wanted = found.views[worst].view, {}
     for side, scene in (("candidate", WORSE), ("reference", SCENE)):
@@ -114,8 +115,8 @@ def test_photographs_are_shown_if_there_are_any(tmp_path):
     views = load_views(write_capture(tmp_path / "capture"))
     text, found = report(views, found=evaluate(SCENE, WORSE, views, split="all"))
     page = Page(text)
-    assert len(page.images) == 3 * (4 + 4) + MAX_SURROUNDINGS * (3 + 3)
-    np.testing.assert_array_equal(page.images[6], found.worst.view.load_photo())
+    assert len(page.images) == 3 * 3 + 3 * (4 + 4) + MAX_SURROUNDINGS * (3 + 3)
+    np.testing.assert_array_equal(page.images[9 + 6], found.worst.view.load_photo())
     for evaluation in (found, found.surroundings):
         assert evaluation.worst.view.name in page.text
         assert evaluation.worst.pose in page.text
@@ -125,6 +126,29 @@ def test_photographs_are_shown_if_there_are_any(tmp_path):
             assert cell.replace("-", "−") in page.text
     assert "5.0× smaller" in page.text
     assert "0.02 → 0.00 MB" in page.text
+
+
+def test_the_patches_that_lose_most_are_shown_the_worst_first(tmp_path):
+    """Each crop holds the pixels around its patch; of patches side by side, only the worst is shown."""
+    views = load_views(write_capture(tmp_path / "capture", size=(200, 130)))
+    text, found = report(views, found=compare_images(SCENE, WORSE, views))
+    page, (view,), changes = Page(text), views.test, found.views[0].patch_changes
+    assert changes.shape == (4, 6)
+    ordered = [np.unravel_index(flat, changes.shape) for flat in changes.ravel().argsort() if changes.flat[flat] < 0]
+    shown = []
+    for row, column in ordered:
+        if all(max(abs(row - other), abs(column - across)) > 2 for other, across in shown):
+            shown.append((row, column))
+    assert 2 <= len(shown) <= MAX_PATCHES
+    headings = [f"{view.name} −{-changes[place]:.4f}" for place in shown]
+    at = page.text.index("Patches that lose most detail")
+    assert [at < page.text.index(heading) for heading in headings] == [True] * len(shown)
+    assert sorted(headings, key=page.text.index) == headings
+    renderings = [np.rint(255 * rendered_view(scene, view)).astype(np.uint8) for scene in (SCENE, WORSE)]
+    for n, (row, column) in enumerate(shown):
+        top, left = np.clip((32 * row - 32, 32 * column - 32), 0, (130 - 96, 200 - 96))
+        for image, whole in zip(page.images[3 * n :], [view.load_photo(), *renderings], strict=False):
+            assert np.abs(image.astype(int) - whole[top : top + 96, left : left + 96]).max() <= 1
 
 
 def test_names_are_escaped(tmp_path):
@@ -150,7 +174,8 @@ def test_equal_scenes_have_a_report():
 
 def test_large_images_are_reduced_but_crops_are_not():
     page = Page(report(cameras(test=1, size=(1500, 300)))[0])
-    assert [image.shape for image in page.images] == [(256, 1280, 3)] * 3 + [(150, 150, 3)] * 3
+    shapes = [image.shape for image in page.images]
+    assert shapes == [(96, 96, 3)] * 2 * MAX_PATCHES + [(256, 1280, 3)] * 3 + [(150, 150, 3)] * 3
 
 
 def test_twelve_of_many_views_are_shown_the_worst_first():

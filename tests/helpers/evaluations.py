@@ -18,8 +18,9 @@ def compared(reference, candidate, to_reference):
     return Comparison(reference=reference, candidate=candidate, candidate_vs_reference=to_reference)
 
 
-def evaluation_with(comparisons):
-    """Return an evaluation of views with one camera, named by their indices."""
+def evaluation_with(comparisons, patch_changes=None):
+    """Return an evaluation of views with one camera, named by their indices; without patches' changes, of none."""
+    patch_changes = patch_changes or [np.zeros((1, 1))] * len(comparisons)
     return Evaluation(
         against="photos" if comparisons[0].reference else "renderings",
         split="all",
@@ -28,7 +29,8 @@ def evaluation_with(comparisons):
         reference_count=1,
         candidate_count=1,
         views=tuple(
-            ViewComparison(view=View(f"{number}", CAMERA), comparison=each) for number, each in enumerate(comparisons)
+            ViewComparison(view=View(f"{number}", CAMERA), comparison=each, patch_changes=changes)
+            for number, (each, changes) in enumerate(zip(comparisons, patch_changes, strict=True))
         ),
     )
 

@@ -16,7 +16,7 @@ from scipy.signal import convolve2d
 
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.resources import Workers
-from kissgs.rendering.metrics import differences_and_ssim, ms_ssim, psnr, ssim
+from kissgs.rendering.metrics import differences_and_ssim, ms_ssim, patch_edges, psnr, ssim, ssim_with_patches
 
 
 def naive_ms_ssim(image, reference):
@@ -62,6 +62,46 @@ def test_ssim_is_that_of_the_textbook(height, width):
     """Smaller than the window, and with one or several tiles in either direction."""
     image, reference = image_pair(height, width)
     assert ssim(image, reference) == pytest.approx(similarities(image, reference).mean(), abs=1e-6)
+
+
+def naive_patches(length):
+    """Return the pixels of each patch along a side, one by one: a remainder below 16 joins the patch before."""
+    patches = [list(range(start, min(start + 32, length))) for start in range(0, length, 32)]
+    if len(patches) > 1 and len(patches[-1]) < 16:
+        patches[-2:] = [patches[-2] + patches[-1]]
+    return patches
+
+
+@pytest.mark.parametrize(
+    ("height", "width"), [(1, 1), (15, 31), (16, 47), (47, 48), (80, 33), (79, 240), (130, 163), (270, 15), (33, 500)]
+)
+def test_patches_have_the_mean_of_their_pixels(height, width):
+    """Smaller than a patch, remainders on both sides of a half, and patches that tiles of the kernel divide."""
+    image, reference = image_pair(height, width)
+    whole, patches = ssim_with_patches(image, reference)
+    pixels = similarities(image, reference)
+    rows, columns = naive_patches(height), naive_patches(width)
+    assert patch_edges(height).tolist() == [row[0] for row in rows] + [height]
+    expected = [[pixels[np.ix_(row, column)].mean() for column in columns] for row in rows]
+    np.testing.assert_allclose(patches, expected, rtol=0, atol=2e-6)
+    assert whole == ssim(image, reference)
+    assert (ssim_with_patches(image, image)[1] == 1).all()
+
+
+def test_patches_of_uniform_images_follow_from_their_means():
+    """Without variance SSIM is its first factor; away from the border, where zeros come in."""
+    one, other = (np.full((128, 128, 3), level, np.float32) for level in (0.25, 0.75))
+    expected = (2 * 0.25 * 0.75 + C1) / (0.25**2 + 0.75**2 + C1)
+    np.testing.assert_allclose(ssim_with_patches(one, other)[1][1:-1, 1:-1], expected, atol=1e-5)
+    assert (ssim_with_patches(one, one)[1] == 1).all()
+
+
+def test_nan_spoils_the_patches_that_it_reaches_and_no_other():
+    image, reference = image_pair(128, 96)
+    image[31, 40, 2] = math.nan
+    whole, patches = ssim_with_patches(image, reference)
+    assert math.isnan(whole)
+    assert np.isnan(patches).tolist() == [[False, True, False]] * 2 + [[False] * 3] * 2
 
 
 @pytest.mark.quick(3)

@@ -80,6 +80,7 @@ def test_evaluating(service):
     assert evaluation["psnr"] == pytest.approx(expected.mean.candidate_vs_reference.psnr, abs=1e-6)
     assert evaluation["worst"] == json.loads(json.dumps(expected.worst.pose_as_dict()))
     assert evaluation["fifth_percentile"] == pytest.approx(expected.fifth_percentile, abs=1e-6)
+    assert evaluation["detail"]["worst"] == pytest.approx(expected.detail.worst, abs=1e-6)
     assert evaluation["shown"] == pytest.approx(expected.shown)
 
 

@@ -8,13 +8,13 @@ Gaussian needs no subtraction: B <- B + alpha (colour - B), starting with the ba
 behind it / (1 - alpha). The derivative of the pixel by the Gaussian's alpha is T (colour - B), and its removal changes
 the pixel by alpha T (colour - B).
 
-Inner loops process whole rows of a tile without branches on one array, so that they are vectorised.
+Inner loops process rows of half a tile, eight pixels, without branches on one array, so that they are vectorised.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import boolean, float32, float64, int32, int64, njit, void
+from numba import float32, float64, int32, int64, njit, void
 
 from kissgs.core.numba_kernels import compiled
 from kissgs.rendering.cpu.records import FRAME, SLOTS, Blended, Frame, Slots, TileLists
@@ -42,10 +42,17 @@ def _exp_minus(s: np.float32) -> np.float32:
 
 
 @njit(nogil=True, error_model="numpy")
+def _pixel(p: int) -> tuple[int, int]:
+    """Return column and row of pixel ``p`` of a tile: its left half comes first, row after row."""
+    return (p >> 7) * 8 + (p & 7), (p >> 3) & 15
+
+
+@njit(nogil=True, error_model="numpy")
 def _pixel_centres(s: np.ndarray) -> None:
     """Write x and y of a tile's pixel centres into the first and the second 256 values of ``s``."""
     for p in range(256):
-        s[p], s[256 + p] = np.float32(p & 15) + np.float32(0.5), np.float32(p >> 4) + np.float32(0.5)
+        x, y = _pixel(p)
+        s[p], s[256 + p] = np.float32(x) + np.float32(0.5), np.float32(y) + np.float32(0.5)
 
 
 @njit(nogil=True, error_model="numpy")
@@ -78,9 +85,11 @@ def _copy_stops(stops: np.ndarray, tile: int, s: np.ndarray) -> int:
 
 
 @njit(nogil=True, error_model="numpy")
-def _rows(span: np.uint16) -> tuple[np.uint64, np.uint64]:
-    """Return the first and last (exclusive) pixel of the rows of a span."""
-    return np.uint64(span >> 5) * np.uint64(16), np.uint64(span & 31) * np.uint64(16)
+def _rows(span: np.uint32, half: int) -> tuple[np.uint64, np.uint64]:
+    """Return the first and last (exclusive) pixel that a span has in the left (0) or right (1) half of a tile."""
+    rows, begin = span >> np.uint32(16 * half), np.uint64(128 * half)
+    first, last = (rows >> np.uint32(5)) & np.uint32(31), rows & np.uint32(31)
+    return begin + np.uint64(8) * np.uint64(first), begin + np.uint64(8) * np.uint64(last)
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
@@ -120,7 +129,8 @@ def blend(frame: Frame, first: int, last: int) -> None:
         x0, y0 = (tile % lists.columns) * 16, (tile // lists.columns) * 16
         begin, end = lists.starts[tile], lists.starts[tile + 1]
         for p in range(256):
-            inside = x0 + (p & 15) < width and y0 + (p >> 4) < height
+            x, y = _pixel(p)
+            inside = x0 + x < width and y0 + y < height
             s[512 + p] = np.float32(end - begin) if inside else zero
             s[768 + p] = one
             s[1024 + p] = s[1280 + p] = s[1536 + p] = zero
@@ -128,20 +138,22 @@ def blend(frame: Frame, first: int, last: int) -> None:
             _copy_records(records, lists.members, start, min(start + 64, end), copies)
             for i in range(start, min(start + 64, end)):
                 place, (opacity, red, green, blue) = _footprint(copies, i - start, x0, y0)
-                top, bottom = _rows(lists.spans[i])
                 index = np.float32(i - begin)
-                for p in range(top, bottom):
-                    drawn = index < s[p + np.uint64(512)]
-                    _, _, _, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
-                    t = s[p + np.uint64(768)]
-                    after = t * (one - alpha)
-                    ends = after <= t_min
-                    weight = zero if ends else alpha * t
-                    s[p + np.uint64(512)] = index if ends else s[p + np.uint64(512)]
-                    s[p + np.uint64(768)] = t if ends else after
-                    s[p + np.uint64(1024)] += weight * red
-                    s[p + np.uint64(1280)] += weight * green
-                    s[p + np.uint64(1536)] += weight * blue
+                for half in range(2):
+                    top, bottom = _rows(lists.spans[i], half)
+                    for p in range(top, bottom):
+                        drawn = index < s[p + np.uint64(512)]
+                        _, _, _, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
+                        t = s[p + np.uint64(768)]
+                        ends = t * (one - alpha) <= t_min
+                        alpha = zero if ends else alpha
+                        weight = alpha * t
+                        # Arithmetic in place of choices between two values, which would compile to masked stores: slow.
+                        s[p + np.uint64(512)] += (one if ends else zero) * (index - s[p + np.uint64(512)])
+                        s[p + np.uint64(768)] = t * (one - alpha)
+                        s[p + np.uint64(1024)] += weight * red
+                        s[p + np.uint64(1280)] += weight * green
+                        s[p + np.uint64(1536)] += weight * blue
             last_stop = zero
             for p in range(512, 768):
                 last_stop = max(last_stop, s[p])
@@ -155,7 +167,8 @@ def _store_tile(s: np.ndarray, tile: int, x0: int, y0: int, out: Blended) -> Non
     """Write the pixels of a tile over the background."""
     background, (height, width) = out.background, out.transmittance.shape
     for p in range(256):
-        x, y = x0 + (p & 15), y0 + (p >> 4)
+        x, y = _pixel(p)
+        x, y = x0 + x, y0 + y
         out.stops[tile, p] = np.int32(s[512 + p])
         if x < width and y < height:
             out.image[y, x, 0] = s[1024 + p] + s[768 + p] * background[0]
@@ -178,24 +191,26 @@ def removal_errors(frame: Frame, slots: Slots, first: int, last: int, errors: np
         x0, y0 = (tile % lists.columns) * 16, (tile // lists.columns) * 16
         begin, last_stop = lists.starts[tile], _copy_stops(blended.stops, tile, s)
         for p in range(256):
-            s[768 + p] = blended.transmittance[min(y0 + (p >> 4), height - 1), min(x0 + (p & 15), width - 1)]
+            x, y = _pixel(p)
+            s[768 + p] = blended.transmittance[min(y0 + y, height - 1), min(x0 + x, width - 1)]
             s[1024 + p], s[1280 + p], s[1536 + p] = background[0], background[1], background[2]
         for i in range(begin + last_stop - 1, begin - 1, -1):
             place, (opacity, red, green, blue) = _footprint(records, lists.members[i], x0, y0)
-            top, bottom = _rows(lists.spans[i])
             index, total = np.float32(i - begin), zero
-            for p in range(top, bottom):
-                drawn = index < s[p + np.uint64(512)]
-                _, _, _, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
-                t = s[p + np.uint64(768)] / (one - alpha)
-                s[p + np.uint64(768)] = t
-                dr = alpha * (red - s[p + np.uint64(1024)])
-                dg = alpha * (green - s[p + np.uint64(1280)])
-                db = alpha * (blue - s[p + np.uint64(1536)])
-                s[p + np.uint64(1024)] += dr
-                s[p + np.uint64(1280)] += dg
-                s[p + np.uint64(1536)] += db
-                total += t * t * (dr * dr + dg * dg + db * db)
+            for half in range(2):
+                top, bottom = _rows(lists.spans[i], half)
+                for p in range(top, bottom):
+                    drawn = index < s[p + np.uint64(512)]
+                    _, _, _, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
+                    t = s[p + np.uint64(768)] / (one - alpha)
+                    s[p + np.uint64(768)] = t
+                    dr = alpha * (red - s[p + np.uint64(1024)])
+                    dg = alpha * (green - s[p + np.uint64(1280)])
+                    db = alpha * (blue - s[p + np.uint64(1536)])
+                    s[p + np.uint64(1024)] += dr
+                    s[p + np.uint64(1280)] += dg
+                    s[p + np.uint64(1536)] += db
+                    total += t * t * (dr * dr + dg * dg + db * db)
             errors[slots.of[i - slots.begin]] = total
 
 
@@ -217,7 +232,8 @@ def _copy_gradient(v_image: np.ndarray, x0: int, y0: int, s: np.ndarray) -> None
     """Write the gradient of a tile's pixels by R, G, B from the fifth 256 values of ``s`` on; 0 beyond the image."""
     height, width, _ = v_image.shape
     for p in range(256):
-        x, y = x0 + (p & 15), y0 + (p >> 4)
+        x, y = _pixel(p)
+        x, y = x0 + x, y0 + y
         inside = x < width and y < height
         x, y = min(x, width - 1), min(y, height - 1)
         s[1024 + p] = v_image[y, x, 0] if inside else np.float32(0)
@@ -227,22 +243,23 @@ def _copy_gradient(v_image: np.ndarray, x0: int, y0: int, s: np.ndarray) -> None
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 def _begin_gradient(frame: Blended, v_alpha: np.ndarray, x0: int, y0: int, s: np.ndarray) -> None:
-    """Write T, the gradient by alpha, and the product of the background and its gradient of a tile's pixels."""
+    """Write T of a tile's pixels, and the product of the background and its gradient, less the gradient by alpha."""
     height, width = v_alpha.shape
     background = frame.background
     for p in range(256):
-        x, y = x0 + (p & 15), y0 + (p >> 4)
+        x, y = _pixel(p)
+        x, y = x0 + x, y0 + y
         inside = x < width and y < height
         x, y = min(x, width - 1), min(y, height - 1)
         s[768 + p] = frame.transmittance[y, x] if inside else np.float32(1)
-        s[1792 + p] = v_alpha[y, x] if inside else np.float32(0)
-        s[2048 + p] = background[0] * s[1024 + p] + background[1] * s[1280 + p] + background[2] * s[1536 + p]
+        behind = background[0] * s[1024 + p] + background[1] * s[1280 + p] + background[2] * s[1536 + p]
+        s[1792 + p] = behind - v_alpha[y, x] if inside else np.float32(0)
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 def _backward(
     s: np.ndarray,
-    span: np.uint16,
+    span: np.uint32,
     index: np.float32,
     footprint: tuple[Place, tuple[np.float32, ...]],
     limits: tuple[np.float32, np.float32],
@@ -251,34 +268,35 @@ def _backward(
     """Compute the nine sums of one footprint over a tile's pixels, and step in front of it."""
     place, (opacity, red, green, blue) = footprint
     zero, one = np.float32(0), np.float32(1)
-    top, bottom = _rows(span)
     m, mu, mv, muu, muv, mvv, vr, vg, vb = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for p in range(top, bottom):
-        drawn = index < s[p + np.uint64(512)]
-        u, v, full, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
-        t = s[p + np.uint64(768)] / (one - alpha)
-        s[p + np.uint64(768)] = t
-        gr, gg, gb = s[p + np.uint64(1024)], s[p + np.uint64(1280)], s[p + np.uint64(1536)]
-        weight = alpha * t
-        vr += weight * gr
-        vg += weight * gg
-        vb += weight * gb
-        change = red * gr + green * gg + blue * gb + s[p + np.uint64(1792)] - s[p + np.uint64(2048)]
-        s[p + np.uint64(2048)] += alpha * change
-        g = -weight * change
-        g = g if full <= limits[1] else zero
-        m += g
-        mu += g * u
-        mv += g * v
-        muu += g * u * u
-        muv += g * u * v
-        mvv += g * v * v
-    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = m, mu, mv, muu, muv, mvv
+    for half in range(2):
+        top, bottom = _rows(span, half)
+        for p in range(top, bottom):
+            drawn = index < s[p + np.uint64(512)]
+            u, v, full, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
+            t = s[p + np.uint64(768)] / (one - alpha)
+            s[p + np.uint64(768)] = t
+            gr, gg, gb = s[p + np.uint64(1024)], s[p + np.uint64(1280)], s[p + np.uint64(1536)]
+            weight = alpha * t
+            vr += weight * gr
+            vg += weight * gg
+            vb += weight * gb
+            change = red * gr + green * gg + blue * gb - s[p + np.uint64(1792)]
+            s[p + np.uint64(1792)] += alpha * change
+            g = weight * change
+            g = g if full <= limits[1] else zero
+            m += g
+            mu += g * u
+            mv += g * v
+            muu += g * u * u
+            muv += g * u * v
+            mvv += g * v * v
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = -m, -mu, -mv, -muu, -muv, -mvv
     sums[6], sums[7], sums[8] = vr, vg, vb
 
 
 @compiled(
-    void(FRAME, SLOTS, int64, int64, float32[:, :, ::1], float32[:, ::1], float32[:, ::1], boolean[::1]),
+    void(FRAME, SLOTS, int64, int64, float32[:, :, ::1], float32[:, ::1], float32[:, ::1]),
     fastmath=_FAST,
 )
 def blend_backward(
@@ -289,18 +307,16 @@ def blend_backward(
     v_image: np.ndarray,
     v_alpha: np.ndarray,
     v_slots: np.ndarray,
-    changed: np.ndarray,
 ) -> None:
     """Compute the gradients of tiles ``first`` to ``last`` (exclusive), given those by the image and by its alpha.
 
     ``v_slots``, ``(slots, 9)``, 0 before, receives the sums over the tile's pixels of the gradient by the exponent
-    times 1, u, v, u², uv, v², and of the gradient by the colour's R, G, B. ``changed`` becomes True for footprints with
-    any.
+    times 1, u, v, u², uv, v², and of the gradient by the colour's R, G, B.
     """
     records, lists, blended = frame.footprints.records, frame.lists, frame.blended
     limits = blended.limits[0], blended.limits[1]
-    # Per pixel: x, y, stop, T; gradient by R, G, B and alpha; product of the colour behind and its gradient.
-    s = np.empty(9 * 256, np.float32)
+    # Per pixel: x, y, stop, T; gradient by R, G, B; product of the colour behind and its gradient, less that by alpha.
+    s = np.empty(8 * 256, np.float32)
     # Slots lie anywhere in memory, as records do.
     copies, sums = np.empty((64, 9), np.float32), np.empty((64, 9), np.float32)
     _pixel_centres(s)
@@ -316,10 +332,23 @@ def blend_backward(
                 footprint = _footprint(copies, i - start, x0, y0)
                 _backward(s, lists.spans[i], np.float32(i - begin), footprint, limits, sums[i - start])
             for i in range(start, end):
+                slot = slots.of[i - slots.begin]
                 for c in range(9):
-                    v_slots[slots.of[i - slots.begin], c] = sums[i - start, c]
-                    if sums[i - start, c] != 0:
-                        changed[lists.members[i]] = True
+                    v_slots[slot, c] = sums[i - start, c]
+
+
+@compiled(int64(SLOTS, float32[:, ::1], int32[::1]))
+def rows_with_gradients(slots: Slots, v_slots: np.ndarray, rows: np.ndarray) -> int:
+    """Write the rows of footprints with any sum of :func:`blend_backward` but 0 to ``rows``; return their number."""
+    found = 0
+    for row in slots.rows:
+        rows[found] = row
+        some = False
+        for slot in range(slots.first[row], slots.first[row + 1]):
+            for c in range(9):
+                some |= v_slots[slot, c] != 0
+        found += some
+    return found
 
 
 @compiled(void(FRAME, SLOTS, int64, int64, float32[:, :, ::1], float32[:, ::1]), fastmath=_FAST)
@@ -343,17 +372,18 @@ def blend_colors_backward(
             _copy_records(records, lists.members, start, end, copies)
             for i in range(start, end):
                 place, (opacity, _, _, _) = _footprint(copies, i - start, x0, y0)
-                top, bottom = _rows(lists.spans[i])
                 index, slot = np.float32(i - begin), slots.of[i - slots.begin]
                 red, green, blue = zero, zero, zero
-                for p in range(top, bottom):
-                    drawn = index < s[p + np.uint64(512)]
-                    _, _, _, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
-                    weight = alpha * s[p + np.uint64(768)]
-                    s[p + np.uint64(768)] -= weight
-                    red += weight * s[p + np.uint64(1024)]
-                    green += weight * s[p + np.uint64(1280)]
-                    blue += weight * s[p + np.uint64(1536)]
+                for half in range(2):
+                    top, bottom = _rows(lists.spans[i], half)
+                    for p in range(top, bottom):
+                        drawn = index < s[p + np.uint64(512)]
+                        _, _, _, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
+                        weight = alpha * s[p + np.uint64(768)]
+                        s[p + np.uint64(768)] -= weight
+                        red += weight * s[p + np.uint64(1024)]
+                        green += weight * s[p + np.uint64(1280)]
+                        blue += weight * s[p + np.uint64(1536)]
                 v_slots[slot, 0], v_slots[slot, 1], v_slots[slot, 2] = red, green, blue
 
 
@@ -374,7 +404,8 @@ def _begin_moments(records: np.ndarray, lists: TileLists, tile: int, frame: Blen
     height, width = frame.transmittance.shape
     background, begin, max_color = frame.background, lists.starts[tile], np.float32(2)
     for p in range(256):
-        s[768 + p] = frame.transmittance[min(y0 + (p >> 4), height - 1), min(x0 + (p & 15), width - 1)]
+        x, y = _pixel(p)
+        s[768 + p] = frame.transmittance[min(y0 + y, height - 1), min(x0 + x, width - 1)]
         s[1024 + p], s[1280 + p], s[1536 + p], s[1792 + p] = background[0], background[1], background[2], 1
         if begin + frame.stops[tile, p] < lists.starts[tile + 1]:
             n = lists.members[begin + frame.stops[tile, p]]
@@ -387,7 +418,7 @@ def _begin_moments(records: np.ndarray, lists: TileLists, tile: int, frame: Blen
 @njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 def _moments(
     s: np.ndarray,
-    span: np.uint16,
+    span: np.uint32,
     index: np.float32,
     footprint: tuple[Place, tuple[np.float32, ...]],
     limits: tuple[np.float32, np.float32],
@@ -399,37 +430,38 @@ def _moments(
     zero, one = np.float32(0), np.float32(1)
     max_color = np.float32(2)  # a display shows at most 1; brighter colours are limited to twice that
     red, green, blue = min(red, max_color), min(green, max_color), min(blue, max_color)
-    top, bottom = _rows(span)
     m0, m20, m11, m02, m40, m31, m22, m13, m04 = zero, zero, zero, zero, zero, zero, zero, zero, zero
     squared_weight = zero
-    for p in range(top, bottom):
-        drawn = index < s[p + np.uint64(512)]
-        u, v, full, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
-        t = s[p + np.uint64(768)] / (one - alpha)
-        s[p + np.uint64(768)] = t
-        dr = alpha * (red - s[p + np.uint64(1024)])
-        dg = alpha * (green - s[p + np.uint64(1280)])
-        db = alpha * (blue - s[p + np.uint64(1536)])
-        s[p + np.uint64(1024)] += dr
-        s[p + np.uint64(1280)] += dg
-        s[p + np.uint64(1536)] += db
-        weight = alpha * t
-        squared_weight += weight * weight
-        background_change = alpha * s[p + np.uint64(1792)]
-        s[p + np.uint64(1792)] -= background_change
-        g = t * t * (dr * dr + dg * dg + db * db + variance * (background_change * background_change))
-        m0 += g
-        g = g if full <= limits[1] else zero
-        uu, uv, vv = u * u, u * v, v * v
-        guu, gvv = g * uu, g * vv
-        m20 += guu
-        m11 += g * uv
-        m02 += gvv
-        m40 += guu * uu
-        m31 += guu * uv
-        m22 += guu * vv
-        m13 += gvv * uv
-        m04 += gvv * vv
+    for half in range(2):
+        top, bottom = _rows(span, half)
+        for p in range(top, bottom):
+            drawn = index < s[p + np.uint64(512)]
+            u, v, full, alpha = _alpha(s[p], s[p + np.uint64(256)], drawn, place, opacity, limits)
+            t = s[p + np.uint64(768)] / (one - alpha)
+            s[p + np.uint64(768)] = t
+            dr = alpha * (red - s[p + np.uint64(1024)])
+            dg = alpha * (green - s[p + np.uint64(1280)])
+            db = alpha * (blue - s[p + np.uint64(1536)])
+            s[p + np.uint64(1024)] += dr
+            s[p + np.uint64(1280)] += dg
+            s[p + np.uint64(1536)] += db
+            weight = alpha * t
+            squared_weight += weight * weight
+            background_change = alpha * s[p + np.uint64(1792)]
+            s[p + np.uint64(1792)] -= background_change
+            g = t * t * (dr * dr + dg * dg + db * db + variance * (background_change * background_change))
+            m0 += g
+            g = g if full <= limits[1] else zero
+            uu, uv, vv = u * u, u * v, v * v
+            guu, gvv = g * uu, g * vv
+            m20 += guu
+            m11 += g * uv
+            m02 += gvv
+            m40 += guu * uu
+            m31 += guu * uv
+            m22 += guu * vv
+            m13 += gvv * uv
+            m04 += gvv * vv
     sums[0], sums[1], sums[2], sums[3] = m0, m20, m11, m02
     sums[4], sums[5], sums[6], sums[7], sums[8] = m40, m31, m22, m13, m04
     sums[9] = squared_weight

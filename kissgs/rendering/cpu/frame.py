@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float32, Float64, Int32, Shaped
+from kissgs.core.array_types import Float32, Float64, Int32, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
@@ -177,9 +177,10 @@ def differentiate(
 
     Only Gaussians that contribute to the image have any: of many Gaussians, most lie outside it, or behind others.
     """
-    v_slots, slots, any_gradient = differentiate_footprints(frame, v_image, v_alpha, pool)
-    changed = slots.rows[any_gradient[slots.rows]]
-    count = len(changed)
+    slots = number_slots(frame.lists, len(frame.footprints.records))
+    v_slots, changed = np.zeros((len(slots.of), 9), np.float32), np.empty_like(slots.rows)
+    _each_tile(blending.blend_backward, frame, slots, pool, v_image, v_alpha, v_slots)
+    count = blending.rows_with_gradients(slots, v_slots, changed)
     gradients = Gaussians(*(np.empty((count, *array.shape[1:]), np.float32) for array in frame.gaussians))
     indices, v_colors = np.empty(count, np.int32), np.empty((count, 3), np.float64)
 
@@ -191,22 +192,19 @@ def differentiate(
     return Gradients(indices, *gradients)
 
 
-def differentiate_footprints(
-    frame: Frame, v_image: Float32[np.ndarray, "H W 3"], v_alpha: Float32[np.ndarray, "H W"], pool: Workers
-) -> tuple[Float32[np.ndarray, "slots 9"], Slots, Bool[np.ndarray, " N"]]:
-    """Return what :func:`blending.blend_backward` finds: sums by slot, the slots, and which rows have any gradient."""
-    count = len(frame.footprints.records)
-    slots, changed = number_slots(frame.lists, count), np.zeros(count, bool)
-    v_slots = np.zeros((len(frame.lists.members), 9), np.float32)
-    _each_tile(blending.blend_backward, frame, slots, pool, v_image, v_alpha, v_slots, changed)
-    return v_slots, slots, changed
+def color_gradients(
+    frame: Frame, v_image: Float32[np.ndarray, "H W 3"], pool: Workers
+) -> tuple[Float32[np.ndarray, "slots 3"], Slots]:
+    """Return the gradients of a loss by the colours, given that by the image: sums by slot, and the slots."""
+    slots = number_slots(frame.lists, len(frame.footprints.records))
+    v_slots = np.zeros((len(slots.of), 3), np.float32)
+    _each_tile(blending.blend_colors_backward, frame, slots, pool, v_image, v_slots)
+    return v_slots, slots
 
 
 def add_color_gradients(
     frame: Frame, v_image: Float32[np.ndarray, "H W 3"], into: Float32[np.ndarray, "N 3"], pool: Workers
 ) -> None:
     """Add the gradients of a loss by ``sh0`` alone, given its gradient by the image, ``v_image``, to ``into``."""
-    slots = number_slots(frame.lists, len(frame.footprints.records))
-    v_slots = np.zeros((len(frame.lists.members), 3), np.float32)
-    _each_tile(blending.blend_colors_backward, frame, slots, pool, v_image, v_slots)
+    v_slots, slots = color_gradients(frame, v_image, pool)
     _each_footprint(add_colors, frame, slots, pool, v_slots, into)

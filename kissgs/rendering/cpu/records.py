@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import boolean, float32, float64, int32, int64, types, uint16
+from numba import boolean, float32, float64, int32, int64, types, uint32
 
-from kissgs.core.array_types import Float32, Float64, Int32, Int64, UInt16
+from kissgs.core.array_types import Float32, Float64, Int32, Int64, UInt32
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
@@ -83,8 +83,9 @@ class TileLists(NamedTuple):
     """Index of the first member of each tile."""
     members: Int32[np.ndarray, " P"]
     """Rows of the footprints, tile after tile, front to back."""
-    spans: UInt16[np.ndarray, " P"]
-    """Rows of pixels that each member touches in the tile, as ``32 * first + last``, last exclusive."""
+    spans: UInt32[np.ndarray, " P"]
+    """Rows of pixels that each member touches in the tile, as ``32 * first + last``, last exclusive: those in its left
+    half in the lower 16 bits, those in its right half in the upper ones."""
 
 
 class Blended(NamedTuple):
@@ -95,7 +96,7 @@ class Blended(NamedTuple):
     transmittance: Float32[np.ndarray, "H W"]
     """Share of the background that is visible, 1 - alpha."""
     stops: Int32[np.ndarray, "tiles 256"]
-    """Index of the first member of the tile that is not drawn at the pixel."""
+    """Index of the first member of the tile that is not drawn at the pixel; left half first, row after row."""
     background: Float32[np.ndarray, "3"]
     limits: Float32[np.ndarray, "3"]
     """ALPHA_MIN, ALPHA_MAX, and the transmittance at which the list of a pixel ends."""
@@ -151,7 +152,7 @@ PROJECTION = named_tuple(
     (float64[:, ::1], float64[:, ::1], float64[::1], int64, int64, *[float64] * 5, boolean), Projection
 )
 FOOTPRINTS = named_tuple((int32[::1], float32[::1], float32[:, ::1]), Footprints)
-TILE_LISTS = named_tuple((int64, int64[::1], int32[::1], uint16[::1]), TileLists)
+TILE_LISTS = named_tuple((int64, int64[::1], int32[::1], uint32[::1]), TileLists)
 BLENDED = named_tuple((float32[:, :, ::1], float32[:, ::1], int32[:, ::1], float32[::1], float32[::1]), Blended)
 FRAME = named_tuple((GAUSSIANS, PROJECTION, FOOTPRINTS, int64[:, ::1], TILE_LISTS, BLENDED), Frame)
 SLOTS = named_tuple((int64, int32[::1], int32[::1], int32[::1]), Slots)

@@ -125,8 +125,8 @@ def _disc(records: np.ndarray, n: int) -> tuple[float, float, float, float, floa
 
 
 @njit(nogil=True, error_model="numpy")
-def _columns(records: np.ndarray, n: int, row: int, columns: int) -> tuple[int, int]:
-    """Return the first and last (exclusive) tile that footprint ``n`` touches in a row of tiles.
+def _halves(records: np.ndarray, n: int, row: int, halves: int) -> tuple[int, int]:
+    """Return the first and last (exclusive) half of a tile that footprint ``n`` touches in a row of tiles.
 
     The footprint is the disc u² + v² <= tau. In a row of tiles, v is in an interval; x = (u - k v) / l0 is largest at
     v = -k √tau / √(1 + k²) or at the interval's nearer end.
@@ -143,38 +143,38 @@ def _columns(records: np.ndarray, n: int, row: int, columns: int) -> tuple[int, 
     right = centre_x + (np.sqrt(max(tau - v * v, 0.0)) - k * v) / l0
     v = min(max(extreme, low), high)
     left = centre_x - (np.sqrt(max(tau - v * v, 0.0)) + k * v) / l0
-    return _clamp(np.ceil((left - 15.51) / 16), columns), _clamp(np.floor((right - 0.49) / 16) + 1, columns)
+    return _clamp(np.ceil((left - 7.51) / 8), halves), _clamp(np.floor((right - 0.49) / 8) + 1, halves)
 
 
 @njit(nogil=True, error_model="numpy")
-def _box(records: np.ndarray, n: int, columns: int, rows: int) -> tuple[int, int, int, int]:
-    """Return the first and last (exclusive) column and row of tiles that footprint ``n`` touches."""
+def _box(records: np.ndarray, n: int, halves: int, rows: int) -> tuple[int, int, int, int]:
+    """Return the first and last (exclusive) half of a tile, and row of tiles, that footprint ``n`` touches."""
     x, y, l0, l1, l2, tau = _disc(records, n)
     width = np.sqrt(tau * (l1 * l1 + l2 * l2)) / (l0 * l2)
     height = np.float64(records[n, 10]) * 1.0001 + 0.01
     return (
-        _clamp(np.ceil((x - width - 15.51) / 16), columns),
-        _clamp(np.floor((x + width - 0.49) / 16) + 1, columns),
+        _clamp(np.ceil((x - width - 7.51) / 8), halves),
+        _clamp(np.floor((x + width - 0.49) / 8) + 1, halves),
         _clamp(np.ceil((y - height - 15.5) / 16), rows),
         _clamp(np.floor((y + height - 0.5) / 16) + 1, rows),
     )
 
 
 @njit(nogil=True, error_model="numpy")
-def _span(records: np.ndarray, n: int, column: int, row: int) -> int:
-    """Return the first and last (exclusive) row of pixels that a footprint touches in a tile, as ``32 * first + last``.
+def _span(records: np.ndarray, n: int, half: int, row: int) -> int:
+    """Return the rows of pixels that a footprint touches in half of a tile, as ``32 * first + last``, last exclusive.
 
-    Within the tile's columns, the footprint is highest at its own highest point or at the nearer side of the tile.
+    Within the half's columns, the footprint is highest at its own highest point or at the nearer side of the half.
     """
     centre_x, centre_y, l0, l1, l2, tau = _disc(records, n)
-    x, y = 16 * column - centre_x, 16 * row - centre_y
+    x, y = 8 * half - centre_x, 16 * row - centre_y
     reach = np.sqrt(tau) / l2
     top_offset = l1 * reach / l0
     a = l1 * l1 + l2 * l2
-    dx = min(max(-top_offset, x + 0.5), x + 15.5)
+    dx = min(max(-top_offset, x + 0.5), x + 7.5)
     b = l0 * l1 * dx
     low = (np.sqrt(max(b * b - a * (l0 * l0 * dx * dx - tau), 0.0)) - b) / a
-    dx = min(max(top_offset, x + 0.5), x + 15.5)
+    dx = min(max(top_offset, x + 0.5), x + 7.5)
     b = l0 * l1 * dx
     high = (np.sqrt(max(b * b - a * (l0 * l0 * dx * dx - tau), 0.0)) + b) / a
     return 32 * _clamp(np.ceil(-high - y - 0.51), 16) + _clamp(np.floor(low - y - 0.49) + 1, 16)
@@ -182,7 +182,7 @@ def _span(records: np.ndarray, n: int, column: int, row: int) -> int:
 
 @njit(nogil=True, error_model="numpy")
 def _whole_span(records: np.ndarray, n: int, row: int) -> int:
-    """Return the span of a footprint that lies within one column of tiles, see :func:`_span`."""
+    """Return the span of a footprint that lies within one column of halves, see :func:`_span`."""
     y = 16 * row - np.float64(records[n, 1])
     reach = np.float64(records[n, 10]) * 1.0001 + 0.01
     return 32 * _clamp(np.ceil(-reach - y - 0.51), 16) + _clamp(np.floor(reach - y - 0.49) + 1, 16)
@@ -193,12 +193,12 @@ def count_tiles(records: np.ndarray, first: int, last: int, per_tile: np.ndarray
     """Add the number of footprints ``first`` to ``last`` (exclusive) that touch each tile to ``per_tile``."""
     rows, columns = per_tile.shape
     for n in range(first, last):
-        left, right, top, bottom = _box(records, n, columns, rows)
+        left, right, top, bottom = _box(records, n, 2 * columns, rows)
         several = right - left > 1 and bottom - top > 1
         for row in range(top, bottom):
             if several:
-                left, right = _columns(records, n, row, columns)
-            for column in range(left, right):
+                left, right = _halves(records, n, row, 2 * columns)
+            for column in range(left // 2, (right + 1) // 2):
                 per_tile[row, column] += 1
 
 
@@ -213,17 +213,19 @@ def fill_tiles(
     records, depths = footprints.records, footprints.depths.view(np.uint32)
     rows, columns = ends.shape
     for n in range(first, last):
-        left, right, top, bottom = _box(records, n, columns, rows)
-        several = right - left > 1 and bottom - top > 1
-        one_column = right - left == 1
+        left, right, top, bottom = _box(records, n, 2 * columns, rows)
+        several, one_half = right - left > 1 and bottom - top > 1, right - left == 1
         for row in range(top, bottom):
             if several:
-                left, right = _columns(records, n, row, columns)
-            for column in range(left, right):
+                left, right = _halves(records, n, row, 2 * columns)
+            for column in range(left // 2, (right + 1) // 2):
                 end = ends[row, column]
                 keys[end] = depths[n]
                 lists.members[end] = n
-                lists.spans[end] = _whole_span(records, n, row) if one_column else _span(records, n, column, row)
+                lists.spans[end] = 0
+                for half in range(max(left, 2 * column), min(right, 2 * column + 2)):
+                    span = _whole_span(records, n, row) if one_half else _span(records, n, half, row)
+                    lists.spans[end] |= np.uint32(span << (half % 2 * 16))
                 ends[row, column] = end + 1
 
 
@@ -264,7 +266,7 @@ def sort_into_tiles(footprints: Footprints, parts: list[Part], projection: Proje
     np.cumsum(per_part.sum(axis=0), out=starts[1:])
     _check_lists(starts)
     total = int(starts[-1])
-    lists = TileLists(columns, starts, np.empty(total, np.int32), np.empty(total, np.uint16))
+    lists = TileLists(columns, starts, np.empty(total, np.int32), np.empty(total, np.uint32))
     keys = np.empty(total, np.uint32)
     ends = starts[:-1].reshape(rows, columns) + np.cumsum(per_part, axis=0) - per_part
     pool.map(lambda n: fill_tiles(footprints, *parts[n], lists, ends[n], keys), range(len(parts)))
