@@ -64,7 +64,7 @@ AS_USERS_HAVE_IT = (
 
 
 @pytest.fixture(autouse=True)
-def fewer_and_smaller_images(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def fewer_and_smaller_images(request, monkeypatch):
     """Choose virtual cameras from fewer, and evaluate smaller images: they take most of the time for a small scene."""
     folder = request.path.parent.name
     thorough = request.node.get_closest_marker("exhaustive") or request.path.stem in AS_USERS_HAVE_IT
@@ -77,7 +77,7 @@ def fewer_and_smaller_images(request: pytest.FixtureRequest, monkeypatch: pytest
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
+def shared_data():
     """Return the folder of real scenes beside this repository, which their licences keep out of it."""
     folder = Path(__file__).parents[2] / "shared" / "data"
     if not folder.is_dir():
@@ -86,24 +86,21 @@ def shared_data() -> Path:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int:
+def pytest_xdist_auto_num_workers():
     """Return one worker more than there are processors, because a quarter of the time of tests is waiting."""
     from kissgs.core.resources import processors  # after the hook
 
     return processors() + 1
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
+def pytest_addoption(parser):
     """Add the option of continuous integration."""
     parser.addoption("--sixth", metavar="COMMIT", help="run a sixth of the exhaustive tests, chosen by the commit")
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark as exhaustive what ``make test`` leaves out, and with ``--sixth`` leave five of six of those out.
-
-    It leaves out all but n parameter sets of a test with ``@pytest.mark.quick(n)``.
-    """
+def pytest_collection_modifyitems(config, items):
+    """Mark as exhaustive all but n sets of parameters of ``quick(n)``; with ``--sixth``, leave out five of six."""
     sets = defaultdict[str, list[pytest.Item]](list)
     for item in items:
         if item.get_closest_marker("quick"):

@@ -1,7 +1,5 @@
 """The documentation is true; reference: the code, the files and the headings that it names."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import re
@@ -24,21 +22,21 @@ GENERATED = runpy.run_path(str(ROOT / "docs" / "generate.py"))["PAGES"]
 FOLDERS = ("kissgs/", "service/", "bench/", "web_decoder/", "tests/", "docs/", "scripts/", "docker/", ".ci/")
 
 
-def pages() -> list[Path]:
+def pages():
     """Every Markdown file that git tracks, or all outside of hidden and installed folders where there is no git."""
     listed = subprocess.run(["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=False)
     names = listed.stdout.split() or [str(path.relative_to(ROOT)) for path in ROOT.glob("docs/**/*.md")] + ["README.md"]
     return [ROOT / name for name in names if (ROOT / name).is_file()]
 
 
-def prose(page: Path) -> str:
+def prose(page):
     """The text of a page without its code blocks."""
     return re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
 
 
-def anchors(page: Path) -> set[str]:
+def anchors(page):
     """The anchors of a page's headings, as GitHub makes them."""
-    found: set[str] = set()
+    found = set()
     for heading in re.findall(r"^#{1,6} (.+)$", prose(page), re.MULTILINE):
         text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower()
         anchor = re.sub(r"[^\w\- ]", "", text).strip().replace(" ", "-")
@@ -49,16 +47,16 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("name", GENERATED)
-def test_generated_pages_are_up_to_date(name: str) -> None:
+def test_generated_pages_are_up_to_date(name):
     assert (ROOT / "docs" / "reference" / name).read_text(encoding="utf-8") == GENERATED[name](), "run: make docs"
 
 
-def test_the_format_page_names_every_file() -> None:
+def test_the_format_page_names_every_file():
     page = (ROOT / "docs" / "reference" / "format.md").read_text(encoding="utf-8")
     assert [name for name in FILES if name not in page] == []
 
 
-def test_the_readme_is_short_and_starts_with_a_command() -> None:
+def test_the_readme_is_short_and_starts_with_a_command():
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 90
     assert "make demo" in "".join(lines[:10])
@@ -66,12 +64,12 @@ def test_the_readme_is_short_and_starts_with_a_command() -> None:
     assert [preset for preset in Preset if f"| `{preset}` |" not in table] == []
 
 
-def test_commands_of_the_readme_can_be_repeated() -> None:
+def test_commands_of_the_readme_can_be_repeated():
     """Whatever writes a file overwrites it, and every file that is read was written before."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```sh\n(.*?)^```$", readme, re.MULTILINE | re.DOTALL)
     commands = [line.partition("#")[0].split() for block in blocks for line in block.splitlines()]
-    written: set[str] = set()
+    written = set()
     writing = {"sample", "compress", "decompress", "render"}
     for command in commands:
         if command[:1] != ["kissgs"]:
@@ -84,7 +82,7 @@ def test_commands_of_the_readme_can_be_repeated() -> None:
     assert written
 
 
-def documented_measurements() -> list[list[str]]:
+def documented_measurements():
     """The words of every ``kissgs bench`` and ``python bench/…`` command, in code blocks and in running text."""
     found = []
     for page in pages():
@@ -95,13 +93,13 @@ def documented_measurements() -> list[list[str]]:
     return found
 
 
-def test_documented_measurements_are_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_documented_measurements_are_accepted(monkeypatch):
     """Every study is documented."""
 
     class Parsed(Exception):
         pass
 
-    def parse(parser: argparse.ArgumentParser) -> None:
+    def parse(parser):
         parse_known(parser, sys.argv[1:])
         raise Parsed
 
@@ -122,7 +120,7 @@ def test_documented_measurements_are_accepted(monkeypatch: pytest.MonkeyPatch) -
     assert studies == {path.stem for path in ROOT.glob("bench/*.py")} - shared
 
 
-def test_links_and_anchors_lead_somewhere() -> None:
+def test_links_and_anchors_lead_somewhere():
     checked = 0
     for page in pages():
         for target, _, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)(#([^)\s]*))?\)", prose(page)):
@@ -134,14 +132,14 @@ def test_links_and_anchors_lead_somewhere() -> None:
     assert checked > 50
 
 
-def test_files_that_pages_name_exist() -> None:
+def test_files_that_pages_name_exist():
     for page in pages():
         named = re.findall(r"`([\w./-]+/[\w./-]*)`", prose(page))
         missing = [name for name in named if name.startswith(FOLDERS) and not (ROOT / name).exists()]
         assert [name for name in missing if name != "web_decoder/vendor"] == [], page.relative_to(ROOT)
 
 
-def test_no_page_is_left_unfinished() -> None:
+def test_no_page_is_left_unfinished():
     for page in pages():
         unfinished = re.findall(
             r"^[A-Z_]{6,}$|TODO|FIXME|[A-Z]{4,}SSIM", page.read_text(encoding="utf-8"), re.MULTILINE
@@ -149,7 +147,7 @@ def test_no_page_is_left_unfinished() -> None:
         assert not unfinished, f"{page.name}: {unfinished}"
 
 
-def test_presets_of_the_service_have_the_figures_of_the_benchmarks() -> None:
+def test_presets_of_the_service_have_the_figures_of_the_benchmarks():
     """Without cameras, as the service compresses: bytes per Gaussian and the change of PSNR to photographs."""
     text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8").partition("### Without the capture")[2]
     text = text.partition("\n#")[0]

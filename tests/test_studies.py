@@ -1,7 +1,5 @@
 """Studies of ``bench/``; reference: curves given as formulas, a converter with known errors, bytes counted by hand."""
 
-from __future__ import annotations
-
 import csv
 import importlib
 import math
@@ -37,12 +35,12 @@ shutil.copy(*sys.argv[-2:])
 
 
 @pytest.mark.parametrize("name", STUDIES)
-def test_a_study_has_what_it_imports(name: str) -> None:
+def test_a_study_has_what_it_imports(name):
     importlib.import_module(f"bench.{name}")
 
 
 @pytest.mark.parametrize("growth", [1.05, 1.3])
-def test_bytes_are_interpolated_exponentially_and_not_extrapolated(growth: float) -> None:
+def test_bytes_are_interpolated_exponentially_and_not_extrapolated(growth):
     curve = [(q, 1e6 * growth**q) for q in (41.0, 30.0, 35.5)]
     for quality in (30.0, 33.3, 35.5, 41.0):
         assert bytes_at([*curve, (math.inf, 5.0), (math.nan, 5.0)], quality) == pytest.approx(1e6 * growth**quality)
@@ -50,7 +48,7 @@ def test_bytes_are_interpolated_exponentially_and_not_extrapolated(growth: float
     assert bytes_at([], 30.0) is None
 
 
-def test_the_saving_is_the_mean_difference_where_both_curves_are() -> None:
+def test_the_saving_is_the_mean_difference_where_both_curves_are():
     curve = [(q, 1e6 * 1.1**q) for q in (30.0, 34.0, 41.0)]
     other = [(q, 0.8e6 * 1.1**q) for q in (33.0, 38.0, 50.0)]
     assert saving(curve, other) == pytest.approx(0.2)
@@ -58,13 +56,13 @@ def test_the_saving_is_the_mean_difference_where_both_curves_are() -> None:
     assert saving(curve, [(50.0, 1.0), (60.0, 2.0)]) is None
 
 
-def test_a_quality_offset_replaces_every_goal() -> None:
+def test_a_quality_offset_replaces_every_goal():
     other = at_quality_offset(kissgs.Settings.from_preset("small", psnr=40.0), -3.5)
     assert (other.encode.quality_offset_db, other.encode.psnr, other.preset) == (-3.5, None, "small")
 
 
 @pytest.mark.quick(0)
-def test_an_external_codec_is_measured_without_this_process(tmp_path: Path) -> None:
+def test_an_external_codec_is_measured_without_this_process(tmp_path):
     """The tool holds 128 MB; this process holds 1 GB, which Linux would count as that of the process it starts."""
     scene, tool, held = tmp_path / "scene.ply", tmp_path / "tool.py", b"x" * 2**30
     kissgs.save(kissgs.sample_scene(100, sh_degree=0), scene)
@@ -82,7 +80,7 @@ def test_an_external_codec_is_measured_without_this_process(tmp_path: Path) -> N
 @pytest.mark.quick(0)
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
 @pytest.mark.skipif(not all((DECODER / each).exists() for each in (SPARK, PLAYCANVAS)), reason="scripts/setup dev")
-def test_viewers_are_compared_with_their_own_drawing_of_the_scene(tmp_path: Path) -> None:
+def test_viewers_are_compared_with_their_own_drawing_of_the_scene(tmp_path):
     """A copy of the scene is drawn exactly alike; one whose colours are all halved has a known error everywhere."""
     scene = kissgs.sample_scene(300, sh_degree=0)
     white = replace(scene, sh0=np.full_like(scene.sh0, 0.5 / SH_C0))
@@ -105,7 +103,7 @@ def test_viewers_are_compared_with_their_own_drawing_of_the_scene(tmp_path: Path
         assert sheet.size == (5 * 32, 2 * 3 * 24)
 
 
-def test_parts_of_the_paper_that_only_save_bytes_change_nothing_else() -> None:
+def test_parts_of_the_paper_that_only_save_bytes_change_nothing_else():
     scene, settings = kissgs.sample_scene(200, sh_degree=1), kissgs.Settings.from_preset("paper").encode
     whole = paper_parts.encode_parts(scene, settings, 1)
     assert whole.size(settings, 1) == len(zip_bytes(encode(scene, settings, Context(1)).files))
@@ -119,7 +117,7 @@ def test_parts_of_the_paper_that_only_save_bytes_change_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 70, 200, 450])
-def test_a_resampled_scene_has_the_count_and_covers_as_much(count: int) -> None:
+def test_a_resampled_scene_has_the_count_and_covers_as_much(count):
     scene = kissgs.sample_scene(200, sh_degree=0)
     scene = replace(scene, scales=np.full_like(scene.scales, -3))
     areas = [np.exp(2 * each.scales[:, 0].astype(float)).sum() for each in (scene, resampled(scene, count))]

@@ -1,7 +1,5 @@
 """Scenes, a container and a capture for the commands, which no test changes."""
 
-from pathlib import Path
-
 import pytest
 from helpers.captured_scene import SCENE, damaged, write_capture
 
@@ -11,14 +9,14 @@ FAST = kissgs.Settings.from_preset("fast")
 
 
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene(tmp_path_factory):
     path = tmp_path_factory.mktemp("scene") / "scene.ply"
     kissgs.save(kissgs.sample_scene(600, sh_degree=1), path)
     return path
 
 
 @pytest.fixture(scope="session")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Folder with a.ply, its container b.zip, a damaged c.ply, and a capture."""
     folder = tmp_path_factory.mktemp("captured")
     kissgs.save(SCENE, folder / "a.ply")

@@ -1,7 +1,5 @@
 """The command line as a user runs it. Oracle: the library's own functions, and the promises of the README."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -17,7 +15,7 @@ from helpers.command_line import KISSGS, failure, run
 import kissgs
 
 
-def test_compress_and_decompress(scene: Path, tmp_path: Path) -> None:
+def test_compress_and_decompress(scene, tmp_path):
     """Regression: square brackets in names were parsed as rich markup."""
     done = run("compress", scene, "-o", tmp_path / "[red]a.zip")
     assert done.returncode == 0
@@ -34,7 +32,7 @@ def test_compress_and_decompress(scene: Path, tmp_path: Path) -> None:
     assert len(kissgs.load(tmp_path / "s.ply")) == 500
 
 
-def test_default_outputs_are_next_to_the_input(scene: Path, tmp_path: Path) -> None:
+def test_default_outputs_are_next_to_the_input(scene, tmp_path):
     here = tmp_path / "mine.ply"
     here.write_bytes(scene.read_bytes())
     assert run("compress", "mine.ply", "-p", "fast", cwd=tmp_path).returncode == 0
@@ -43,7 +41,7 @@ def test_default_outputs_are_next_to_the_input(scene: Path, tmp_path: Path) -> N
     assert run("decompress", "mine.zip", "--force", cwd=tmp_path).returncode == 0
 
 
-def test_several_files_and_patterns(scene: Path, tmp_path: Path) -> None:
+def test_several_files_and_patterns(scene, tmp_path):
     """One bad file does not stop the others."""
     for name in ("a.ply", "c.ply"):
         (tmp_path / name).write_bytes(scene.read_bytes())
@@ -56,7 +54,7 @@ def test_several_files_and_patterns(scene: Path, tmp_path: Path) -> None:
     assert all(Path(report["output"]).stat().st_size == report["container_bytes"] for report in (first, third))
 
 
-def test_info_of_both_kinds(scene: Path, tmp_path: Path) -> None:
+def test_info_of_both_kinds(scene, tmp_path):
     container = tmp_path / "a.zip"
     run("compress", scene, "-o", container, "-q", "-p", "fast")
     ply, zipped = json.loads(run("info", scene, container, "--json").stdout)
@@ -70,7 +68,7 @@ def test_info_of_both_kinds(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.quick(0)
-def test_goals_and_cached_sensitivity(scene: Path, tmp_path: Path) -> None:
+def test_goals_and_cached_sensitivity(scene, tmp_path):
     few_views = "--set", "sensitivity_views=4", "--set", "sensitivity_view_size=48"
     copy = tmp_path / "scene.ply"
     copy.write_bytes(scene.read_bytes())
@@ -88,7 +86,7 @@ def test_goals_and_cached_sensitivity(scene: Path, tmp_path: Path) -> None:
     )  # from other cameras than those of the search
 
 
-def test_settings_from_the_command_line(scene: Path, tmp_path: Path) -> None:
+def test_settings_from_the_command_line(scene, tmp_path):
     words = "-p", "fast", "--set", "sh_neighbors=16", "--seed", "3"
     report = json.loads(run("compress", scene, "-o", tmp_path / "a.zip", "--json", *words).stdout)
     assert (report["source_count"], report["container_bytes"]) == (600, (tmp_path / "a.zip").stat().st_size)
@@ -135,7 +133,7 @@ REFUSED = {
 }
 
 
-def test_errors_are_one_line_and_make_nothing(scene: Path, tmp_path: Path) -> None:
+def test_errors_are_one_line_and_make_nothing(scene, tmp_path):
     (tmp_path / "scene.ply").write_bytes(scene.read_bytes())
     (tmp_path / "text.ply").write_text("hello")
     (tmp_path / "bad.zip").write_bytes(b"PK\x03\x04 but no more")
@@ -154,7 +152,7 @@ def test_errors_are_one_line_and_make_nothing(scene: Path, tmp_path: Path) -> No
         ("compact --help > /dev/full", "cannot write to standard output: no space left on device"),
     ],
 )
-def test_standard_files_that_fail(scene: Path, words: str, said: str) -> None:
+def test_standard_files_that_fail(scene, words, said):
     for environment in (None, {}) if "help" in words else (None,):  # the help's output depends on the terminal's
         done = subprocess.run(
             f"{KISSGS} {words}",
@@ -168,7 +166,7 @@ def test_standard_files_that_fail(scene: Path, words: str, said: str) -> None:
         assert (done.returncode, done.stderr) == (2, f"kissgs: {said}\n")
 
 
-def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
+def test_no_folder_gets_the_name_of_a_file(scene, tmp_path):
     """Regression: compress -o a.spz made a folder a.spz, and wrote a SOG-XT container into it."""
     for name in ("a.spz", "a.Yaml", "x.usdz", "full.ziip", ".zip", "a.zip.", "v1.2", "new", "new/room"):
         assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
@@ -191,7 +189,7 @@ def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     assert len(kissgs.load(tmp_path / "c.sog" / "scene.container")) > 0
 
 
-def test_names_of_folders(scene: Path, tmp_path: Path) -> None:
+def test_names_of_folders(scene, tmp_path):
     """A slash, or a folder that exists."""
     names = ["x.usdz/", "new/", "a/v1.2/", "made.d"]
     (tmp_path / "made.d").mkdir()
@@ -200,7 +198,7 @@ def test_names_of_folders(scene: Path, tmp_path: Path) -> None:
     assert {path.parent for path in tmp_path.rglob("*.ply")} == {tmp_path / name for name in names}
 
 
-def test_a_folder_that_is_no_container_is_named_with_what_to_give(scene: Path, tmp_path: Path) -> None:
+def test_a_folder_that_is_no_container_is_named_with_what_to_give(scene, tmp_path):
     trained = "point_cloud/iteration_7000/point_cloud.ply"
     for path in (tmp_path / "trained" / trained, tmp_path / "adir" / "scene.ply", tmp_path / "notes" / "a.txt"):
         path.parent.mkdir(parents=True)
@@ -212,7 +210,7 @@ def test_a_folder_that_is_no_container_is_named_with_what_to_give(scene: Path, t
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
-def test_standard_output_escapes_what_its_encoding_lacks(scene: Path, tmp_path: Path, encoding: str) -> None:
+def test_standard_output_escapes_what_its_encoding_lacks(scene, tmp_path, encoding):
     """The expected bytes are those of Python's own error handler for standard error."""
     name = "日本 ü\udcff.ply"
     (tmp_path / name).write_bytes(scene.read_bytes())
@@ -225,11 +223,9 @@ def test_standard_output_escapes_what_its_encoding_lacks(scene: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("option", ["--unpacked", "--quiet"])
-def test_a_disk_that_fills_up_leaves_no_file(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
-) -> None:
+def test_a_disk_that_fills_up_leaves_no_file(scene, tmp_path, monkeypatch, option):
 
-    def full(descriptor: int) -> None:
+    def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
@@ -238,7 +234,7 @@ def test_a_disk_that_fills_up_leaves_no_file(
     assert sorted(tmp_path.rglob("*")) == [tmp_path / "new"]  # which another command may be about to write into
 
 
-def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
+def test_interrupt_leaves_nothing(tmp_path):
     scene, target = tmp_path / "scene.ply", tmp_path / "a.zip"
     kissgs.save(kissgs.sample_scene(60_000), scene)
     process = subprocess.Popen([KISSGS, "compress", scene, "-o", target, "-p", "paper"], stderr=subprocess.PIPE)

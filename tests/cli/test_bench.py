@@ -1,12 +1,9 @@
 """``kissgs bench`` as a user runs it; reference: ``kissgs compress`` and ``evaluate`` by hand, and texts of errors."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,11 +15,11 @@ from kissgs.cli import bench
 from kissgs.cli.interrupts import Interrupted
 
 
-def table(path: Path) -> list[dict[str, str]]:
+def table(path):
     return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
 
-def test_the_table_has_the_bytes_and_the_quality_of_the_commands(scene: Path, tmp_path: Path) -> None:
+def test_the_table_has_the_bytes_and_the_quality_of_the_commands(scene, tmp_path):
     done = run("bench", scene, "-p", "fast", "--time", "0.01s", "-o", tmp_path / "t.csv")
     assert done.returncode == 0, done.stderr
     rows = table(tmp_path / "t.csv")
@@ -43,7 +40,7 @@ def test_the_table_has_the_bytes_and_the_quality_of_the_commands(scene: Path, tm
     assert (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_photographs_are_compared_with(tmp_path: Path) -> None:
+def test_photographs_are_compared_with(tmp_path):
     kissgs.save(SCENE, tmp_path / "scene.ply")
     capture = write_capture(tmp_path / "capture", names=("a.png", "b.png", "c.png"))
     words = tmp_path / "scene.ply", "-p", "fast", "--views", capture, "-o", tmp_path / "t.csv"
@@ -67,32 +64,28 @@ def test_photographs_are_compared_with(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def one(scene: Path) -> bench.Measurement:
+def one(scene):
     return bench.measured(scene, kissgs.Settings(preset="fast"))
 
 
-def test_all_presets_and_some_times_are_measured_by_default(
-    scene: Path, one: bench.Measurement, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[tuple[str, float | None]] = []
+def test_all_presets_and_some_times_are_measured_by_default(scene, one, monkeypatch):
+    asked = []
 
-    def measured(path: Path, settings: kissgs.Settings, **_: object) -> bench.Measurement:
+    def measured(path, settings, **_):
         asked.append((str(settings.preset), settings.time_limit))
         return one
 
     monkeypatch.setattr(bench, "measured", measured)
     assert run("bench", scene).returncode == 0
-    presets: list[tuple[str, float | None]] = [("fast", None), ("balanced", None), ("small", None), ("paper", None)]
+    presets = [("fast", None), ("balanced", None), ("small", None), ("paper", None)]
     assert asked == [*presets, ("balanced", 5), ("balanced", 30), ("balanced", 120)]
 
 
 @pytest.mark.parametrize("error", [kissgs.UnsupportedError("it was killed"), Interrupted(signal.SIGINT)])
-def test_what_is_measured_is_kept_if_a_later_one_fails(
-    scene: Path, one: bench.Measurement, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
-) -> None:
-    left: list[bench.Measurement | BaseException] = [one, error]
+def test_what_is_measured_is_kept_if_a_later_one_fails(scene, one, tmp_path, monkeypatch, error):
+    left = [one, error]
 
-    def measured(*_: object, **__: object) -> bench.Measurement:
+    def measured(*_, **__):
         found = left.pop(0)
         if isinstance(found, BaseException):
             raise found
@@ -108,20 +101,18 @@ def test_what_is_measured_is_kept_if_a_later_one_fails(
     assert [row["name"] for row in table(tmp_path / "t.csv")] == ["fast"]
 
 
-def test_a_killed_measurement_and_an_error_end_in_a_sentence(tmp_path: Path) -> None:
+def test_a_killed_measurement_and_an_error_end_in_a_sentence(tmp_path):
     with pytest.raises(kissgs.UnsupportedError, match=r"^a scene: the measurement was killed"):
         bench.isolated(killed, "a scene")
     with pytest.raises(kissgs.InvalidSceneError, match="there is no such file"):
         bench.measured(tmp_path / "none.ply", kissgs.Settings())
 
 
-def killed() -> None:
+def killed():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_without_matplotlib_the_table_is_written(
-    scene: Path, one: bench.Measurement, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_matplotlib_the_table_is_written(scene, one, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "find_spec", lambda name: None)
     monkeypatch.setattr(bench, "measured", lambda *_, **__: one)
     done = run("bench", scene, "-p", "fast", "-o", tmp_path / "t.csv")
@@ -140,9 +131,7 @@ REFUSED = {
 }
 
 
-def test_wrong_inputs_are_refused_before_a_measurement(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wrong_inputs_are_refused_before_a_measurement(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "measured", None)
     for name in ("there.csv", "plotted.png"):
         (tmp_path / name).touch()

@@ -1,7 +1,5 @@
 """``kissgs convert`` as a user runs it. Oracle: the library's own functions."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -14,7 +12,7 @@ from kissgs import preview as page_files
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene(tmp_path_factory):
     path = tmp_path_factory.mktemp("convert") / "scene.ply"
     splats = kissgs.sample_scene(600, sh_degree=1)
     splats.sh0[:] = splats.sh0.clip(-1.7, 1.7)  # all colours between 0 and 1
@@ -22,7 +20,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_ending_decides(scene: Path, tmp_path: Path) -> None:
+def test_the_ending_decides(scene, tmp_path):
     for ending in ("ply", "compressed.ply", "spz", "glb", "spz.glb"):
         done = run("convert", scene, tmp_path / f"a.{ending}")
         assert (done.returncode, done.stderr) == (0, b"")
@@ -33,7 +31,7 @@ def test_the_ending_decides(scene: Path, tmp_path: Path) -> None:
     assert (tmp_path / "c.spz").read_bytes() == (tmp_path / "a.spz").read_bytes()
 
 
-def test_losses_are_one_line(scene: Path, tmp_path: Path) -> None:
+def test_losses_are_one_line(scene, tmp_path):
     done = run("convert", scene, tmp_path / "a.splat")
     assert done.stderr.decode() == f"kissgs: {tmp_path}/a.splat: view-dependent colour (SH degree 1) is left out\n"
     report = json.loads(run("convert", scene, tmp_path / "a.splat", "--force", "--json").stdout)
@@ -50,7 +48,7 @@ def test_losses_are_one_line(scene: Path, tmp_path: Path) -> None:
     assert run("convert", scene, tmp_path / "a.splat", "-f", "-q").stderr == b""
 
 
-def test_what_reading_and_cleaning_change_is_in_the_line(tmp_path: Path) -> None:
+def test_what_reading_and_cleaning_change_is_in_the_line(tmp_path):
     """Rotations that are no unit quaternions, as all trainers write them, look the same and are not in it."""
     broken = kissgs.sample_scene(50, sh_degree=0)
     broken.means[3], broken.quats[4:6], broken.quats[6] = np.inf, 0, (0, 0, 0, 9)
@@ -67,7 +65,7 @@ def test_what_reading_and_cleaning_change_is_in_the_line(tmp_path: Path) -> None
     assert len(report["notes"]) == 3
 
 
-def test_pipes(scene: Path, tmp_path: Path) -> None:
+def test_pipes(scene, tmp_path):
     piped = run("convert", "-", "-", "--to", "spz", stdin=scene.read_bytes())
     assert run("convert", "-", tmp_path / "a.glb", stdin=piped.stdout).returncode == 0
     kissgs.save(kissgs.load(scene), tmp_path / "b.spz")
@@ -75,7 +73,7 @@ def test_pipes(scene: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(kissgs.load(tmp_path / "a.glb").means, kissgs.load(tmp_path / "b.spz").means)
 
 
-def test_several_files_into_a_folder(scene: Path, tmp_path: Path) -> None:
+def test_several_files_into_a_folder(scene, tmp_path):
     for name in ("one.ply", "two.ply"):
         (tmp_path / name).write_bytes(scene.read_bytes())
     done = run("convert", tmp_path / "*.ply", f"{tmp_path}/out/", "--to", "compressed.ply", "--json")
@@ -85,7 +83,7 @@ def test_several_files_into_a_folder(scene: Path, tmp_path: Path) -> None:
     ]
 
 
-def test_compressed_ply_is_an_ending(scene: Path, tmp_path: Path) -> None:
+def test_compressed_ply_is_an_ending(scene, tmp_path):
     """An output beside the input never has its name, and a plain .ply is not named like a compressed one."""
     packed = tmp_path / "a.compressed.ply"
     assert run("convert", scene, packed).returncode == 0
@@ -95,12 +93,6 @@ def test_compressed_ply_is_an_ending(scene: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.compressed.ply", "a.ply", "a.spz"]
     assert run("compress", packed, "-p", "fast", "-q").returncode == 0
     assert (tmp_path / "a.zip").exists()
-
-
-def test_raw_axes(scene: Path, tmp_path: Path) -> None:
-    assert run("convert", scene, tmp_path / "raw.spz", "--raw-axes").returncode == 0
-    assert run("convert", tmp_path / "raw.spz", tmp_path / "b.ply", "--raw-axes").returncode == 0
-    np.testing.assert_allclose(kissgs.load(tmp_path / "b.ply").means, kissgs.load(scene).means, atol=2**-12)
 
 
 REFUSED = {
@@ -123,7 +115,7 @@ REFUSED = {
 }
 
 
-def test_errors(scene: Path, tmp_path: Path) -> None:
+def test_errors(scene, tmp_path):
     (tmp_path / "scene.ply").write_bytes(scene.read_bytes())
     (tmp_path / "a.spz").write_bytes(b"mine")
     (tmp_path / "boxes").mkdir()
@@ -150,7 +142,7 @@ WAYS_TO_READ = {
 
 
 @pytest.mark.parametrize("way", WAYS_TO_READ)
-def test_every_command_says_what_reading_cleans(way: str, tmp_path: Path) -> None:
+def test_every_command_says_what_reading_cleans(way, tmp_path):
     if way == "view" and not (page_files.ROOT / "web_decoder" / "vendor").exists():
         pytest.skip("scripts/vendor has not run")
     kissgs.save(kissgs.sample_scene(50, sh_degree=0), tmp_path / "a.splat")

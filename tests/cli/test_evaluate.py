@@ -1,9 +1,6 @@
 """``kissgs evaluate`` and ``compress --evaluate`` as a user runs them. Oracle: the library's own functions."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +11,11 @@ from PIL import Image
 import kissgs
 
 
-def rows(text: str, *names: str) -> dict[str, list[str]]:
+def rows(text, *names):
     return {row.split()[0]: row.split()[1:] for row in text.splitlines() if row.startswith(names)}
 
 
-def test_the_report_is_the_evaluation_and_the_bytes(folder: Path) -> None:
+def test_the_report_is_the_evaluation_and_the_bytes(folder):
     words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture", "--split", "all"]
     report = json.loads(run(*words, "--json").stdout)
     scenes = kissgs.load(folder / "a.ply"), kissgs.load(folder / "c.ply")
@@ -43,7 +40,7 @@ def test_the_report_is_the_evaluation_and_the_bytes(folder: Path) -> None:
     assert said in " ".join(text.split())
 
 
-def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder: Path, tmp_path: Path) -> None:
+def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder, tmp_path):
     kissgs.compress(SCENE, tmp_path / "unpacked", settings=kissgs.Settings.from_preset("fast"))
     done = run("evaluate", folder / "b.zip", tmp_path / "unpacked")
     text = done.stdout.decode()
@@ -53,7 +50,7 @@ def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder: Path,
     assert "photo" not in text
 
 
-def test_the_cameras_depend_on_the_seed_and_the_distance(folder: Path) -> None:
+def test_the_cameras_depend_on_the_seed_and_the_distance(folder):
     scenes = kissgs.load(folder / "a.ply"), kissgs.load(folder / "c.ply")
     words = ["evaluate", folder / "a.ply", folder / "c.ply", "--seed", 7]
     report, far = (json.loads(run(*words, *more, "--json").stdout) for more in ([], ["--distance", 3]))
@@ -68,7 +65,7 @@ def test_the_cameras_depend_on_the_seed_and_the_distance(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("noise", "noted"), [(0.02, False), (0.2, True)])
-def test_a_capture_that_fits_poorly_is_noted(folder: Path, tmp_path: Path, noise: float, noted: bool) -> None:
+def test_a_capture_that_fits_poorly_is_noted(folder, tmp_path, noise, noted):
     """Below 18 dB the photographs may be of another scene, which ``compress`` notes too."""
     capture = write_capture(tmp_path / "capture")
     for path in (capture / "images").iterdir():
@@ -80,14 +77,14 @@ def test_a_capture_that_fits_poorly_is_noted(folder: Path, tmp_path: Path, noise
     assert ("the photographs differ much from renderings of a.ply: PSNR 1" in text) == noted
 
 
-def test_views_without_a_test_split_say_so(folder: Path, tmp_path: Path) -> None:
+def test_views_without_a_test_split_say_so(folder, tmp_path):
     capture = write_capture(tmp_path / "one", names=("only.png",))
     text = run("evaluate", folder / "a.ply", folder / "a.ply", "--views", capture).stdout.decode()
     assert "1 training photograph, 60x40" in text
     assert "no view is held out" in text
 
 
-def test_missing_photographs_are_reported(folder: Path, tmp_path: Path) -> None:
+def test_missing_photographs_are_reported(folder, tmp_path):
     capture = write_capture(tmp_path / "capture")
     (capture / "images").rename(capture / "rgb")
     words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", capture]
@@ -100,7 +97,7 @@ def test_missing_photographs_are_reported(folder: Path, tmp_path: Path) -> None:
     assert (report["note"], report["against"]) == ("", "photos")
 
 
-def test_a_page_is_written_whole_and_not_over_another(folder: Path, tmp_path: Path) -> None:
+def test_a_page_is_written_whole_and_not_over_another(folder, tmp_path):
     page, words = (
         tmp_path / "page.html",
         ["evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture"],
@@ -131,7 +128,7 @@ REFUSED = {
 }
 
 
-def test_errors_are_one_line(folder: Path) -> None:
+def test_errors_are_one_line(folder):
     for words, expected in REFUSED.items():
         assert expected in failure("evaluate", *words.split(), cwd=folder), words
     photo = folder / "capture" / "images" / "a.png"
@@ -145,7 +142,7 @@ def test_errors_are_one_line(folder: Path) -> None:
 
 
 @pytest.mark.quick(0)
-def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
+def test_compressing_can_evaluate(folder, tmp_path):
     words = ["compress", folder / "a.ply", "-o", tmp_path / "a.zip", "--evaluate", "--views", folder / "capture"]
     report = json.loads(run(*words, "--json").stdout)["evaluation"]
     views = kissgs.load_views(folder / "capture")
@@ -161,8 +158,8 @@ def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
 
 
-def test_cancelling_the_evaluation_writes_nothing(tmp_path: Path) -> None:
-    def stop(stage: str, fraction: float) -> None:
+def test_cancelling_the_evaluation_writes_nothing(tmp_path):
+    def stop(stage, fraction):
         if stage == "evaluate" and fraction > 0:
             raise kissgs.Cancelled("enough")
 
@@ -175,7 +172,7 @@ def test_cancelling_the_evaluation_writes_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("preset", ["fast", "balanced", "small", "paper"])
 @pytest.mark.quick(1)
-def test_every_preset_accepts_views(folder: Path, tmp_path: Path, preset: str) -> None:
+def test_every_preset_accepts_views(folder, tmp_path, preset):
     """A loop over presets needs no exception: presets that render no images use the views for evaluation only."""
     few_views = "--set", "sensitivity_views=4", "--set", "sensitivity_view_size=48"
     words = "compress", folder / "a.ply", "-p", preset, *few_views, "--views", folder / "capture", "--json"
@@ -192,14 +189,14 @@ def test_every_preset_accepts_views(folder: Path, tmp_path: Path, preset: str) -
 
 @pytest.mark.parametrize("preset", ["fast", "paper"])
 @pytest.mark.quick(1)
-def test_views_do_not_change_the_bytes_of_presets_that_render_no_images(folder: Path, preset: str) -> None:
+def test_views_do_not_change_the_bytes_of_presets_that_render_no_images(folder, preset):
     settings = kissgs.Settings.from_preset(preset)
     views = kissgs.load_views(folder / "capture")
     with_views, without_views = (kissgs.compress(SCENE, settings=settings, views=some) for some in (views, None))
     assert with_views.files == without_views.files
 
 
-def test_a_capture_that_cannot_be_read_is_refused_by_every_preset(folder: Path, tmp_path: Path) -> None:
+def test_a_capture_that_cannot_be_read_is_refused_by_every_preset(folder, tmp_path):
     words = "compress", folder / "a.ply", "-p", "fast", "-o", tmp_path / "a.zip"
     assert "there is no folder" in failure(*words, "--views", tmp_path / "none")
     assert run(*words, "--views", folder / "capture", "--quiet").stderr == b""

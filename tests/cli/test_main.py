@@ -1,7 +1,5 @@
 """Ctrl-C during imports and at exit: one line and exit code 130, never a traceback."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -35,7 +33,7 @@ finally:
 """
 
 
-def start(left: int, *words: str, number: int = signal.SIGINT) -> subprocess.CompletedProcess[str]:
+def start(left, *words, number=signal.SIGINT):
     """Run the command line, with a signal at its ``left``-th import; 0 sends none and prints the number of imports."""
     return subprocess.run(
         [sys.executable, "-P", "-c", PROGRAM.replace("SIGNAL", str(int(number))), str(left), *words],
@@ -49,7 +47,7 @@ def start(left: int, *words: str, number: int = signal.SIGINT) -> subprocess.Com
 
 @pytest.mark.parametrize("words", [["--version"], ["compress", "none.ply"]])
 @pytest.mark.quick(1)
-def test_interrupts_at_every_stage_of_loading(words: list[str]) -> None:
+def test_interrupts_at_every_stage_of_loading(words):
     imports = int(start(0, *words).stderr.rsplit("\n", 1)[-1])
     assert imports > 100
     for left in sorted({1, 4, 16, 64, *range(1, imports, imports // 6), imports}):
@@ -57,7 +55,7 @@ def test_interrupts_at_every_stage_of_loading(words: list[str]) -> None:
         assert (done.returncode, done.stderr) == (130, SAID), (left, done.stderr[-2000:])
 
 
-def test_sigterm() -> None:
+def test_sigterm():
     done = start(40, "--version", number=signal.SIGTERM)
     assert (done.returncode, done.stderr) == (143, SAID)
 
@@ -87,13 +85,13 @@ def work(words): pass
 
 
 @pytest.mark.parametrize("moment", WORK)
-def test_an_interrupt_is_never_lost(moment: str) -> None:
+def test_an_interrupt_is_never_lost(moment):
     begin = "import atexit, signal, time, weakref; from kissgs.cli import app, main"
     done = _python(f"{begin}\n{WORK[moment]}\napp.app = work\nmain.main()")
     assert (done.returncode, done.stderr) == (130, SAID)
 
 
-def test_no_module_is_imported_before_signals_are_handled() -> None:
+def test_no_module_is_imported_before_signals_are_handled():
     """Only modules that Python loads itself, and those of kissgs that handle signals."""
     bare = set(_python("import re, signal, sys; print(*sys.modules)").stdout.split())
     ours = set(_python("import re, signal, sys; import kissgs.cli.main; print(*sys.modules)").stdout.split())
@@ -102,7 +100,7 @@ def test_no_module_is_imported_before_signals_are_handled() -> None:
     }
 
 
-def _python(program: str) -> subprocess.CompletedProcess[str]:
+def _python(program):
     return subprocess.run(
         [sys.executable, "-P", "-c", program],
         env=os.environ | {"PYTHONPATH": HOME},
@@ -113,7 +111,7 @@ def _python(program: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_help_loads_nothing_heavy() -> None:
+def test_help_loads_nothing_heavy():
     heavy = ("numpy", "numba", "torch", "scipy", "PIL", "kissgs.settings")
     program = f"""
 import atexit, sys

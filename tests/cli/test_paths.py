@@ -1,11 +1,8 @@
 """Invalid paths in every argument and option that takes one: a one-line error and exit code 2, never a traceback."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -63,13 +60,13 @@ KINDS = {
 }
 
 
-def ignores_permissions(path: Path) -> bool:
+def ignores_permissions(path):
     """Whether this user, such as root, can read a folder without permission."""
     return os.access(path, os.R_OK)
 
 
 @pytest.fixture(scope="module")
-def folder() -> Iterator[Path]:
+def folder():
     """Folder with the scene in several forms, and with unusable paths."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name)
@@ -83,14 +80,14 @@ def folder() -> Iterator[Path]:
         yield path
 
 
-def takes(place: str, kind: str) -> bool:
+def takes(place, kind):
     """Whether this kind of path is invalid there: patterns only apply to inputs, and ``loop.zip`` is no loop."""
     if kind == "too long with an asterisk":
         return place.split()[:2][-1] == "BAD" and place != "sample BAD"
     return not ("BAD." in place and kind in ("a loop", "a link to what is locked"))
 
 
-def said(words: str, kind: str, folder: Path) -> list[str]:
+def said(words, kind, folder):
     """Run a command that must end with exit code 2; return its lines on standard error."""
     done = run(*(word.replace("BAD", KINDS.get(kind, kind)) for word in words.split()), cwd=folder)
     assert done.returncode == 2, (words, done)
@@ -100,7 +97,7 @@ def said(words: str, kind: str, folder: Path) -> list[str]:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.quick(2)
-def test_invalid_paths_give_one_line(kind: str, folder: Path) -> None:
+def test_invalid_paths_give_one_line(kind, folder):
     if "lock" in KINDS[kind] + kind and ignores_permissions(folder / "locked"):
         pytest.skip("this user ignores permissions")
     before = sorted(folder.iterdir())
@@ -114,14 +111,14 @@ def test_invalid_paths_give_one_line(kind: str, folder: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["too long", "a folder that is too long", "within a file", "missing/inner"])
 @pytest.mark.quick(2)
-def test_the_error_names_the_input(kind: str, folder: Path) -> None:
+def test_the_error_names_the_input(kind, folder):
     """Regression: the error named the output, whose path is derived from the input."""
     for words in ("compress BAD", "compress BAD other.ply -o out/", "decompress BAD", "render BAD"):
         assert said(words, kind, folder)[0].startswith(f"kissgs: cannot read {KINDS.get(kind, kind)[:100]}"), words
 
 
 @pytest.mark.quick(0)
-def test_a_name_that_is_too_long_with_another_ending(folder: Path, tmp_path: Path) -> None:
+def test_a_name_that_is_too_long_with_another_ending(folder, tmp_path):
     """The files next to the scene have longer names than the scene."""
     scene = tmp_path / ("a" * 251 + ".ply")
     shutil.copy(folder / "scene.ply", scene)
@@ -132,7 +129,7 @@ def test_a_name_that_is_too_long_with_another_ending(folder: Path, tmp_path: Pat
 
 @pytest.mark.parametrize("name", ["a\0b", "loop", "\0.zip", "a" * 300])
 @pytest.mark.quick(1)
-def test_the_library_raises_its_own_errors(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_library_raises_its_own_errors(name, folder, monkeypatch):
     monkeypatch.chdir(folder)
     kept = "loop/x" if name == "loop" else name  # a link is replaced, wherever it leads
     few = kissgs.Settings.from_preset("fast", compact={"count": 9})

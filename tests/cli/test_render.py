@@ -1,7 +1,5 @@
 """``kissgs render`` as a user runs it. Oracle: the library's own renderings and views, read back by Pillow."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -22,7 +20,6 @@ from rich.console import Console
 
 import kissgs
 from kissgs.cameras.captures.transforms_json import read_cameras
-from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.select import best_view
 from kissgs.cli import files as console
 from kissgs.core.splats import clean
@@ -31,33 +28,33 @@ from kissgs.rendering.metrics import psnr
 
 
 @pytest.fixture(scope="module")
-def virtual() -> Views:
+def virtual():
     return kissgs.virtual_views(SCENE, width=80, height=60)
 
 
-def by_name(views: Views) -> list[View]:
+def by_name(views):
     return sorted(views.train + views.test, key=lambda view: view.name)
 
 
-def shown(camera: kissgs.Camera, scene: kissgs.Splats = SCENE, background: tuple[float, ...] = (0, 0, 0)) -> np.ndarray:
+def shown(camera, scene=SCENE, background=(0, 0, 0)):
     """Render with the library, and round to 8 bits per channel."""
     image, _ = kissgs.render(scene, camera, background=background)
     return (255 * image.astype(np.float64)).round().clip(0, 255).astype(np.uint8)
 
 
-def pixels(source: Path | bytes) -> np.ndarray:
+def pixels(source):
     with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as image:
         return np.asarray(image.convert("RGB"))
 
 
-def close(one: np.ndarray, other: np.ndarray) -> bool:
+def close(one, other):
     """Whether two images are equal except for the rounding of values at .5."""
     return (
         one.shape == other.shape and int(np.abs(one.astype(int) - other).max()) <= 1 and (one == other).mean() > 0.999
     )
 
 
-def test_the_default_is_the_best_virtual_view_next_to_the_scene(folder: Path, tmp_path: Path, virtual: Views) -> None:
+def test_the_default_is_the_best_virtual_view_next_to_the_scene(folder, tmp_path, virtual):
     (tmp_path / "mine.ply").write_bytes((folder / "a.ply").read_bytes())
     done = run("render", "mine.ply", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -70,7 +67,7 @@ def test_the_default_is_the_best_virtual_view_next_to_the_scene(folder: Path, tm
     assert pixels(tmp_path / "mine.png").shape == (60, 80, 3)
 
 
-def test_virtual_views_by_number_and_name(folder: Path, tmp_path: Path, virtual: Views) -> None:
+def test_virtual_views_by_number_and_name(folder, tmp_path, virtual):
     fourth = by_name(virtual)[3]
     for which in ("3", fourth.name):
         done = run("render", folder / "b.zip", "-o", "-", "--view", which, "--size", "80x60", "--background", "#ff8000")
@@ -80,7 +77,7 @@ def test_virtual_views_by_number_and_name(folder: Path, tmp_path: Path, virtual:
         assert close(pixels(done.stdout), shown(view.camera, scene, (1, 128 / 255, 0)))
 
 
-def test_views_of_a_capture_have_their_own_size(folder: Path, tmp_path: Path) -> None:
+def test_views_of_a_capture_have_their_own_size(folder, tmp_path):
     capture = by_name(kissgs.load_views(folder / "capture"))
     words = ["render", folder / "a.ply", "--views", folder / "capture", "-o", tmp_path / "a.png", "--force"]
     for which, view in ((None, capture[0]), ("1", capture[1]), ("c", capture[2]), ("images/b.png", capture[1])):
@@ -96,7 +93,7 @@ def test_views_of_a_capture_have_their_own_size(folder: Path, tmp_path: Path) ->
     assert np.array_equal(report["cameras"][0]["K"], camera.K)
 
 
-def test_a_saved_camera_renders_the_same_image(folder: Path, tmp_path: Path) -> None:
+def test_a_saved_camera_renders_the_same_image(folder, tmp_path):
     kept = tmp_path / "kept.json"
     words = ["render", folder / "a.ply", "-o"]
     done = run(*words, tmp_path / "a.png", "--size", "80x60", "--view", "5", "--save-camera", kept)
@@ -112,7 +109,7 @@ def test_a_saved_camera_renders_the_same_image(folder: Path, tmp_path: Path) -> 
     assert not (tmp_path / "d.png").exists()
 
 
-def test_an_orbit_is_an_animation_or_a_contact_sheet(folder: Path, tmp_path: Path) -> None:
+def test_an_orbit_is_an_animation_or_a_contact_sheet(folder, tmp_path):
     words = ["render", folder / "a.ply", "--orbit", "--size", "40x30", "--json", "-o"]
     report = json.loads(run(*words, tmp_path / "a.webp", "--frames", "9").stdout)
     assert (report["width"], report["height"], report["frames"], len(report["cameras"])) == (40, 30, 9, 9)
@@ -134,7 +131,7 @@ def test_an_orbit_is_an_animation_or_a_contact_sheet(folder: Path, tmp_path: Pat
     assert report["width"] > 2 * 40
 
 
-def test_a_sheet_has_all_views(folder: Path, tmp_path: Path) -> None:
+def test_a_sheet_has_all_views(folder, tmp_path):
     words = ["render", folder / "a.ply", "--sheet", "--size", "60x40"]
     done = run(*words, "--views", folder / "capture", "-o", tmp_path / "a.png")
     assert ", 3 views, 1 held out (cameras of " in done.stdout.decode()
@@ -172,7 +169,7 @@ REFUSED = {
 }
 
 
-def test_impossible_requests_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_impossible_requests_are_refused(folder, tmp_path):
     for words, expected in REFUSED.items():
         options = words.replace("OUT", str(tmp_path / "a")).split()
         assert expected in failure("render", "a.ply", *options, cwd=folder), words
@@ -181,7 +178,7 @@ def test_impossible_requests_are_refused(folder: Path, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interrupted_animation_leaves_no_file(folder: Path, tmp_path: Path) -> None:
+def test_an_interrupted_animation_leaves_no_file(folder, tmp_path):
     words = ["render", folder / "a.ply", "--orbit", "--frames", "3600", "-o", tmp_path / "a.webp"]
     with subprocess.Popen([KISSGS, *map(str, words)], stderr=subprocess.PIPE) as process:
         time.sleep(2)
@@ -192,7 +189,7 @@ def test_an_interrupted_animation_leaves_no_file(folder: Path, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
-def test_compilation_is_announced_when_it_happens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compilation_is_announced_when_it_happens(tmp_path, capsys):
     """Regression: a timer announced it to whoever had a slow disk, and a second "kernels" stage raised."""
     module = tmp_path / "kernel.py"
     module.write_text(
@@ -208,9 +205,7 @@ def test_compilation_is_announced_when_it_happens(tmp_path: Path, capsys: pytest
         assert capsys.readouterr().err.count("compiling kernels (once; cached from then on)") == expected
 
 
-def test_the_clock_of_the_progress_bar_runs_through_all_stages(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_clock_of_the_progress_bar_runs_through_all_stages(monkeypatch, capsys):
     """Regression: it stopped for good when the first stage was complete."""
     now = 0.0
     monkeypatch.setattr(console, "Console", partial(Console, force_terminal=True, get_time=lambda: now))
@@ -223,7 +218,7 @@ def test_the_clock_of_the_progress_bar_runs_through_all_stages(
 
 @pytest.mark.parametrize("torch", ["", "import sys; sys.modules['torch'] = None; "], ids=["torch", "no torch"])
 @pytest.mark.quick(0)
-def test_warmup_compiles_all_kernels(torch: str, tmp_path: Path) -> None:
+def test_warmup_compiles_all_kernels(torch, tmp_path):
     """A kernel compiles at its first call, so that one that is not loaded here is compiled later."""
     home = Path(kissgs.__file__).parents[1]
     sources = {path: path.read_text(encoding="utf-8") for path in home.glob("kissgs/**/*.py")}

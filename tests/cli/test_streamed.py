@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from helpers.command_line import KISSGS, failure, run
-from helpers.streamed_scenes import files_of, small_sizes
+from helpers.streamed_scenes import files_of, write_small
 
 import kissgs
 from kissgs import Settings
@@ -129,12 +129,8 @@ def test_an_interruption_says_what_is_left_and_the_same_command_completes_it(sce
 
 def test_numbers_say_what_they_count(tmp_path):
     """``info`` describes one of two levels, and gives the bytes of both in its heading."""
-    with pytest.MonkeyPatch.context() as patch:
-        small_sizes(patch, chunk=400, leaf=200, coarsest=200)
-        kissgs.save(kissgs.sample_scene(300, sh_degree=0), tmp_path / "scene.ply")
-        kissgs.compress_streamed(
-            tmp_path / "scene.ply", tmp_path / "city/lod-meta.json", settings=Settings.from_preset("fast")
-        )
+    scene = kissgs.sample_scene(300, sh_degree=0)
+    write_small(scene, tmp_path / "city" / "lod-meta.json", chunk=400, leaf=200, coarsest=200)
     for level in (0, 1):
         said = run("info", tmp_path / "city", "--level", str(level)).stdout.decode()
         sizes = {path: path.stat().st_size for path in (tmp_path / "city").rglob("*.*")}

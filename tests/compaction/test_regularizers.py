@@ -33,20 +33,6 @@ def test_the_loss_is_the_papers_for_any_scales(scales):
     assert found(scales, torch.float64) == pytest.approx(exact(scales), rel=1e-12, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("scales", "loss"),
-    [
-        ((0, 0, 0), 0.0),  # a ball
-        ((3, 3, -30), 0.0),  # a disc has rank 2
-        ((30, -30, -30), -math.log(EPSILON)),  # a needle has rank 1
-        ((-30, -30, -30), 0.0),
-        ((30, 30, 30), 0.0),
-    ],
-)
-def test_known_shapes(scales, loss):
-    assert found([float(scale) for scale in scales]) == pytest.approx(loss, abs=1e-5)
-
-
 @given(st.tuples(LOG_SCALES, LOG_SCALES, LOG_SCALES))
 def test_the_gradient_is_finite_and_at_most_2(scales):
     leaf = torch.tensor([scales], requires_grad=True)
@@ -80,9 +66,6 @@ def test_the_loss_does_not_depend_on_the_size_of_the_scene():
 
 def test_an_empty_scene_has_no_loss():
     assert ShapeRegularizer(1, 1, 1.0).penalty(0, {"scales": torch.empty(0, 3)}) is None
-
-
-# Sparsification.
 
 
 @given(st.lists(st.sampled_from([-1.0, 0.0, 0.25, 0.5, 2.0]), min_size=1, max_size=12), st.integers(1, 12))

@@ -1,7 +1,4 @@
-"""Pruning by score. Oracle: sorted scores, and pairs of copies of which one is superfluous.
-
-The scores themselves are tested in tests/rendering.
-"""
+"""Pruning by score (see tests/rendering). Oracle: sorted scores, and pairs of copies of which one is superfluous."""
 
 from dataclasses import replace
 

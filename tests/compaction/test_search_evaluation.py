@@ -10,7 +10,7 @@ from kissgs.cameras.views import Views, black
 from kissgs.cameras.virtual.samples import random_poses
 from kissgs.compaction.search_evaluation import COUNT, SearchEvaluation
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_images, render_clamped
+from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import SEARCH_SEED
 
 SCENE = kissgs.sample_scene(400, sh_degree=1, seed=3)
@@ -34,19 +34,6 @@ def test_without_a_capture_poses_of_photographs_and_cameras_over_the_whole_scene
     assert {view.view.background[0] for view in found.views} == {0.0, 0.5, 1.0}
     again = compare_images(SCENE, WORSE, Views((), tuple(view.view for view in found.views), found.background, ""))
     assert again.mean == found.mean
-
-
-def test_the_views_and_their_renderings_are_made_once(monkeypatch):
-    compare, rendered = SearchEvaluation(SCENE, None), []
-    first = compare(WORSE)
-    monkeypatch.setattr(
-        "kissgs.evaluation.evaluate.render_clamped",
-        lambda *given, **named: rendered.append(1) or render_clamped(*given, **named),
-    )
-    monkeypatch.setattr("kissgs.compaction.search_evaluation.random_poses", None)
-    monkeypatch.setattr("kissgs.compaction.search_evaluation.evaluation_views", None)
-    assert compare(WORSE).as_dict() == first.as_dict()
-    assert len(rendered) == len(first.views) + len(first.surroundings.views)  # the candidate alone
 
 
 def test_held_out_views_may_have_equal_names():

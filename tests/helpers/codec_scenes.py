@@ -77,11 +77,7 @@ def product(p, q):
 
 
 def equivalents(quats, scales):
-    """Return all 48 equivalent forms of each Gaussian, (48, N, 4) and (48, N, 3), from SciPy's rotations of the cube.
-
-    A rotation M of the cube takes axis i to ± axis p: R M has the old column p as its column i, up to its sign, so the
-    new scale i is the old scale p.
-    """
+    """Return all 48 equivalent forms, (48, N, 4) and (48, N, 3), from SciPy's rotations of the cube."""
     turns = Rotation.create_group("O")
     new_quats, new_scales = [], []
     for turn, matrix in zip(turns.as_quat(scalar_first=True), turns.as_matrix(), strict=True):

@@ -1,9 +1,4 @@
-"""The command ``kissgs``, run in this process, so that all tests share imported modules and loaded kernels.
-
-Tests of signals, pipes and start-up run the executable ``KISSGS`` as a separate process.
-"""
-
-from __future__ import annotations
+"""The command ``kissgs``, run in this process; for signals and pipes, the executable ``KISSGS``."""
 
 import contextlib
 import faulthandler
@@ -12,9 +7,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 from kissgs.cli.main import main
 
@@ -24,9 +17,7 @@ TIMEOUT_SECONDS = 900.0
 """A command that takes longer hangs: it ends its test process, after a traceback of all threads."""
 
 
-def run(
-    *words: object, stdin: bytes = b"", cwd: Path | None = None, encoding: str = "utf-8"
-) -> subprocess.CompletedProcess[bytes]:
+def run(*words, stdin=b"", cwd=None, encoding="utf-8"):
     """Run ``kissgs WORDS`` with these bytes on standard input and return the exit code and both outputs."""
     arguments = ["kissgs", *map(str, words)]
     with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
@@ -40,7 +31,7 @@ def run(
         return subprocess.CompletedProcess(arguments, code, out.read(), err.read())
 
 
-def failure(*words: object, stdin: bytes = b"", cwd: Path | None = None) -> str:
+def failure(*words, stdin=b"", cwd=None):
     """Run a command that must fail with exit code 2 and one line, and return the line."""
     done = run(*words, stdin=stdin, cwd=cwd)
     assert done.returncode == 2, done
@@ -50,8 +41,8 @@ def failure(*words: object, stdin: bytes = b"", cwd: Path | None = None) -> str:
     return lines[0]
 
 
-def _exit_code() -> int:
-    code: object = 0
+def _exit_code():
+    code = 0
     faulthandler.dump_traceback_later(TIMEOUT_SECONDS, exit=True, file=sys.__stderr__)
     try:
         main()
@@ -64,7 +55,7 @@ def _exit_code() -> int:
 
 
 @contextlib.contextmanager
-def _process_state() -> Iterator[None]:
+def _process_state():
     """Restore process state that commands change: arguments, signal handlers, the hook for unraisable exceptions."""
     arguments, hook = sys.argv, sys.unraisablehook
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -77,7 +68,7 @@ def _process_state() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _standard_files(encoding: str, *files: BinaryIO) -> Iterator[None]:
+def _standard_files(encoding, *files):
     """Replace standard input, output and error by files, for Python and for C libraries."""
     before = sys.stdin, sys.stdout, sys.stderr
     sys.stdout.flush()

@@ -1,7 +1,5 @@
 """How many examples property tests try: few in ``make test``, all of them in ``make test-all``."""
 
-from __future__ import annotations
-
 from hypothesis import HealthCheck, settings
 
 SHARE, LEAST = 0.1, 10
@@ -18,11 +16,11 @@ settings.register_profile("thorough", max_examples=100, **COMMON)
 settings.load_profile("quick")  # pytest's option --hypothesis-profile is read later
 
 
-def thorough() -> bool:
+def thorough():
     """Whether all examples are wanted."""
     return settings.get_current_profile_name() == "thorough"
 
 
-def examples(count: int) -> settings:
+def examples(count):
     """Return Hypothesis settings for a test that is worth ``count`` examples."""
     return settings(max_examples=count if thorough() else max(LEAST, round(SHARE * count)))

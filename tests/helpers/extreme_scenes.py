@@ -1,7 +1,5 @@
 """Small extreme scenes, as float64 arrays by attribute, and cameras."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from helpers import render_scenes
@@ -11,7 +9,7 @@ from kissgs.rendering.camera import Camera, look_at
 Arrays = dict[str, np.ndarray]
 
 
-def cloud(count=12, degree=1, seed=5) -> Arrays:
+def cloud(count=12, degree=1, seed=5):
     """Return coloured Gaussians around the origin, not opaque enough to terminate a pixel."""
     rng = np.random.default_rng([seed, count, degree])
     quats = rng.normal(size=(count, 4))
@@ -25,13 +23,13 @@ def cloud(count=12, degree=1, seed=5) -> Arrays:
     }
 
 
-def changed(**arrays) -> Arrays:
+def changed(**arrays):
     """Return the cloud with other values, broadcast to its shapes."""
     before = cloud()
     return before | {name: np.broadcast_to(value, before[name].shape).astype(float) for name, value in arrays.items()}
 
 
-def with_values(attribute, *values) -> Arrays:
+def with_values(attribute, *values):
     """Return the cloud with the first numbers of an attribute's first Gaussians replaced."""
     arrays = cloud()
     for n, value in enumerate(values):
@@ -39,28 +37,28 @@ def with_values(attribute, *values) -> Arrays:
     return arrays
 
 
-def camera() -> Camera:
+def camera():
     """Return a camera that sees the cloud."""
     return render_scenes.camera(48, 32)
 
 
-def small() -> Camera:
+def small():
     """Return a camera that sees the cloud in fewer pixels."""
     return render_scenes.camera(24, 16)
 
 
-def straight() -> Camera:
+def straight():
     """Return a camera with the axes of the world, so that equal z are bit-identical depths."""
     pose = np.eye(4)
     pose[2, 3] = 3
     return Camera(pose, np.array([[60.0, 0, 24], [0, 60.0, 16], [0, 0, 1]]), 48, 32)
 
 
-def seen_from(place, target, fov) -> Camera:
+def seen_from(place, target, fov):
     return look_at(np.array(place), np.array(target), np.array([0.0, -1, 0]), fov=fov, width=48, height=32)
 
 
-def sized(size) -> Arrays:
+def sized(size):
     before = cloud()
     return before | {"means": before["means"] * size, "scales": before["scales"] + np.log(size)}
 

@@ -29,18 +29,7 @@ BOUNDS = {
 
 @dataclass(frozen=True, slots=True)
 class Extreme:
-    """One row of the table.
-
-    Attributes:
-        name: of the row, and of its tests.
-        given: what is extreme.
-        promise: what happens to it.
-        arrays: makes the scene, as float64 before anything is cleaned.
-        camera: makes a camera that sees it.
-        changes: what cleaning has to report.
-        bounds: where they are not those of ``BOUNDS``; the promise says why.
-        as_ply: the scene is read from a ``.ply`` of float64 properties.
-    """
+    """One row of the table; ``changes`` is what cleaning has to report, the promise explains own ``bounds``."""
 
     name: str
     given: str
@@ -51,7 +40,7 @@ class Extreme:
     bounds: Mapping[str, float] = field(default_factory=dict)
     as_ply: bool = False
 
-    def bound(self, stage: str) -> float:
+    def bound(self, stage):
         """Return the error bound of a stage."""
         return {**BOUNDS, **self.bounds}[stage]
 

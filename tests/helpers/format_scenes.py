@@ -36,10 +36,7 @@ def made_scene(count, degree, *, extremes=True):
 
 
 def assert_alike(found, wanted, *, rtol=0.0, atol=0.0, opacities=0.015):
-    """Assert that scenes are equal within the tolerances; quaternions may have the other sign.
-
-    Opacity logits beyond 13.8 are the same opacity to this library, which clamps them to 13.8023; others to 13.8155.
-    """
+    """Assert that scenes are equal within the tolerances, whatever the sign of quaternions and logits beyond 13.8."""
     assert len(found) == len(wanted)
     assert found.sh_degree == wanted.sh_degree
     for name in ATTRIBUTES:

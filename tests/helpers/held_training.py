@@ -1,9 +1,6 @@
 """Training that waits at a checkpoint until it is interrupted, so that no test depends on how fast it trains."""
 
-from __future__ import annotations
-
 import time
-from pathlib import Path
 
 PROGRAM = """
 import os
@@ -30,19 +27,15 @@ Checkpoint.due = property(lambda self: True)  # after every step
 
 
 class HeldTraining:
-    """Training that saves a checkpoint after every step (compaction: and before the first), and waits after one.
+    """Training that saves a checkpoint after every step, and waits after one; its process runs ``program`` first."""
 
-    Attributes:
-        program: Python code to run in the process that trains, before anything else.
-    """
-
-    def __init__(self, folder: Path, saves: int) -> None:
+    def __init__(self, folder, saves):
         """Let it wait after so many ``saves``; ``folder`` belongs to it."""
         self._folder = folder
         (folder / "hold").touch()
         self.program = PROGRAM.format(folder=str(folder), saves=saves)
 
-    def wait(self, seconds: float = 300) -> None:
+    def wait(self, seconds=300):
         """Wait until training waits."""
         end = time.monotonic() + seconds
         while not (self._folder / "waiting").exists():
@@ -50,11 +43,11 @@ class HeldTraining:
             time.sleep(0.02)
 
     @property
-    def saves_by_process(self) -> list[int]:
+    def saves_by_process(self):
         """Number of checkpoints saved by each process, in the order of their last ones."""
         files = sorted(self._folder.glob("saves-*"), key=lambda path: path.stat().st_mtime_ns)
         return [int(path.read_text()) for path in files]
 
-    def release(self) -> None:
+    def release(self):
         """Let training run to its end, in its process or in the next one."""
         (self._folder / "hold").unlink()

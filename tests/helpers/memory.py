@@ -2,14 +2,12 @@
 
 import os
 import tracemalloc
-from collections.abc import Callable
 
 
-def takes_less_than(limit: float, call: Callable[[], object]) -> bool:
-    """Whether Python and NumPy hold fewer than ``limit`` bytes while ``call`` runs.
+def takes_less_than(limit, call):
+    """Whether Python and NumPy hold fewer than ``limit`` bytes while ``call`` runs, here and in a process of its own.
 
-    It runs twice: here, so that it may return or raise something, and in a process of its own, where no other thread
-    takes memory or is interrupted by the end of tracemalloc, which can crash Python 3.11 (gh-128679).
+    There, the end of tracemalloc, which can crash Python 3.11 (gh-128679), interrupts no other thread.
     """
     call()
     child = os.fork()

@@ -56,6 +56,3 @@ def refusal(files, kind=InvalidContainerError):
 def assert_same(found, wanted=None):
     wanted = wanted or decompress(FILES)
     assert all(np.array_equal(getattr(found, name), getattr(wanted, name)) for name in ATTRIBUTES)
-
-
-# --- What we write --------------------------------------------------------------------------------

@@ -107,13 +107,14 @@ class Preview:
         return np.asarray(Image.open(io.BytesIO(screenshot)).convert("RGB")).astype(int)
 
     def still_image(self, seconds=300):
-        """Return a screenshot when no frame has been requested for 0.4 s, so that Spark has finished sorting."""
-        end, frames = time.monotonic() + seconds, -1
+        """Return a screenshot when no frame has been requested for 0.3 s, so that Spark has finished sorting."""
+        end, frames, still = time.monotonic() + seconds, -1, 0
         while time.monotonic() < end:
             before, frames = frames, self.page.evaluate("resourceCounts().frames")
-            if frames == before:
+            still = still + 1 if frames == before else 0
+            if still == 3:
                 return self.pixels()
-            self.page.wait_for_timeout(400)
+            self.page.wait_for_timeout(100)
         raise AssertionError("the image keeps changing")
 
     def error_message(self, *words):

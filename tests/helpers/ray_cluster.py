@@ -57,7 +57,7 @@ class RayCluster:
     machines, but those below a folder with a file ``shared``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.folder = Path(tempfile.mkdtemp(prefix="kr-"))  # short: sockets below have paths of at most 107 bytes
         self.environment = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
         self.nodes: list[subprocess.Popen] = []
@@ -67,7 +67,7 @@ class RayCluster:
             probe.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{probe.getsockname()[1]}"
 
-    def __enter__(self) -> RayCluster:
+    def __enter__(self):
         quick = {"health_check_period_ms": 500, "health_check_failure_threshold": 4, "health_check_initial_delay_ms": 0}
         self.head = self._start(
             *("--head", f"--port={self.address.rpartition(':')[2]}", "--num-cpus=0", "--include-dashboard=false"),
@@ -75,16 +75,16 @@ class RayCluster:
         )
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error):
         for node in [*self.nodes, self.head]:
             kill_tree(node)
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def add_node(self) -> subprocess.Popen:
+    def add_node(self):
         self.nodes.append(self._start(f"--address={self.address}", "--num-cpus=1", f"--memory={NODE_MEMORY}"))
         return self.nodes[-1]
 
-    def items(self) -> list[int]:
+    def items(self):
         """Return the ids of the processes of all items."""
         found = []
         for node in self.nodes:
@@ -94,22 +94,22 @@ class RayCluster:
                         found.append(pid)
         return found
 
-    def kill_node_of(self, pid: int) -> None:
+    def kill_node_of(self, pid):
         """Kill the node that a process runs on."""
         kill_tree(next(node for node in self.nodes if pid in tree(node.pid)))
 
-    def left_by_items(self) -> list[str]:
+    def left_by_items(self):
         """Return the paths of temporary folders of items, on all nodes that run."""
         running = [node for node in self.nodes if node.poll() is None]
         return [str(path) for node in running for path in self._temporary[node.pid].glob("kissgs-*")]
 
-    def restore(self) -> None:
+    def restore(self):
         """Start a node for each one that was killed."""
         for node in [node for node in self.nodes if node.poll() is not None]:
             self.nodes.remove(node)
             self.add_node()
 
-    def _start(self, *options: str) -> subprocess.Popen:
+    def _start(self, *options):
         kept = {name: value for name, value in os.environ.items() if not name.startswith(("KISSGS_", "RAY_"))}
         environment = {**kept, **self.environment, "RAY_TMPDIR": str(self.folder), "RAY_USAGE_STATS_ENABLED": "0"}
         temporary = self.folder / f"temporary{len(self.logs)}"  # of its own, as on a machine of its own
@@ -133,7 +133,7 @@ class RayCluster:
         return process
 
 
-def tree(pid: int) -> list[int]:
+def tree(pid):
     """Return the ids of a process and of all processes below it."""
     found = [pid]
     with contextlib.suppress(OSError):
@@ -143,7 +143,7 @@ def tree(pid: int) -> list[int]:
     return found
 
 
-def kill_tree(process: subprocess.Popen) -> None:
+def kill_tree(process):
     """Kill a node as if its machine had lost its power: all of its processes at once."""
     pids = tree(process.pid)
     for pid in pids:

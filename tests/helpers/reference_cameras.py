@@ -3,7 +3,6 @@
 import json
 import struct
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from PIL import Image
@@ -47,7 +46,7 @@ def poses(names, seed=0):
     ]
 
 
-def write_binary(folder: Path, cameras: dict, images: list[Pose]):
+def write_binary(folder, cameras, images):
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cameras.bin").write_bytes(camera_bytes(cameras))
     (folder / "images.bin").write_bytes(image_bytes(images))
@@ -71,7 +70,7 @@ def image_bytes(images):
     return data
 
 
-def write_text(folder: Path, cameras: dict, images: list[Pose]):
+def write_text(folder, cameras, images):
     folder.mkdir(parents=True, exist_ok=True)
     lines = ["# Camera list with one line of data per camera:", ""]
     for number, (model, width, height, parameters) in cameras.items():
@@ -95,13 +94,13 @@ def frames(images, prefix="images/"):
     return [{"file_path": prefix + pose.name, "transform_matrix": opengl_matrix(pose)} for pose in images]
 
 
-def write_json(path: Path, document):
+def write_json(path, document):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(document))
     return path
 
 
-def write_photo(path: Path, width, height, mode="RGB", value=None):
+def write_photo(path, width, height, mode="RGB", value=None):
     """Write a colour ramp, which shows whether an image was resized or flipped."""
     path.parent.mkdir(parents=True, exist_ok=True)
     y, x = np.mgrid[:height, :width]

@@ -1,8 +1,4 @@
-"""Two naive decoders, written from the description of the format alone (docs/reference/format.md), as oracles.
-
-``decode`` does what the paper's Python decoder does: whole arrays, float32, activated values and back.
-``decode_browser`` does what viewers and other tools do: it looks at ``meta.json`` only, and checks what they check.
-"""
+"""Naive decoders from docs/reference/format.md alone: as the paper's, and as viewers, which read ``meta.json`` only."""
 
 from __future__ import annotations
 
@@ -138,8 +134,7 @@ def range_magnitude(ranges, column):
 def assert_equal_scenes(ours, reference, files):
     """Assert that a kissgs scene equals the oracle's columns up to float32 rounding, 5e-7 of a channel's range.
 
-    The oracle's activation of opacities o costs it an ulp of o, which is 1.2e-7 * e^logit of the logit; that of scales
-    almost nothing.
+    Activating opacities costs the oracle an ulp, which is 1.2e-7 * e^logit of the logit.
     """
     ranges = ranges_of(yaml.safe_load(files["container_meta.yaml"]))
     mine = as_columns(ours)

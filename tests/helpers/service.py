@@ -30,7 +30,6 @@ from kissgs.io.ply import write_ply
 from service.core.settings import ServiceSettings
 from service.http.app import create_app
 from service.http.server import Server, listen
-from service.jobs.container import ServiceContainer
 
 ROOT = Path(__file__).parents[2]
 
@@ -63,7 +62,7 @@ class Service:
     ``processes`` processes. Settings in small letters are constants of ``ServiceSettings``, such as ``sync_seconds=2``.
     """
 
-    def __init__(self, folder: Path, *, processes: bool = False, **settings: object) -> None:
+    def __init__(self, folder, *, processes=False, **settings):
         self.folder, self.processes = folder, processes
         self.constants = {name: value for name, value in settings.items() if name.islower()}
         self.settings = {
@@ -74,15 +73,15 @@ class Service:
         }
         self.log = folder.parent / f"{folder.name}.log"
 
-    def __enter__(self) -> Service:
+    def __enter__(self):
         self.start()
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error):
         self.http.close()
         self.stop()
 
-    def start(self) -> Service:
+    def start(self):
         model = type("Settings", (ServiceSettings,), {**self.constants, "__module__": __name__})
         settings = model(**{name.removeprefix("KISSGS_").lower(): value for name, value in self.settings.items()})
         self._handler = logging.FileHandler(self.log)
@@ -102,54 +101,54 @@ class Service:
         self._connect(listener.getsockname()[1])
         return self
 
-    def interrupt(self) -> None:
+    def interrupt(self):
         """Ask the service to end, as Ctrl-C does: the first time soon, the second time at once."""
         with contextlib.suppress(RuntimeError):  # its loop has ended
             self._server.loop.call_soon_threadsafe(self._server.handle_exit, signal.SIGINT, None)
 
-    def join(self, seconds: float = 300) -> None:
+    def join(self, seconds=300):
         """Wait for the end of a service that was interrupted."""
         self._thread.join(seconds)
         assert not self._thread.is_alive()
         logging.getLogger("kissgs").removeHandler(self._handler)
         self._handler.close()
 
-    def stop(self) -> None:
+    def stop(self):
         """End all jobs and the service."""
         while self._thread.is_alive():
             self.interrupt()
             self._thread.join(0.1)
         self.join()
 
-    def restart(self) -> Service:
+    def restart(self):
         """Start a service that has ended once more."""
         self.http.close()
         return self.start()
 
-    def _connect(self, port: int) -> None:
+    def _connect(self, port):
         self.url, self.port = f"http://127.0.0.1:{port}", port
         self.http = httpx.Client(base_url=self.url, timeout=300, trust_env=False)
 
     # Common actions of tests ---------------------------------------------------------------------------------
 
-    def submit(self, data: bytes = SMALL, options: str = FAST, **headers: str) -> dict:
+    def submit(self, data=SMALL, options=FAST, **headers):
         answer = self.http.post(
             "/v1/jobs", content=data, params={"options": options, "name": "a scene.ply"}, headers=headers
         )
         assert answer.status_code == 202, answer.text
         return answer.json()
 
-    def cancel(self, job: dict) -> dict:
+    def cancel(self, job):
         answer = self.http.post(f"/v1/jobs/{job['id']}/cancel")
         assert answer.status_code == 200, answer.text
         return answer.json()
 
-    def status(self, job: dict, wait: float = 0) -> dict:
+    def status(self, job, wait=0):
         answer = self.http.get(f"/v1/jobs/{job['id']}", params={"wait": wait})
         assert answer.status_code == 200, answer.text
         return answer.json()
 
-    def ended(self, job: dict, seconds: float = 600) -> dict:
+    def ended(self, job, seconds=600):
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             status = self.status(job, wait=5)
@@ -157,14 +156,14 @@ class Service:
                 return status
         raise AssertionError(f"job {job['id']} has not ended: {status}")
 
-    def only_result(self, job: dict) -> bytes:
+    def only_result(self, job):
         """Return the container of a job, which must succeed and leave no temporary files."""
         status = self.ended(job)
         assert status["state"] == "succeeded", status
         assert self.leftovers() == []
         return self.http.get(status["links"]["result"]).content
 
-    def running(self, job: dict, stage: str | None = None, seconds: float = 300) -> dict:
+    def running(self, job, stage=None, seconds=300):
         """Wait until the job runs, in ``stage`` if given; return the status."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -177,11 +176,11 @@ class Service:
             time.sleep(0.02)
         raise AssertionError(f"job {job['id']} does not run: {status}\n{self.log.read_text()[-3000:]}")
 
-    def hold(self) -> dict:
+    def hold(self):
         """Submit a job that keeps the worker busy, and return its status once it runs."""
         return self.running(self.submit(scene_bytes(20_000, 3) if self.processes else SMALL, SLOW))
 
-    def children(self) -> list[int]:
+    def children(self):
         """Return the ids of all job processes, which work in the folders of their jobs."""
         found = []
         for process in Path("/proc").glob("[0-9]*"):
@@ -190,21 +189,21 @@ class Service:
                     found.append(int(process.name))
         return found
 
-    def stored(self) -> set[str]:
+    def stored(self):
         """Return the ids of all jobs that have files."""
         return {path.name for path in (self.folder / "jobs").iterdir()}
 
-    def uploads(self) -> list[str]:
+    def uploads(self):
         """Return the names of uploads in progress."""
         return [path.name for path in (self.folder / "incoming").iterdir()]
 
-    def leftovers(self) -> list[str]:
+    def leftovers(self):
         """Return the paths of temporary files."""
         jobs = self.folder / "jobs"
         found = [*(self.folder / "incoming").iterdir(), *jobs.glob("*/work-*"), *jobs.glob("*/.*")]
         return [str(path.relative_to(self.folder)) for path in found]
 
-    def raw(self, data: bytes) -> socket.socket:
+    def raw(self, data):
         """Open a connection and send these bytes."""
         connection = socket.create_connection(("127.0.0.1", self.port), timeout=300)
         connection.sendall(data)
@@ -214,7 +213,7 @@ class Service:
 _generate, _generated = FastAPI.openapi, {}
 
 
-def _openapi(app: FastAPI) -> dict:
+def _openapi(app):
     """Return the OpenAPI document, which takes most of the time of a start, and is the same for all services."""
     if not _generated:
         _generated.update(copy.deepcopy(_generate(app)))
@@ -224,11 +223,11 @@ def _openapi(app: FastAPI) -> dict:
 class _Server(Server):
     """Server that says when it listens."""
 
-    def __init__(self, app: object, context: ServiceContainer) -> None:
+    def __init__(self, app, context):
         super().__init__(app, context)
         self.listening = threading.Event()
 
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+    async def startup(self, sockets=None):
         self.loop = asyncio.get_running_loop()
         await super().startup(sockets)
         self.listening.set()
@@ -239,10 +238,10 @@ class ServiceProcess(Service):
 
     process: subprocess.Popen | None = None
 
-    def __init__(self, folder: Path, **settings: object) -> None:
+    def __init__(self, folder, **settings):
         super().__init__(folder, processes=True, **settings)
 
-    def start(self) -> Service:
+    def start(self):
         begin = self.log.stat().st_size if self.log.exists() else 0
         kept = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
         chosen = {name: str(value) for name, value in self.settings.items()}
@@ -263,29 +262,29 @@ class ServiceProcess(Service):
             time.sleep(0.05)
         raise AssertionError(f"the service did not start: {self.log.read_text()[-3000:]}")
 
-    def _program(self) -> list[str]:
+    def _program(self):
         if not self.constants:
             return ["-m", "service"]
         changes = "".join(f"ServiceSettings.{name} = {value!r}\n" for name, value in self.constants.items())
         imports = "from service.__main__ import main\nfrom service.core.settings import ServiceSettings\n"
         return ["-c", f"{imports}{changes}main()"]
 
-    def stop(self) -> None:
+    def stop(self):
         self.kill(signal.SIGKILL)
 
-    def kill(self, number: int) -> int:
+    def kill(self, number):
         """Send a signal, wait for the end, and return the exit status."""
         if self.process.poll() is None:
             self.process.send_signal(number)
         return self.process.wait(timeout=300)
 
-    def memory(self) -> int:
+    def memory(self):
         """Return the peak resident memory of the server process, bytes."""
         text = Path(f"/proc/{self.process.pid}/status").read_text()
         return int(re.search(r"VmHWM:\s+([0-9]+) kB", text)[1]) << 10
 
 
-def read_response(connection: socket.socket) -> bytes:
+def read_response(connection):
     """Return one HTTP response from a connection."""
     answer = b""
     with contextlib.suppress(ConnectionError):
@@ -298,7 +297,7 @@ def read_response(connection: socket.socket) -> bytes:
     return answer
 
 
-def problem(answer: httpx.Response, status: int, code: str) -> dict:
+def problem(answer, status, code):
     """Return the problem document of a response, which must have this status and code."""
     assert (answer.status_code, answer.headers["content-type"]) == (status, "application/problem+json"), answer.text
     found = answer.json()
@@ -310,7 +309,7 @@ def problem(answer: httpx.Response, status: int, code: str) -> dict:
     return found
 
 
-def events(text: str) -> list[tuple[int, str, dict]]:
+def events(text):
     """Return id, kind and data of each server-sent event of a stream."""
     found = []
     for block in text.split("\n\n"):

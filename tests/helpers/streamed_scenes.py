@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import pytest
+
 import kissgs
 from helpers.reference_sog import sog_files, sog_folder, streamed_files
 from kissgs import Settings
@@ -35,13 +37,7 @@ class Kind:
         return streamed_files(levels, environment=environment, container=self.container, manifest=self.manifest)
 
 
-SOG = Kind(
-    "streamed-sog",
-    "lod-meta.json",
-    SOG_FORMAT.decode,
-    sog_folder,
-    lambda scene: decode_sog(sog_files(scene)),
-)
+SOG = Kind("streamed-sog", "lod-meta.json", SOG_FORMAT.decode, sog_folder, lambda scene: decode_sog(sog_files(scene)))
 SOGXT = Kind(
     "streamed-sogxt",
     "levels.json",
@@ -68,6 +64,14 @@ def small_sizes(patch, *, chunk, leaf, coarsest):
     """Make chunks, leaves and coarsest levels of so few Gaussians that small scenes have several of each."""
     for name, value in {"CHUNK": chunk, "LEAF": leaf, "COARSEST": coarsest}.items():
         patch.setattr(build, name, value)
+
+
+def write_small(splats, target, *, chunk, leaf, coarsest):
+    """Write a streamed scene of several small chunks and leaves by way of a ``scene.ply`` beside its folder."""
+    kissgs.save(splats, target.parents[1] / "scene.ply")
+    with pytest.MonkeyPatch.context() as patch:
+        small_sizes(patch, chunk=chunk, leaf=leaf, coarsest=coarsest)
+        kissgs.compress_streamed(target.parents[1] / "scene.ply", target, settings=FAST)
 
 
 def saved_sample(tmp_path_factory, count, sh_degree):

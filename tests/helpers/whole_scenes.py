@@ -1,11 +1,5 @@
-"""Scenes with parts that are easily overlooked, and cameras that see all parts.
+"""Scenes with parts that are easily overlooked, and cameras, independent of kissgs's own, that see all parts."""
 
-The cameras are independent of those of the encoder and the evaluation.
-"""
-
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,19 +11,19 @@ KINDS = ("all around", "close up", "farther off", "across")
 BACKGROUNDS = (0.0, 0.5, 1.0)
 
 
-def moved(splats: Splats, *, by: tuple[float, float, float] = (0, 0, 0), scale: float = 1.0) -> Splats:
+def moved(splats, *, by=(0, 0, 0), scale=1.0):
     """Return a copy, scaled about the origin and then translated."""
     means = (splats.means.astype(np.float64) * scale + by).astype(np.float32)
     return replace(splats, means=means, scales=splats.scales + np.float32(np.log(scale)))
 
 
-def joined(*parts: Splats) -> Splats:
+def joined(*parts):
     """Return all parts in one scene, in random order."""
     whole = concatenate(parts)
     return whole.select(np.random.default_rng(5).permutation(len(whole)))
 
 
-def surface(points: np.ndarray, normals: np.ndarray, size: float, seed: int) -> Splats:
+def surface(points, normals, size, seed):
     """Return flat, nearly opaque Gaussians on a surface, with varying colours."""
     rng = np.random.default_rng(seed)
     n = len(points)
@@ -51,12 +45,12 @@ def surface(points: np.ndarray, normals: np.ndarray, size: float, seed: int) -> 
     )
 
 
-def two(distance: float, scale: float = 1.0, count: int = 6000) -> Splats:
+def two(distance, scale=1.0, count=6000):
     """Return two objects of ``count`` Gaussians."""
     return joined(sample_scene(count), moved(sample_scene(count, seed=1), by=(distance, 0, 0), scale=scale))
 
 
-def five() -> Splats:
+def five():
     """Return five objects of 600 to 9,600 Gaussians."""
     places = ((0, 0, 0), (150, 0, 0), (0, 0, 150), (-150, 20, 0), (300, 0, 300))
     counts = (9600, 4800, 2400, 1200, 600)
@@ -65,24 +59,24 @@ def five() -> Splats:
     )
 
 
-def small_detail() -> Splats:
+def small_detail():
     """Return a detailed object of 4,000 Gaussians at 0.03 of the size, in front of a surface."""
     return joined(sample_scene(12_000), moved(sample_scene(4000, seed=2), by=(0.6, -1.9, -1.2), scale=0.03))
 
 
-def nested() -> Splats:
+def nested():
     """Return a scene in the middle of one fifty times as large."""
     return joined(moved(sample_scene(6000), scale=50), moved(sample_scene(6000, seed=3), by=(20, -70, -30)))
 
 
-def wall() -> Splats:
+def wall():
     """Return a plane that is seen from both sides."""
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-5, 5, (8000, 2)), rng.normal(0, 0.01, (8000, 1))], axis=1)
     return surface(points, np.tile([0.0, 0, 1], (8000, 1)), 10 / np.sqrt(8000), 1)
 
 
-def huge_opaque() -> Splats:
+def huge_opaque():
     """Return a scene with an enormous opaque Gaussian beside it."""
     giant = replace(
         sample_scene(1),
@@ -95,7 +89,7 @@ def huge_opaque() -> Splats:
     return joined(sample_scene(8000), giant)
 
 
-def enormous_sh() -> Splats:
+def enormous_sh():
     """Return a scene with an SH coefficient of 1e5 in five Gaussians."""
     scene = sample_scene(10_000)
     shN = scene.shN.copy()
@@ -103,7 +97,7 @@ def enormous_sh() -> Splats:
     return replace(scene, shN=shN)
 
 
-def hollow_room() -> Splats:
+def hollow_room():
     """Return six walls seen from inside, with nothing in the middle."""
     rng = np.random.default_rng(2)
     points, normals = rng.uniform(-1, 1, (10_000, 3)), np.zeros((10_000, 3))
@@ -113,7 +107,7 @@ def hollow_room() -> Splats:
     return surface(points * (3, 1.5, 4), normals, 0.05, 3)
 
 
-def far_sky() -> Splats:
+def far_sky():
     """Return a scene under 3,000 large Gaussians at a hundred times the distance."""
     rng = np.random.default_rng(4)
     directions = rng.normal(size=(3000, 3))
@@ -121,7 +115,7 @@ def far_sky() -> Splats:
     return joined(sample_scene(8000), surface(400 * directions, -directions, 20.0, 5))
 
 
-SCENES: dict[str, Callable[[], Splats]] = {
+SCENES = {
     "two, 50 apart": lambda: two(50),
     "two, 200 apart": lambda: two(200),
     "two, 1000 apart": lambda: two(1000),
@@ -138,7 +132,7 @@ SCENES: dict[str, Callable[[], Splats]] = {
 }
 
 
-def camera_at(place: np.ndarray, target: np.ndarray, rng: np.random.Generator, size: tuple[int, int]) -> Camera:
+def camera_at(place, target, rng, size):
     """Return a camera with a field of view of 60 degrees and random roll."""
     ahead = (target - place) / np.linalg.norm(target - place)
     right = np.cross(ahead, rng.normal(size=3))
@@ -150,9 +144,7 @@ def camera_at(place: np.ndarray, target: np.ndarray, rng: np.random.Generator, s
     return Camera(pose, np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]]), *size)
 
 
-def cameras(
-    splats: Splats, count: int = 32, seed: int = 11, size: tuple[int, int] = (160, 120)
-) -> dict[str, list[Camera]]:
+def cameras(splats, count=32, seed=11, size=(160, 120)):
     """Return ``count`` random cameras of each kind: all around; around a random Gaussian; across the scene."""
     rng = np.random.default_rng(seed)
     means = splats.means.astype(np.float64)
@@ -161,11 +153,8 @@ def cameras(
 
     sizes = np.exp(splats.scales.max(axis=1).astype(np.float64))
 
-    def steady(draw: Callable[[], Camera]) -> Camera:
-        """Return the next camera whose image does not depend strongly on tiny changes of positions.
-
-        It does inside a Gaussian, and if one next to the camera is close to the near plane.
-        """
+    def steady(draw):
+        """Return the next camera that is not in a Gaussian, nor next to one that is close to the near plane."""
         while True:
             camera = draw()
             away = np.linalg.norm(means - camera.position, axis=1)
@@ -173,23 +162,23 @@ def cameras(
             if (away > sizes).all() and not ((np.abs(depth - 0.01) < 0.015) & (away < 10 * sizes)).any():
                 return camera
 
-    def direction() -> np.ndarray:
+    def direction():
         vector = rng.normal(size=3)
         return vector / np.linalg.norm(vector)
 
-    def beside(target: np.ndarray, rank: int) -> np.ndarray:
+    def beside(target, rank):
         distances = np.partition(np.linalg.norm(means - target, axis=1), min(rank, len(means) - 1))
         return target + distances[min(rank, len(means) - 1)] * direction()
 
-    def around(rank: int) -> Camera:
+    def around(rank):
         target = means[rng.integers(len(means))]
         return camera_at(beside(target, rank), target, rng, size)
 
-    def across() -> Camera:
+    def across():
         here, there = means[rng.choice(len(means), 2, replace=False)]
         return camera_at(beside(here, 200), there, rng, size)
 
-    def all_around() -> Camera:
+    def all_around():
         return camera_at(middle + 1.5 * extent * direction(), middle + 0.2 * extent * rng.normal(size=3), rng, size)
 
     kinds = {
@@ -201,14 +190,14 @@ def cameras(
     return {kind: [steady(draw) for _ in range(count)] for kind, draw in kinds.items()}
 
 
-def rendered(splats: Splats, camera: Camera) -> Iterator[np.ndarray]:
+def rendered(splats, camera):
     """Yield the rendering over each of :data:`BACKGROUNDS`."""
     image, alpha = render(splats, camera, threads=1)
     for background in BACKGROUNDS:
         yield np.clip(image + background * (1 - alpha.reshape(*image.shape[:2], 1)), 0, 1)
 
 
-def psnrs(reference: Splats, candidate: Splats, views: list[Camera]) -> np.ndarray:
+def psnrs(reference, candidate, views):
     """``(views, backgrounds)`` decibels, at most 100."""
     found = []
     for camera in views:

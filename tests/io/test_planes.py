@@ -172,18 +172,3 @@ def test_damage_inside_the_image_is_refused():
 )
 def test_large_images_take_less_effort_unless_more_than_the_usual_is_asked_for(shape, asked, wanted):
     assert effort_of(shape, *asked) == wanted
-
-
-@pytest.mark.parametrize(
-    ("limit", "asked", "effort"), [(6400, (75, 4), (100, 5)), (6399, (75, 4), (75, 4)), (6400, (50, 6), (100, 6))]
-)
-def test_more_effort_goes_to_small_images_that_gain_from_it(limit, asked, effort):
-    names = ("book.webp", "scales.webp", "means_bytes_0.webp", "f_rest_labels.webp")
-    images = {name: random_image(80, 80, 3) // 16 for name in names} | {"large.webp": random_image(720, 700, 1) // 64}
-    settings = EncodeSettings(high_effort_pixels=limit, webp_quality=asked[0], webp_method=asked[1])
-    with blas_workers(2) as pool:
-        found = compress_images(images, settings, pool, lambda fraction: None, codebook="book.webp")
-    efforts = {"book.webp": (100, 6), "scales.webp": effort}
-    for name, image in images.items():
-        quality, method = efforts.get(name, effort_of(image.shape, *asked))
-        assert found[name] == encode_plane(image, quality=quality, method=method), name

@@ -76,7 +76,7 @@ def test_a_position_of_level_1_by_hand():
 TOLERANCE = {0: 1e-6, 1: 2e-3, 2: 0.5 * 3 / 255 * 1.01}
 
 
-def inside(scene: Splats) -> Splats:
+def inside(scene):
     """Return a scene of attributes that all levels can hold."""
     middle = scene.means / np.abs(scene.means).max() * 2
     arrays = {"scales": np.clip(scene.scales, -8, 3), "shN": np.clip(scene.shN, -1.5, 1.5), "means": middle}
@@ -116,7 +116,7 @@ def test_the_range_of_bytes_is_in_the_header():
 GOOD = ksplat_bytes([made_scene(300, 1)], 1)
 
 
-def overwritten(offset: int, value: bytes) -> bytes:
+def overwritten(offset, value):
     return GOOD[:offset] + value + GOOD[offset + len(value) :]
 
 

@@ -169,9 +169,7 @@ DAMAGED = {
     V3[:60] + bytes(40) + V3[100:]: "is damaged: gzip cannot unpack it; download it again",
     with_header(8, b"\x15"): "is cut short: it unpacks to 596 bytes of 625; download it again",
     with_header(8, b"\0\0\0\1"): "bytes cannot hold what its header declares; download it again",
-    gzip.compress(
-        gzip.decompress(V3) + bytes(1 << 21)
-    ): "unpacks to more bytes than its header declares; it is damaged",
+    gzip.compress(gzip.decompress(V3) + bytes(1 << 21)): "unpacks to more bytes than its header declares; it is",
     V4[:40]: "is cut short: it needs",
     V4[:-1]: "is cut short or damaged: its streams do not end at its last byte; download it again",
     V4[:15] + b"\5" + V4[16:]: "has 5 streams; SH degree 1 needs 6: export it again",

@@ -138,26 +138,6 @@ def test_the_remedy_that_is_named_helps(size, reading, tmp_path):
     assert "positions have steps of" not in report.note
 
 
-def test_few_gaussians_far_apart_get_parts_of_their_own(tmp_path):
-    rng = np.random.default_rng(1)
-    positions = rng.normal(size=(400, 3)) + np.repeat([(0, 0, 0), (1000, 0, 0)], 200, axis=0)
-    scene = write(tmp_path / "a.ply", positions, size=np.repeat([0.03, 0.01], 200))
-    assert "into FOLDER/lod-meta.json does" in kissgs.compress(scene, settings=FAST).report.note
-    report = kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST)
-    assert "positions have steps of" not in report.note
-    found = kissgs.load(tmp_path / "tree" / "lod-meta.json").means
-    nearest = np.linalg.norm(found[:, None] - positions, axis=2).min(axis=1)
-    assert nearest.max() < 0.003
-
-
-def test_streamed_sog_is_no_remedy_for_itself(tmp_path):
-    scene = write(tmp_path / "a.ply", 1000 * around((0, 0, 0), 1000), size=1e-7)
-    assert "files of their own" in kissgs.compress(scene, settings=FAST).report.note
-    note = kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST).note
-    assert "positions have steps of" in note
-    assert "lod-meta.json" not in note
-
-
 def test_a_scene_in_blocks_has_the_origin_of_the_whole_scene(tmp_path):
     scene = write(tmp_path / "a.ply", 1000 * around((3, 0, 0), 500))
     kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST, reading=AUTO)

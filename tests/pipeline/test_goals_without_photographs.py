@@ -78,18 +78,6 @@ def test_a_limited_time_trains_if_it_is_long(monkeypatch, units, trained):
         assert "too little time to train a smaller number" in report.compaction.note
 
 
-@pytest.mark.quick(0)
-def test_a_loss_that_is_estimated_is_called_so_once():
-    """Regression: not where the encoder alone searched."""
-    alone = {"compact": {"auto_count": False}, "finetune": {"enabled": False}}
-    few = {"sensitivity_views": 16, "sensitivity_view_size": 96}
-    for changes in (alone, {"finetune": {"enabled": False}}):
-        chosen = kissgs.Settings.research("balanced", max_psnr_drop=0.5, **changes, **few)
-        report = kissgs.compress(SMALL, settings=chosen).report
-        notes = report.note + ("" if report.compaction is None else report.compaction.note)
-        assert notes.count("the drop of PSNR is estimated for a scene that has 30 dB") == 1
-
-
 def test_ctrl_c_keeps_the_container_of_the_encoder():
     """Pressed in the first training, when containers of the encoder alone exist."""
     stopped = []
@@ -124,11 +112,3 @@ def test_fewer_gaussians_are_no_worse_where_all_are_needed():
     trained, alone = (kissgs.compress(NEEDED, settings=settings(tunes, target_size=wanted)) for tunes in (True, False))
     assert len(trained.to_zip()) <= wanted
     assert psnr(trained, NEEDED) >= psnr(alone, NEEDED) - 0.1
-
-
-@pytest.mark.quick(0)
-def test_the_reported_settings_give_the_same_bytes_for_any_number_of_threads():
-    found = kissgs.compress(FEW, settings=settings(steps=20, max_ssim_drop=0.05), threads=1)
-    assert any(trial.count < len(FEW) for trial in found.report.trials)
-    again = kissgs.compress(FEW, settings=Settings.model_validate(found.report.settings), threads=2)
-    assert again.files == found.files

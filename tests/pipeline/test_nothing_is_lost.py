@@ -1,24 +1,22 @@
 """No visible part of a scene is lost: random cameras everywhere; oracle: ``fast``, which measures no sensitivity."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.whole_scenes import SCENES, cameras, joined, moved, psnrs, two
 
-from kissgs import Settings, Splats, clean, compress, decompress, evaluate, sample_scene
+from kissgs import Settings, clean, compress, decompress, evaluate, sample_scene
 
 VIEWS = 6
 """Number of views of each kind."""
 
 
-def kept(scene: Splats, preset: str, **settings: object) -> Splats:
+def kept(scene, preset, **settings):
     return decompress(compress(scene, settings=Settings.research(preset, **settings)).to_zip())
 
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.quick(1)
-def test_no_view_is_much_worse_than_with_uniform_steps(name: str):
+def test_no_view_is_much_worse_than_with_uniform_steps(name):
     """One view in 24 may be worse: if two large Gaussians have nearly equal depth, rounding may swap their order."""
     scene = clean(SCENES[name]())[0]
     views = [camera for kind in cameras(scene, count=VIEWS).values() for camera in kind]

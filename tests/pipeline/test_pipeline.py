@@ -143,9 +143,6 @@ def test_threads_do_not_change_the_result(threads):
     assert compress(SCENE, threads=threads).to_zip() == compress(SCENE).to_zip()
 
 
-# --- Output ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["scene.zip", "folder", "back.ply"])
 def test_existing_outputs_are_refused_before_the_work(tmp_path, name):
     path = tmp_path / name
@@ -185,12 +182,6 @@ def test_a_folder_of_other_things_is_refused_before_the_work(tmp_path):
         compress(SCENE, folder, overwrite=True, progress=events)
     assert names(folder) == ["thesis.tex"]
     assert events.events == []
-
-
-def test_only_ply_is_decompressed(tmp_path):
-    with pytest.raises(OutputError, match=r"a scene is written as \.ply; use compress to write a container"):
-        kissgs.decompress(b"", tmp_path / "scene.zip")
-    assert names(tmp_path) == []
 
 
 def test_decompressed_numbers_are_exact_whatever_the_name(tmp_path):
@@ -269,9 +260,6 @@ def test_files_have_the_permissions_that_new_files_have(tmp_path):
     assert (tmp_path / "scene.zip").stat().st_mode & 0o777 == 0o640
     assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o750
     assert (tmp_path / "folder" / "meta.json").stat().st_mode & 0o777 == 0o640
-
-
-# --- Input ----------------------------------------------------------------------------------------
 
 
 def test_the_content_decides_and_not_the_name(tmp_path):

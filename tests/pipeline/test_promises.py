@@ -1,13 +1,11 @@
 """The promises of the README for real scenes. Oracle: figures of other encoders on the same files."""
 
 import functools
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import kissgs
-from kissgs.pipeline.pipeline import Compressed
 
 SPZ_SHN_RMSE = 0.0247038
 """Root mean square error of fox' SH after a round trip through splat-transform's .spz, version 4, default bits."""
@@ -26,17 +24,17 @@ SOG_GUITAR = 1_196_155
 
 
 @functools.cache
-def fox(folder: Path) -> tuple[kissgs.Splats, kissgs.Views]:
+def fox(folder):
     return kissgs.load(folder / "fox" / "point_cloud.ply"), kissgs.load_views(folder / "fox")
 
 
 @functools.cache
-def bare_fox(folder: Path) -> Compressed:
+def bare_fox(folder):
     return kissgs.compress(fox(folder)[0])
 
 
 @pytest.mark.quick(0)
-def test_fox_is_small_and_keeps_its_view_dependent_colour(shared_data: Path) -> None:
+def test_fox_is_small_and_keeps_its_view_dependent_colour(shared_data):
     scene, result = fox(shared_data)[0], bare_fox(shared_data)
     assert len(result.to_zip()) <= 0.73 * PAPER_FOX
     errors = kissgs.decompress(result.files).shN.astype(np.float64) - scene.shN[result.order]
@@ -44,7 +42,7 @@ def test_fox_is_small_and_keeps_its_view_dependent_colour(shared_data: Path) -> 
 
 
 @pytest.mark.quick(0)
-def test_fox_keeps_its_psnr(shared_data: Path) -> None:
+def test_fox_keeps_its_psnr(shared_data):
     """Held-out photographs; splat-transform's .spz of the same file loses 2.07 dB, at 1.6 times the bytes."""
     scene, views = fox(shared_data)
     result = kissgs.evaluate(scene, kissgs.decompress(bare_fox(shared_data).files), views)
@@ -57,7 +55,7 @@ def test_fox_keeps_its_psnr(shared_data: Path) -> None:
 
 
 @pytest.mark.quick(0)
-def test_fox_with_its_capture_has_half_the_bytes_of_the_paper(shared_data: Path) -> None:
+def test_fox_with_its_capture_has_half_the_bytes_of_the_paper(shared_data):
     scene, views = fox(shared_data)
     result = kissgs.compress(scene, views=views, evaluate=True)
     assert len(result.to_zip()) <= 0.52 * PAPER_FOX
@@ -70,7 +68,7 @@ def test_fox_with_its_capture_has_half_the_bytes_of_the_paper(shared_data: Path)
 
 
 @pytest.mark.quick(0)
-def test_guitar_at_lower_quality_is_smaller_than_with_other_encoders(shared_data: Path) -> None:
+def test_guitar_at_lower_quality_is_smaller_than_with_other_encoders(shared_data):
     """The default quality equals that of the paper's settings; this one is at most 1.5 dB below."""
     source, settings = (
         shared_data / "guitar" / "guitar.ply",
@@ -85,7 +83,7 @@ def test_guitar_at_lower_quality_is_smaller_than_with_other_encoders(shared_data
 
 
 @pytest.mark.quick(0)
-def test_guitar_by_default_equals_the_paper_in_three_quarters_of_its_bytes(shared_data: Path) -> None:
+def test_guitar_by_default_equals_the_paper_in_three_quarters_of_its_bytes(shared_data):
     result = kissgs.compress(shared_data / "guitar" / "guitar.ply", evaluate=True)
     assert result.report.container_bytes <= 0.72 * PAPER_GUITAR
     seen = result.report.evaluation

@@ -1,14 +1,10 @@
 """Containers under any name and in any kind of zip: all commands agree on what is a container."""
 
-from __future__ import annotations
-
 import io
-import json
 import zipfile
 
 import numpy as np
 import pytest
-from helpers.command_line import run
 
 import kissgs
 from kissgs import InvalidContainerError, KissgsError, Settings, decompress, sample_scene
@@ -16,11 +12,11 @@ from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline.scene_files import describe, is_container, open_scene
 
 
-def zips() -> dict[str, bytes]:
+def zips():
     """Return one container as zips in many forms, by file name."""
     packed = kissgs.compress(sample_scene(50), settings=Settings.from_preset("fast"))
 
-    def again(method: int = zipfile.ZIP_STORED, folder: str = "", comment: bytes = b"") -> bytes:
+    def again(method=zipfile.ZIP_STORED, folder="", comment=b""):
         buffer = io.BytesIO()
         with zipfile.ZipFile(buffer, "w", method) as archive:
             for name, data in packed.files.items():
@@ -77,13 +73,3 @@ def test_a_false_zip_is_refused_by_all_commands(tmp_path):
     for read in (decompress, kissgs.load, describe, kissgs.compress):
         with pytest.raises(KissgsError, match=r"is not a readable zip file|this is an HTML page"):
             read(path)
-
-
-def test_evaluate_and_render_read_what_decompress_reads(tmp_path):
-    program = tmp_path / "program.exe"
-    program.write_bytes(FORMS["program.exe"])
-    assert run("decompress", program, "-o", tmp_path / "a.ply").returncode == 0
-    assert json.loads(run("info", program, "--json").stdout)["kind"] == "sogxt"
-    done = run("evaluate", tmp_path / "a.ply", program, "--json")
-    assert json.loads(done.stdout)["bytes"]["candidate"] == len(FORMS["program.exe"])
-    assert run("render", program, "-o", tmp_path / "a.png", "--size", "64x48").returncode == 0

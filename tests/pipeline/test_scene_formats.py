@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 from helpers.command_line import run
 from helpers.format_scenes import made_scene
@@ -171,29 +170,6 @@ def test_a_limit_of_gaussians_holds_for_descriptions_of_containers(container, tm
         describe(tmp_path / "c", ReadOptions(max_gaussians=count - 1))
 
 
-def test_raw_axes(tmp_path):
-    path = tmp_path / "a.spz"
-    path.write_bytes(spz_bytes(SCENE, 3))
-    raw, turned = kissgs.load(path, raw_axes=True), kissgs.load(path)
-    np.testing.assert_array_equal(raw.means, turned.means * [1, -1, -1])
-    assert_identical(kissgs.decompress(path, raw_axes=True), read_scene(path, ReadOptions(raw_axes=True)))
-
-
-def test_details(tmp_path):
-    wanted = {
-        "a4.spz": {"version": 4, "antialiased": True, "fractional_bits": 12},
-        "a.ksplat": {"compression_level": 1, "sections": 1},
-        "a.glb": {"binary": True, "primitives": 1, "spz": False, "antialiased": False},
-        "a.splat": {},
-        "a.sog": {
-            "version": 2, "antialiased": False, "model": None, "generator": "by hand", "codebook_entries": 30,
-        },
-    }  # fmt: skip
-    for name, details in wanted.items():
-        (tmp_path / name).write_bytes(FILES[name][1])
-        assert describe(tmp_path / name).details == details
-
-
 def test_damaged_files_are_explained_by_the_reader_of_their_ending(tmp_path):
     for name, message in {
         "a.spz": "is not an .spz file",
@@ -209,24 +185,6 @@ def test_damaged_files_are_explained_by_the_reader_of_their_ending(tmp_path):
         assert message in str(error.value)
         with pytest.raises((InvalidSceneError, InvalidContainerError), match="cannot read"):
             kissgs.load(tmp_path / f"absent-{name}")
-
-
-def test_the_command_line_reads_them(tmp_path):
-    for name in ("a.sog", "a2.spz", "a.zip"):
-        (tmp_path / name).write_bytes(FILES[name][1])
-    done = run("compress", tmp_path / "a.sog", "-o", tmp_path / "out.zip", "-p", "fast", "--json")
-    assert json.loads(done.stdout)["source_bytes"] == len(FILES["a.sog"][1])
-    assert run("decompress", tmp_path / "a2.spz", "-o", tmp_path / "b.ply", "--raw-axes").returncode == 0
-    assert_identical(kissgs.load(tmp_path / "b.ply"), kissgs.load(tmp_path / "a2.spz", raw_axes=True))
-    assert run("decompress", tmp_path / "a.zip", "-o", tmp_path / "c.ply", "--level", "1").returncode == 0
-    assert len(kissgs.load(tmp_path / "c.ply")) == 7
-    said = run("info", tmp_path / "a.sog", tmp_path / "a2.spz", tmp_path / "a.zip").stdout.decode()
-    for text in (
-        "SOG container (version 2, by hand)",
-        "SPZ scene (version 2)",
-        "finest first: 30, 5; in the environment, which belongs to every level: 2",
-    ):
-        assert text in said
 
 
 @pytest.mark.parametrize("name", FILES)

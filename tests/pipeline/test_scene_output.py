@@ -1,7 +1,5 @@
 """Scenes written by the ending of their name. Reference: the readers of each format, and the scene itself."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -17,7 +15,7 @@ ENDINGS = [*OUTPUT_FORMATS, "SPZ", "Compressed.PLY"]
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_every_format_is_read_back_by_its_content_or_ending(ending: str, tmp_path: Path) -> None:
+def test_every_format_is_read_back_by_its_content_or_ending(ending, tmp_path):
     scene = kissgs.sample_scene(600, sh_degree=2)
     path = tmp_path / f"a.b.{ending}"
     notes = kissgs.save(scene, path)
@@ -33,7 +31,7 @@ def test_every_format_is_read_back_by_its_content_or_ending(ending: str, tmp_pat
     assert path.read_bytes() == before
 
 
-def test_a_ply_is_exact_and_others_are_cleaned(tmp_path: Path) -> None:
+def test_a_ply_is_exact_and_others_are_cleaned(tmp_path):
     scene = made_scene(20, 1)
     scene.means[3] = np.nan
     scene.quats[4] = 0
@@ -46,7 +44,7 @@ def test_a_ply_is_exact_and_others_are_cleaned(tmp_path: Path) -> None:
     assert np.isnan(scene.means[3]).all(), "the given scene is unchanged"
 
 
-def test_axes_of_spz(tmp_path: Path) -> None:
+def test_axes_of_spz(tmp_path):
     scene = kissgs.sample_scene(50, sh_degree=1)
     kissgs.save(scene, tmp_path / "up.spz")
     kissgs.save(scene, tmp_path / "raw.spz", raw_axes=True)
@@ -56,21 +54,21 @@ def test_axes_of_spz(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.zip", "a.sog", "A.ZIP"])
-def test_names_of_containers_lead_to_compress(name: str, tmp_path: Path) -> None:
+def test_names_of_containers_lead_to_compress(name, tmp_path):
     with pytest.raises(OutputError, match=r"is the name of a container; kissgs compress writes those$"):
         kissgs.save(kissgs.sample_scene(10), tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a", "a.ksplat", "a.gltf", "ply", ".spz.txt", "a.png"])
-def test_other_endings_are_refused(name: str) -> None:
+def test_other_endings_are_refused(name):
     endings = ".ply, .compressed.ply, .spz, .splat, .glb, .spz.glb"
     with pytest.raises(OutputError, match=f"has no ending of a format that is written: {re.escape(endings)}; choose"):
         output_format(Path(name))
 
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
-def test_a_scene_without_gaussians(ending: str, tmp_path: Path) -> None:
+def test_a_scene_without_gaussians(ending, tmp_path):
     """Formats that do not allow it refuse it, and leave no file."""
     path = tmp_path / f"a.{ending}"
     if ending in ("spz", "glb", "spz.glb"):

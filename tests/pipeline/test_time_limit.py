@@ -198,17 +198,6 @@ def test_ctrl_c_while_all_gaussians_are_encoded_keeps_them(tmp_path, monkeypatch
 
 
 @pytest.mark.quick(0)
-def test_an_aim_is_sought_only_while_there_is_time(tmp_path, monkeypatch):
-    scene = cloud(200)
-    views = photographs(scene, tmp_path, brightness=1.0)
-    monkeypatch.setattr("kissgs.pipeline.choice.encode_seconds", lambda *found: LONG / 12.0)
-    monkeypatch.setattr(SearchTime, "expected", lambda *given, **named: math.inf)
-    requested = with_photographs().model_copy(update={"time_limit": LONG})
-    found = kissgs.compress(scene, settings=requested, views=views)
-    assert [trial.count for trial in found.report.trials] == [200]
-
-
-@pytest.mark.quick(0)
 def test_a_goal_that_training_does_not_recover_is_met_by_the_encoder(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
@@ -241,30 +230,6 @@ def test_little_time_makes_one_container_with_few_steps(tmp_path, monkeypatch):
     assert len(found.report.trials) == 1
     assert 0 < found.report.finetuning.steps < 20_000
     assert f"finetune_steps: {found.report.finetuning.steps}" in found.files["container_meta.yaml"].decode()
-
-
-class StopIn:
-    """Receiver that ends the search in the second fine-tuning."""
-
-    def __init__(self):
-        self.tuned, self.last, self.stopped_at = 0, "", None
-
-    def __call__(self, stage, fraction, note=""):
-        self.tuned += stage == "finetune" != self.last
-        self.last = stage
-        if self.tuned == 2 and self.stopped_at is None:
-            self.stopped_at = self.tuned
-            raise kissgs.StopSearch
-
-
-def test_a_stopped_search_for_an_aim_keeps_the_closest_container(tmp_path, monkeypatch):
-    monkeypatch.setattr("kissgs.pipeline.search.RECOVERABLE_DB", math.inf)
-    scene, receiver = cloud(150), StopIn()
-    views = photographs(scene, tmp_path, brightness=1.0)
-    requested = with_photographs().model_copy(update={"time_limit": LONG})
-    found = kissgs.compress(scene, settings=requested, views=views, progress=receiver)
-    assert receiver.stopped_at == 2
-    assert [trial.bytes for trial in found.report.trials] == [len(found.to_zip())]
 
 
 def test_a_short_search_prunes_no_further_than_it_trains(tmp_path, monkeypatch):

@@ -101,9 +101,6 @@ def test_neighbours_on_the_grid_are_near_in_space(order):
     assert sideways < 0.5 * 0.66, "two random points of a unit cube are 0.66 apart"
 
 
-# Order along principal axes.
-
-
 def test_bands_blocks_rows_and_columns_follow_the_axes():
     coordinates = np.random.default_rng(0).normal(size=(24 * 24, 6)).astype(np.float32)
     order = axes_order(coordinates)

@@ -200,9 +200,6 @@ def test_signed_log_and_its_inverse(values):
     np.testing.assert_allclose(signed_exp(logs), values.astype(np.float64), rtol=1e-12)
 
 
-# Tables of values.
-
-
 def table_error(table, values, weights):
     return float(weights @ np.square(values[:, None] - table).min(axis=1))
 

@@ -10,14 +10,7 @@ import kissgs
 from kissgs.core.resources import Workers
 from kissgs.planning.quantize import quantize
 from kissgs.planning.rd_criterion import Costs, RdCriterion, step
-from kissgs.planning.rd_fields import (
-    CAPTURED,
-    UNSEEN,
-    VIRTUAL,
-    largest_changes,
-    quantize_by_steps,
-    rdo_quantize,
-)
+from kissgs.planning.rd_fields import CAPTURED, UNSEEN, VIRTUAL, largest_changes, quantize_by_steps, rdo_quantize
 
 
 def anything(count):

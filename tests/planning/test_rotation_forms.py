@@ -151,9 +151,6 @@ def test_covariance_error_of_extreme_sizes_is_finite(gaussians, size):
     assert covariance_error(quats, scales, *apply_forms(quats, scales, canonical_forms(quats))) < 1e-6
 
 
-# Rotations as three components.
-
-
 def angles(p, q):
     return 2 * np.arccos(np.clip(np.abs((p * q).sum(axis=1)), 0, 1))
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.page_server import serving
 from helpers.preview_browser import colours, preview, psnr, software_browser  # noqa: F401  fixtures
-from helpers.streamed_scenes import small_sizes
+from helpers.streamed_scenes import write_small
 from helpers.viewers import scattered
 
 import kissgs
@@ -26,11 +26,7 @@ NAME = "city 100%41 \N{SNOWMAN}"
 def city(tmp_path_factory):
     """A folder with levels of 1,200, 600, 300 and 150 Gaussians in 16 leaves."""
     folder = tmp_path_factory.mktemp("streamed")
-    kissgs.save(scattered(1200, 1), folder / "scene.ply")
-    with pytest.MonkeyPatch.context() as patch:
-        small_sizes(patch, chunk=400, leaf=80, coarsest=200)
-        settings = kissgs.Settings(preset="fast")
-        kissgs.compress_streamed(folder / "scene.ply", folder / NAME / "lod-meta.json", settings=settings)
+    write_small(scattered(1200, 1), folder / NAME / "lod-meta.json", chunk=400, leaf=80, coarsest=200)
     return folder / NAME
 
 
@@ -133,27 +129,6 @@ def test_a_phone_and_another_scene_afterwards(server, opened):
     tab.fact("Gaussians", "100")
 
 
-@pytest.mark.quick(0)  # in tests/web/test_streamed_preview.py, without the page
-def test_a_small_budget(server, opened):
-    """Nothing of the finest level is loaded from afar; near one end, some of its files are."""
-    server.gate.set()
-    tab = opened(budget=400)
-    settle(tab)
-    far = asked(tab)
-    drawn = int(facts(tab)["Gaussians drawn"][0].replace(",", ""))
-    assert 150 < drawn <= 400
-    assert facts(tab)["At most"] == ("400", "on this device")
-    assert not any(name.startswith("0_") for name in far)
-    tab.page.locator("#viewport").focus()
-    for _ in range(85):  # to the far end of the scene
-        tab.page.keyboard.press("w")
-    tab.page.wait_for_timeout(300)
-    settle(tab)
-    finest = {name[:3] for name in asked(tab) if name.startswith("0_")}
-    assert 0 < len(finest) < 4
-    assert int(facts(tab)["Gaussians drawn"][0].replace(",", "")) <= 400
-
-
 def test_a_missing_file_and_a_damaged_list(server, opened):
     server.gate.set()
     (lost,) = [path for path in server.contents if path.endswith("0_1/scales.webp")]
@@ -186,18 +161,15 @@ def test_a_missing_file_and_a_damaged_list(server, opened):
 
 @pytest.mark.parametrize("apart", [False, True])
 @pytest.mark.quick(1)
-def test_the_first_camera_is_within_the_sky(preview, tmp_path, apart):  # noqa: F811
+def test_the_first_camera_is_within_the_sky(preview, tmp_path, monkeypatch, apart):  # noqa: F811
     """A sky that is much of the coarsest level does not decide where the camera stands; nor does an environment."""
     near = scattered(1000, 0)
     sky = scattered(140, 1)
     far = 12 * sky.means / np.linalg.norm(sky.means, axis=1, keepdims=True)
     sky = replace(sky, means=far, scales=sky.scales + 3.5, opacities=sky.opacities + 8, shN=near.shN[:140])
-    kissgs.save(concatenate([near, sky]), tmp_path / "scene.ply")
-    with pytest.MonkeyPatch.context() as patch:
-        small_sizes(patch, chunk=2000, leaf=600, coarsest=200)
-        patch.setattr(environment, "FEWEST", 100 if apart else 1000)
-        settings = kissgs.Settings(preset="fast")
-        kissgs.compress_streamed(tmp_path / "scene.ply", tmp_path / "city" / "lod-meta.json", settings=settings)
+    monkeypatch.setattr(environment, "FEWEST", 100 if apart else 1000)
+    target = tmp_path / "city" / "lod-meta.json"
+    write_small(concatenate([near, sky]), target, chunk=2000, leaf=600, coarsest=200)
     coarsest = kissgs.load(tmp_path / "city", level=3)
     assert np.mean(np.linalg.norm(coarsest.means, axis=1) > 8) > 0.3
     assert (tmp_path / "city" / "environment").exists() == apart

@@ -8,14 +8,13 @@ import pytest
 from helpers.page_server import ask, serving
 from helpers.reference_sog import write_folder
 from helpers.small_page import FILES
-from helpers.streamed_scenes import SOG, small_sizes
+from helpers.streamed_scenes import SOG, write_small
 from helpers.viewers import scattered
 
 import kissgs
 from kissgs import preview as module
 from kissgs.core.errors import InvalidContainerError
 from kissgs.preview import fitting_level, is_streamed_folder, streamed_folder
-from kissgs.streaming.compress import compress_streamed
 
 NAME = "two words % & ü"
 
@@ -23,12 +22,7 @@ NAME = "two words % & ü"
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
-    kissgs.save(scattered(300, 1), folder / "scene.ply")
-    with pytest.MonkeyPatch.context() as patch:
-        small_sizes(patch, chunk=200, leaf=50, coarsest=100)
-        compress_streamed(
-            folder / "scene.ply", folder / NAME / "lod-meta.json", settings=kissgs.Settings(preset="fast")
-        )
+    write_small(scattered(300, 1), folder / NAME / "lod-meta.json", chunk=200, leaf=50, coarsest=100)
     return folder / NAME
 
 

@@ -8,13 +8,37 @@ from pathlib import Path
 
 import pytest
 from helpers.ray_cluster import NODE_MEMORY
-from helpers.ray_service import RayService
 from helpers.running import is_alive, processors, wait_until
 from helpers.service import FAST, SLOW, SMALL, Service, ServiceProcess, events, scene_bytes
 
 import kissgs
 from service.core.settings import ServiceSettings, SettingsError
 from service.http.app import create_app
+
+
+class RayService(ServiceProcess):
+    """A service and a cluster of nodes with one processor each, which see no data folder but those that are shared."""
+
+    workers = 2
+
+    def __init__(self, folder, cluster, **settings):
+        self.cluster = cluster
+        fixed = {
+            "KISSGS_RUNNER": cluster.address,
+            "KISSGS_WORKERS": self.workers,
+            "KISSGS_JOB_MEMORY": NODE_MEMORY,
+            "KISSGS_JOB_THREADS": 1,
+        }
+        super().__init__(folder, **{**fixed, **settings})
+
+    def children(self):
+        """Return the ids of the processes of all jobs; decoding, which stays with the service, is not counted."""
+        return self.cluster.items()
+
+    def leftovers(self):
+        """Return the paths of what no job should have left, in the data folder and on nodes."""
+        return [*super().leftovers(), *self.cluster.left_by_items()]
+
 
 MEDIUM = scene_bytes(4000, 2)
 ON_THIS_MACHINE = {"KISSGS_JOB_MEMORY": NODE_MEMORY, "KISSGS_WORKERS": 2, "KISSGS_JOB_THREADS": 1}

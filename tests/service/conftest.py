@@ -1,7 +1,4 @@
-"""Fixtures: a service that tests share, and new ones, whose jobs are threads.
-
-How they run in processes, and on other machines, is tested in tests/runners and test_faults.py.
-"""
+"""Fixtures: a service that tests share, and new ones, whose jobs are threads (processes: see tests/runners)."""
 
 import pytest
 from helpers.data_folders import jobs_folder, no_variables, sample_folder  # noqa: F401

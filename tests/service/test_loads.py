@@ -10,7 +10,6 @@ import socket
 import threading
 import time
 import uuid
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import uvicorn
@@ -112,16 +111,6 @@ def test_a_decoding_ends_with_its_job(start):
     assert str(service.folder) not in answers[0].text[:2000]
     assert list((service.folder / "jobs").iterdir()) == []
     assert service.http.get("/readyz").status_code == 200
-
-
-@pytest.mark.quick(0)
-def test_simultaneous_requests_decode_once(start):
-    service = start()
-    job = service.ended(service.submit())
-    with ThreadPoolExecutor(5) as pool:
-        answers = list(pool.map(lambda _: service.http.get(job["links"]["decoded"]), range(5)))
-    assert len({answer.content for answer in answers}) == 1
-    assert {answer.status_code for answer in answers} == {200}
 
 
 def test_an_error_in_the_job_process_is_internal(tmp_path):

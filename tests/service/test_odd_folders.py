@@ -46,18 +46,6 @@ def assert_orphaned(folder, change, elsewhere, before):
         assert listing(elsewhere) == before
 
 
-def test_deleting(start, tmp_path):
-    it = start()
-    job = it.ended(it.submit())
-    folder = it.folder / "jobs" / job["id"]
-    before = listing(folder)
-    a_link(folder, tmp_path / "elsewhere")
-    assert it.http.delete(f"/v1/jobs/{job['id']}").status_code == 204
-    problem(it.http.get(f"/v1/jobs/{job['id']}"), 404, "not-found")
-    assert_orphaned(folder, a_link, tmp_path / "elsewhere", before)
-    assert f"job {job['id']}: its folder was not created by the service and was moved to" in it.log.read_text()
-
-
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.usefixtures("no_variables")
 def test_expiring(tmp_path, change):
@@ -128,9 +116,6 @@ def test_recovery_follows_no_links(tmp_path):
     assert [listing(tmp_path / job) for job in jobs] == before
 
 
-# Results that cannot be stored ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("no_variables")
 def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
     """A folder that was not empty once blocked its worker for ever."""
@@ -153,9 +138,6 @@ def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
         context.storage.jobs.rename(tmp_path / "away")  # which may come back
         assert not any(map(is_permanent, errors))
         (tmp_path / "away").rename(context.storage.jobs)
-
-
-# Folders that disappear ----------------------------------------------------------------------------------
 
 
 def test_readiness(start, monkeypatch):

@@ -16,23 +16,6 @@ def test_the_document_equals_the_snapshot(service):
     assert service.http.get("/openapi.json").json() == expected
 
 
-def test_everything_is_documented(service):
-    document = service.http.get("/openapi.json").json()
-    assert len(document["info"]["description"]) > 100
-    for path, operations in document["paths"].items():
-        for method, operation in operations.items():
-            where = f"{method} {path}"
-            assert operation["summary"], where
-            assert operation["description"], where
-            assert operation["operationId"], where
-            for parameter in operation.get("parameters", []):
-                assert parameter["description"], (where, parameter["name"])
-            for status, answer in operation["responses"].items():
-                assert answer["description"], (where, status)
-                if int(status) >= 400 and status != "503":
-                    assert list(answer["content"]) == ["application/problem+json"], (where, status)
-
-
 def test_keys_are_documented(start):
     guarded = start(KISSGS_KEYS=f"alice:{'0' * 64}").http.get("/openapi.json").json()
     assert guarded["paths"]["/v1/jobs"]["post"]["security"] == [{"HTTPBearer": []}]

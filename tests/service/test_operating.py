@@ -11,9 +11,7 @@ from helpers.service import SMALL
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from service import cli
-from service.core.schemas import Health
 from service.core.settings import ServiceSettings, SettingsError
-from service.jobs import container
 
 
 @pytest.fixture
@@ -105,32 +103,6 @@ def test_health(service):
     ready = service.http.get("/readyz")
     assert ready.json() == {"ready": True, "checks": {"worker": "ok", "database": "ok", "disk": "ok"}}
     assert service.http.get("/version").json()["container"] == "SOG-XT"
-
-
-def test_readiness_is_checked_every_two_seconds(monkeypatch):
-    """Every request once wrote to the disk, and strangers slowed submissions down with it."""
-    running = checks = 0
-
-    async def check():
-        nonlocal running, checks
-        running, checks = running + 1, checks + 1
-        assert running == 1
-        await asyncio.sleep(0.01)
-        running -= 1
-        return Health(ready=checks == 1, checks={})
-
-    async def ask(readiness):
-        found = await asyncio.gather(*(readiness.health(check) for _ in range(50)))
-        return {health.ready for health in found}
-
-    async def ask_twice():
-        readiness = container.Readiness()
-        assert await ask(readiness) == await ask(readiness) == {True}
-        monkeypatch.setattr(container, "READY_SECONDS", 0.0)
-        assert False in await ask(readiness)
-
-    assert container.READY_SECONDS <= 2
-    asyncio.run(ask_twice())
 
 
 @pytest.mark.usefixtures("no_variables")

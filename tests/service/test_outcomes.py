@@ -1,7 +1,4 @@
-"""How starts of jobs end: lost, not possible now, or recorded by a database that fails in between.
-
-Oracles: the outcomes and the log, the times that the guide states, and what one undisturbed record leaves.
-"""
+"""How starts of jobs end. Oracles: the log, the times that the guide states, and what an undisturbed record leaves."""
 
 import asyncio
 import logging
@@ -25,9 +22,6 @@ pytestmark = pytest.mark.usefixtures("no_variables")
 def context(tmp_path):
     with service(tmp_path / "data") as it:
         yield it
-
-
-# What a cluster answers ---------------------------------------------------------------------------------------------
 
 
 class Cluster:
@@ -96,8 +90,6 @@ def test_a_reason_of_the_runner_reaches_the_worker():
     assert outcome == postponed("no more processes")
 
 
-# Pauses -------------------------------------------------------------------------------------------------------------
-
 LOST = Outcome("lost", code="crashed", message="the machine was lost")
 
 
@@ -122,14 +114,14 @@ def run(context, job, outcome, meanwhile=None):
 
 
 def test_the_pause_after_a_lost_start_grows(context, monkeypatch):
-    monkeypatch.setattr(worker_module, "LOST_SECONDS", 0.2)
+    monkeypatch.setattr(worker_module, "LOST_SECONDS", 0.02)
     job_id, pauses = add_a_job(context), []
     for start in range(1, context.settings.job_starts + 1):
         job = context.store.claim()
         assert job.starts == start
         pauses.append(run(context, job, LOST))
     assert context.store.get(job_id).state == State.FAILED
-    assert all(pause >= 0.2 * 2**start for start, pause in enumerate(pauses[:-1]))
+    assert all(pause >= 0.02 * 2**start for start, pause in enumerate(pauses[:-1]))
 
 
 @pytest.mark.parametrize("end", ["a stop", "a cancellation"])
@@ -169,8 +161,6 @@ def test_starts_that_are_not_possible_are_logged_once_and_rarely_tried(context, 
     run(context, context.store.claim(), reason)
     assert pauses[-1] == 1
 
-
-# Records ------------------------------------------------------------------------------------------------------------
 
 SUMMARY = {"count": 3, "seconds": {"total": 1.0}, "cpu_seconds": 1.0, "container": {"bytes": 2}, "files": {}}
 DONE = Outcome("done", SUMMARY)

@@ -3,12 +3,8 @@
 import asyncio
 import base64
 import hashlib
-import json
-import re
 import shutil
-from html.parser import HTMLParser
 from pathlib import Path
-from urllib.parse import urljoin
 
 import httpx
 import pytest
@@ -174,42 +170,3 @@ def test_only_a_result_has_a_preview(service):
     assert service.ended(job)["links"]["preview"] == f"/preview/{job['id']}"
     failed = service.http.post(service.submit()["links"]["cancel"]).json()
     assert "preview" not in failed["links"] or failed["state"] == "succeeded"
-
-
-class Addresses(HTMLParser):
-    """Parser that collects the addresses that a page loads in ``found``."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.found, self._tag = set(), {}
-        self.feed(page)
-
-    def handle_starttag(self, tag, attributes):
-        self._tag = dict(attributes)
-        self.found |= {self._tag.get("src"), self._tag.get("href") if tag == "link" else None} - {None}
-
-    def handle_data(self, text):
-        if self._tag.get("type") == "importmap":
-            self.found |= {address for address in json.loads(text)["imports"].values() if not address.endswith("/")}
-        self._tag = {}
-
-
-def test_all_files_of_the_page_exist(service):
-    """Follow the imports of modules from the page's address."""
-    here = service.url + "/preview/" + "0" * 32
-    page = service.http.get(here).text
-    named = {address for address in Addresses(page).found if not address.startswith("data:")}
-    waiting, seen = {urljoin(here, address) for address in named}, set()
-    assert len(waiting) >= 3
-    while waiting - seen:
-        address = (waiting - seen).pop()
-        seen.add(address)
-        assert address.startswith(f"{service.url}/preview/"), address
-        if "/vendor/" in address and not VENDOR.exists():
-            continue
-        answer = service.http.get(address)
-        assert answer.status_code == 200, address
-        if address.endswith(".js") and "/vendor/" not in address:
-            code = re.sub(r"/\*.*?\*/", "", answer.text, flags=re.DOTALL)  # where types are imported
-            named = re.findall(r'(?:\bfrom|\bimport|\bimport\(|new URL\() ?"(\.[^"]+)"', code)
-            waiting |= {urljoin(address, name) for name in named}

@@ -75,6 +75,7 @@ def test_dropping_files(preview, service, tmp_path):
         ("letter.txt", b"Dear reader,\n" * 99, ["zip"]),
         ("half.zip", ZIP[: len(ZIP) // 2], ["zip"]),
         ("half.ply", PLY[: len(PLY) // 2], ["half.ply"]),
+        ("garden.glb", b"anything", ["does not open glTF", '"kissgs view garden.glb"']),
         ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", ["mesh.ply"]),
     ],
 )
@@ -222,31 +223,6 @@ def test_no_horizontal_overflow_of_the_preview(preview, service):
         assert tools["x"] + tools["width"] <= width
 
 
-def served(tab, service, data, name="garden.zip"):
-    """Open the preview with the address of a zip."""
-    tab.page.route(f"{service.url}/{name}", lambda route: route.fulfill(body=data))
-    return tab.open(service, f"?src=../{name}")
-
-
-def statistics(tab):
-    """Return the text of the statistics without the loading time."""
-    return re.sub(r"Loaded in\s+\S+ \S+", "", tab.page.locator("#statistics").inner_text())
-
-
-@pytest.mark.quick(0)
-def test_an_address_and_a_file_have_the_same_statistics(preview, service):
-    tab = served(preview(), service, ZIP)
-    tab.shown(COUNT)
-    assert tab.page.get_by_role("heading", name="garden").is_visible()
-    remote = statistics(tab)
-    assert f"{len(ZIP):,}" in remote
-    tab.drop(("b.zip", OTHER))
-    tab.shown(OTHERS)
-    tab.drop(("garden.zip", ZIP))
-    tab.shown(COUNT)
-    assert statistics(tab) == remote
-
-
 def test_what_cannot_be_shown(preview, service):
     """Invalid addresses, a scene without Gaussians, and a small file that claims to be a large scene."""
     tab = preview()
@@ -335,24 +311,6 @@ window.pixelsOf = (canvas) => [...canvas.getContext("2d").getImageData(0, 0, can
 """
 
 
-@pytest.mark.quick(0)
-def test_thumbnails_are_painted_in_turn(preview, service):
-    tab = preview()
-    tab.page.add_init_script(IDLE)
-    tab.open(service)
-    tab.drop(("a.zip", ZIP))
-    tab.shown(COUNT)
-    for done in range(4):
-        assert tab.page.evaluate("painted()") == [at < done for at in range(9)]
-        assert tab.page.evaluate("waiting.length") == 1
-        tab.page.evaluate("waiting.shift()()")
-    tab.drop(("b.zip", OTHER))
-    tab.shown(OTHERS)
-    assert tab.page.evaluate("waiting.length") == 2
-    tab.page.evaluate("waiting.shift()()")  # belongs to the previous scene
-    assert tab.page.evaluate("[waiting.length, painted()[0]]") == [1, False]
-
-
 @pytest.mark.parametrize("idle", [True, False])
 @pytest.mark.quick(1)
 def test_planes_show_their_levels(preview, service, idle):
@@ -372,21 +330,3 @@ def test_planes_show_their_levels(preview, service, idle):
         assert thumb.locator("canvas").evaluate("(it) => pixelsOf(it)") == levels.ravel().tolist()
         thumb.click()
         assert tab.page.locator(".plane canvas").evaluate("(it) => pixelsOf(it)") == levels.ravel().tolist()
-
-
-@pytest.mark.quick(0)
-def test_a_scene_without_positions_hides_the_previous_one(preview, service):
-    """The second scene has damaged positions, so the drawing of the first is hidden until a third is loaded."""
-    tab = preview().open(service)
-    tab.choose(("first.zip", ZIP), button="#choose")
-    tab.shown(COUNT)
-    damaged = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(OTHER)) as whole, zipfile.ZipFile(damaged, "w") as archive:
-        for name in whole.namelist():
-            archive.writestr(name, whole.read(name)[: 30 if name == "means_bytes_1.webp" else None])
-    tab.choose(("second.zip", damaged.getvalue()))
-    tab.error_message("means_bytes_1.webp")
-    tab.page.locator("#empty").wait_for()
-    assert not tab.page.locator("#viewport").is_visible()
-    tab.choose(("third.zip", ZIP))
-    assert colours(tab.shown(COUNT)) > 3000

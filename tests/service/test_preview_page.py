@@ -8,9 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from helpers.format_scenes import made_scene
 from helpers.preview_browser import assert_readout, colours, psnr
-from helpers.reference_sog import sog_files, zip_of
 from helpers.service import FAST, scene_bytes
 from PIL import Image
 
@@ -461,43 +459,3 @@ def test_without_the_vendor_folder(preview, service, xt):
     assert "Column 0, row 0" in tab.page.locator(".readout").inner_text()
     assert tab.page.locator("#problem").is_visible()
     tab.expect_errors("^404 .*vendor", "Failed to load resource.*404")
-
-
-# Files of SOG --------------------------------------------------------------------------------------------------------
-
-FILES = sog_files(made_scene(65, 1, extremes=False))
-FILES_V1 = sog_files(made_scene(65, 1, extremes=False), version=1)
-
-
-def as_png(files):
-    """Return files whose images are PNG, under names of their own."""
-    meta, changed = files["meta.json"].decode(), {}
-    for name in [name for name in files if name != "meta.json"]:
-        buffer, renamed = io.BytesIO(), f"plane{len(changed)}.png"
-        Image.open(io.BytesIO(files[name])).save(buffer, "PNG")
-        changed[renamed] = buffer.getvalue()
-        meta = meta.replace(name, renamed)
-    return {"meta.json": meta.encode(), **changed}
-
-
-@pytest.mark.quick(0)
-def test_files_of_other_encoders(preview, service):
-    """Version 1, and PNG under other names, give the same image as version 2 does."""
-    tab = preview().open(service)
-    images = []
-    for name, files in (("two", FILES), ("png", as_png(FILES)), ("one", FILES_V1)):
-        tab.drop((f"{name}.sog", zip_of(files)))
-        tab.page.get_by_role("heading", name=name, exact=True).wait_for()
-        images.append(tab.shown(65))
-    assert colours(images[0]) > 500
-    assert psnr(images[1], images[0]) > 60
-    assert psnr(images[2], images[0]) > 35  # other levels
-
-
-def test_an_unsuitable_file(preview, service):
-    tab = preview().open(service)
-    tab.drop(("other.sog", zip_of({"notes.txt": b"hello"})))
-    tab.error_message("no SOG-XT or SOG container", "meta.json")
-    tab.drop(("garden.glb", b"anything"))
-    tab.error_message("does not open glTF", '"kissgs view garden.glb"')
-    assert tab.page.locator("#empty").is_visible()

@@ -59,9 +59,6 @@ def test_options_that_an_older_version_accepted_are_kept(tmp_path):
         assert (settings.encode.seed, settings.encode.sh_step, settings.compact.seed) == (3, 1.0, 0)
 
 
-# A database that is older than the folder ----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("upload", ["kept", "gone"])
 @pytest.mark.parametrize("state", ["waiting", "running"])
 def test_a_result_without_a_record_is_recovered(tmp_path, state, upload, caplog):
@@ -97,9 +94,6 @@ def test_a_job_during_which_the_service_ends_fails_after_its_last_start(tmp_path
         job = context.store.get(job_id)
         assert (job.state, job.problem["code"]) == (State.FAILED, "crashed")
         assert f"ended {most} times while the job ran" in job.problem["detail"]
-
-
-# Missing folders -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("change", ["emptied", "moved away", "of other jobs"])
@@ -166,8 +160,6 @@ def test_a_result_of_a_job_that_failed_is_kept(two_jobs):
         assert listing(folder / "jobs" / ".orphaned" / running) == before
         assert not (folder / "jobs" / waiting).exists()  # without a result, the folder is removed
 
-
-# Damage -----------------------------------------------------------------------------------------------------
 
 DAMAGES = {
     "cut off": lambda result: (result / "summary.json").write_text('{"container": {"by'),

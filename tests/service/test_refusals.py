@@ -65,22 +65,6 @@ def test_hostile_scenes(service, kind, form):
     assert not found["retryable"]
 
 
-@pytest.mark.quick(0)
-def test_errors_in_the_body_fail_the_job(service):
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    text = header(2, "".join(f"property float {name}\n" for name in names), "ascii") + b"1 2 three\n" * 50
-    found = service.ended(submit(service, text).json())
-    assert (found["state"], found["problem"]["code"]) == ("failed", "invalid-scene")
-    assert "line" in found["problem"]["detail"]
-    assert "/" not in found["problem"]["detail"]
-    assert found["problem"]["type"] == "/v1/problems/invalid-scene"
-    answer = service.http.get(f"/v1/jobs/{found['id']}/result")
-    assert found["problem"]["detail"] in problem(answer, 409, "not-succeeded")["detail"]
-    direct = service.http.post("/v1/compress", content=text)
-    assert problem(direct, 422, "invalid-scene")["detail"] == found["problem"]["detail"]
-
-
 def test_too_many_gaussians_are_refused_after_the_header(service):
     """The rest of the body is never sent."""
     start = scene_bytes(1, 1).replace(b"vertex 1\n", b"vertex 20001\n")[:2000]
@@ -119,7 +103,8 @@ def test_too_large(service, chunked):
 INVALID_OPTIONS = [
     *("", "{", "[]", "null", "7", "{" * 5000, '{"x": 1}', '{"preset": "tiny"}', '{"evaluate": "perhaps"}'),
     *('{"encode": {"gaussians_per_codebook_entry": -1}}', '{"encode": {"nothing": 1}}'),
-    *('{"encode": {"seed": 1e400}}', '{"encode": null}'),
+    *('{"encode": {"seed": 1e400}}', '{"encode": null}', '{"format": "spz"}', '{"format": ["sog"]}'),
+    *('{"compact": {"count": 5, "ratio": 0.1}}', '{"compact": {"auto_count": true}}'),
 ]
 
 

@@ -51,22 +51,6 @@ def test_remote_compression_equals_local_compression(service, scene, tmp_path):
     assert received[-1] == ("download", 1.0)
 
 
-@pytest.mark.quick(0)
-def test_training_notes_are_received(service, scene, tmp_path):
-    changes = {"count": 100, "sparsify_steps": 4, "refine_steps": 4, "views": 24, "view_size": 48}
-    received = []
-    with kissgs.Remote(service.url) as remote:
-        remote.compress(
-            scene,
-            tmp_path / "x.zip",
-            settings=kissgs.Settings.research("fast", compact=changes),
-            progress=lambda *event: received.append(event),
-        )
-    notes = {stage: note for stage, _, *optional in received for note in optional}
-    assert notes.keys() == {"sparsify", "refine"}
-    assert all(note.startswith("1") and "Gaussians" in note for note in notes.values())
-
-
 @pytest.mark.parametrize(
     ("data", "kind", "message"),
     [

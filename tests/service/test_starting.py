@@ -41,9 +41,6 @@ def test_a_start_after_the_jobs_were_moved_away(jobs_folder):
     assert len(list((jobs_folder / "old").iterdir())) == 12
 
 
-# Orphaned folders ---------------------------------------------------------------------------------------------------
-
-
 def test_folders_of_unknown_jobs_are_moved(jobs_folder, caplog):
     """The database is an older copy without the latest job."""
     known = names(jobs_folder / "jobs")

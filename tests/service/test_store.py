@@ -7,7 +7,7 @@ import pytest
 from helpers.data_folders import add_a_row as add
 
 from service.core.models import ENDED, State
-from service.jobs.status import QueueEstimator, job_status
+from service.jobs.status import QueueEstimator
 from service.storage.job_records import Store
 
 ALLOWED = {
@@ -58,26 +58,6 @@ def test_owners_take_turns(store):
     assert [job.number for job in after_one] == started[1:]
     late = [add(store, owner, max_owner=9) for owner in "abd"]
     assert [store.claim().number for _ in late] == [late[2].number, late[1].number, late[0].number]
-
-
-def test_the_queue_is_read_once_for_each_change_of_it(store, monkeypatch):
-    """A list of 100 jobs with 195 queued once took 193 ms. Oracle: the number of readings."""
-    jobs = [add(store, str(i % 3), max_queue=99, max_owner=99) for i in range(30)]
-    read, readings = store.active, []
-    monkeypatch.setattr(store, "active", lambda: readings.append(1) or read())
-    estimator = QueueEstimator(store, 1)
-    for change in (
-        lambda: None,
-        store.claim,
-        lambda: store.move(jobs[20].number, State.CANCELLED),
-        lambda: add(store, max_queue=99),
-    ):
-        change()
-        readings.clear()
-        for job in jobs * 3:
-            job_status(store.get(job.id), estimator.current())
-        assert len(readings) == 1
-        store.progress(jobs[0].number, "codebook", 0.5)
 
 
 def run_together(*calls):

@@ -40,10 +40,7 @@ def test_the_default_is_balanced_and_presets_differ():
 @pytest.mark.parametrize("made", [Settings.from_preset, Settings.research])
 @pytest.mark.parametrize("preset", list(Preset))
 def test_settings_survive_json(preset, made):
-    """Reports, jobs and work items carry them; they must give the same settings again, and the same JSON.
-
-    A default of 7 where others write 7.0 made two containers of one scene differ by two bytes of metadata.
-    """
+    """A default of 7 where others write 7.0 made two containers of one scene differ by two bytes of metadata."""
     changes = {"sh_step": 2, "compact": {"views": 5}} if made == Settings.research else {"compact": {"ratio": 0.5}}
     chosen = made(preset, seed=7, **changes)
     for again in (chosen.model_dump(mode="json"), chosen.model_dump(mode="json", exclude_unset=True)):

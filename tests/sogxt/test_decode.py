@@ -124,9 +124,6 @@ def test_labels_between_the_codebook_side_and_its_end_reach_into_the_next_row():
     reference_decoder.assert_equal_scenes(decompress(files), reference_decoder.decode(files), files)
 
 
-# --- What is refused ------------------------------------------------------------------------------
-
-
 def refusal(files):
     with pytest.raises(InvalidContainerError) as caught:
         decompress(files)

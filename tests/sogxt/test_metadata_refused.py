@@ -131,9 +131,6 @@ def test_images_other_than_webp_are_unsupported_by_name():
     assert refusal(with_document(changed), UnsupportedError) == sentence
 
 
-# --- YAML that is refused -------------------------------------------------------------------------
-
-
 def test_no_metadata_at_all():
     sentence = (
         "this is no container: it has neither container_meta.yaml nor meta.json, and no lod-meta.json or "
@@ -155,9 +152,6 @@ def test_metadata_of_megabytes_is_refused_unread():
     sentence = f"has {len(text)} bytes; the limit for this file is {MAX_METADATA_BYTES}"
     assert refusal({"container_meta.yaml": text}) == f"container_meta.yaml {sentence}"
     assert refusal({"meta.json": text}) == f"meta.json {sentence}"
-
-
-# --- Bombs: a few bytes that would grow without bounds --------------------------------------------
 
 
 def laughs(depth):

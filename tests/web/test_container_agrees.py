@@ -15,8 +15,7 @@ FILES = container("fast", 1, 20)
 YAML, JSON = "container_meta.yaml", "meta.json"
 MARKED = dict(
     compress(
-        replace(scene_of(20, 1), antialiased=True, origin=(5000000.0, -2.5, 0.0)),
-        settings=Settings.from_preset("fast"),
+        replace(scene_of(20, 1), antialiased=True, origin=(5000000.0, -2.5, 0.0)), settings=Settings.from_preset("fast")
     ).files
 )
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")

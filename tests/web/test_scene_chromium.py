@@ -3,15 +3,7 @@
 import json
 
 import pytest
-from helpers.web_scenes import (
-    IMAGES,
-    assert_progress,
-    assert_scene,
-    container,
-    job,
-    without_checksums,
-    zipped,
-)
+from helpers.web_scenes import IMAGES, assert_progress, assert_scene, container, job, without_checksums, zipped
 from helpers.web_tools import Site
 
 MAX_ULPS = 1
@@ -106,16 +98,6 @@ def test_all_options_of_decoding(do, site, options, within, large):
         assert_progress(report)
 
 
-@pytest.mark.parametrize("preset", ["fast", "paper"])
-@pytest.mark.quick(1)
-def test_small_scenes(do, preset):
-    for count, degree in ((0, 0), (0, 3), (1, 0), (8, 1), (65, 0), (65, 3)):
-        files = container(preset, degree, count)
-        report = do(job(files, options={"keepPlanes": True}))
-        assert assert_scene(report, files) <= MAX_ULPS
-        assert_progress(report)
-
-
 def test_the_browser_decodes_all_but_rotations_exactly(do, large):
     """Eight images, verified by checksums; without workers, calls of the page's own decoder can be counted."""
     report = do(job(large, options={"workers": 0}))
@@ -200,28 +182,10 @@ def test_from_another_origin(do, site, large):
     """Pages may import the decoder from another origin, but not start its workers."""
     other = Site()
     try:
-        report = do(
-            job(other.put("scene", large)),
-            IN_PAGE.replace('"/tests', f'"{other.url}/tests'),
-        )
+        report = do(job(other.put("scene", large)), IN_PAGE.replace('"/tests', f'"{other.url}/tests'))
     finally:
         other.close()
     assert assert_scene(report, large) <= MAX_ULPS
-
-
-def test_errors_and_aborts_are_the_same_as_in_node(do, site):
-    address = site.put("slow2", container())
-    site.late["/slow2/f_dc.webp"] = 1.0
-    report = do(job(address, abort={"after": 100}))
-    assert report["error"]["name"] == "AbortError"
-    assert report["later"] == 0
-    assert do(job(address, abort="before"))["error"]["name"] == "AbortError"
-    assert do(job(address, abort="reason"))["error"]["name"] == "RangeError"
-    report = do(job(f"{site.url}/nothing/"))
-    assert report["error"]["name"] == "SogxtError"
-    assert report["error"]["message"] == "meta.json cannot be fetched: the server answers with status 404"
-    cut = zipped(container())[:-30]
-    assert do(job(cut))["error"]["message"] == "not a zip file, or one that is cut off"
 
 
 def test_an_image_of_another_size_is_refused(do, large):

@@ -5,19 +5,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from helpers.web_scenes import (
-    IMAGES,
-    array_of,
-    assert_progress,
-    assert_scene,
-    container,
-    in_node,
-    job,
-    ulps,
-    with_meta,
-    without_checksums,
-    zipped,
-)
+from helpers.web_scenes import IMAGES, array_of, assert_progress, assert_scene, container, in_node, job, ulps, zipped
 from helpers.web_tools import pillow
 
 import kissgs
@@ -72,14 +60,6 @@ def test_requests_are_made_as_asked(site):
     assert assert_scene(report, container()) <= MAX_ULPS
     assert len(site.received) == 10
     assert {key for _, key in site.received} == {"Bearer x"}
-
-
-def test_containers_of_other_encoders():
-    """They have no block "kissgs", no version and no format."""
-    files = without_checksums(container())
-    bare = with_meta(files, lambda meta: [meta.pop(key) for key in ("format", "version", "profile")])
-    for report, some in zip(in_node(job(files), job(bare)), (files, bare), strict=True):
-        assert assert_scene(report, some) <= MAX_ULPS
 
 
 def test_images_that_arrive_in_the_worst_order(site):

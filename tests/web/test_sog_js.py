@@ -153,8 +153,6 @@ def test_the_filters_of_png():
     assert_equal(report, files)
 
 
-# --- Refusals -------------------------------------------------------------------------------------
-
 GOOD = sog_files(made_scene(65, 2))
 
 

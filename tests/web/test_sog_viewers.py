@@ -1,11 +1,6 @@
-"""Our ``.sog`` and other files in viewers that others wrote, Spark and the PlayCanvas engine, by pixels.
-
-References: ``kissgs.render``, and each viewer's own reading of a ``.ply`` with equal values. ``pytest --log-cli-level
-INFO`` shows how close they are.
-"""
+"""Our files in Spark and the PlayCanvas engine; reference: ``kissgs.render``, and their own reading of a ``.ply``."""
 
 import io
-import logging
 
 import numpy as np
 import pytest
@@ -20,7 +15,6 @@ from kissgs.pipeline.scene_files import write_scene
 # the parts of quaternions in another order, give less than 28.
 TO_RASTERISER = {"spark": 44, "playcanvas": 35}
 TO_ITS_PLY = 46  # the same values from a .ply: other roundings within the viewer, and ties in its sorting
-log = logging.getLogger(__name__)
 
 
 @pytest.fixture(scope="module", params=["spark", "playcanvas"])
@@ -42,6 +36,19 @@ def reference(splats, camera):
     return np.clip(kissgs.render(splats, camera)[0], 0, 1)
 
 
+def assert_alike(viewer, splats, drawn, same):
+    """Compare images to the rasteriser's and to those of the .ply. Return each one's PSNR to the former."""
+    found = []
+    for camera, image, beside in zip(CAMERAS, drawn, same, strict=True):
+        wanted = reference(splats, camera)
+        found.append(psnr(image, wanted))
+        assert found[-1] > TO_RASTERISER[viewer.name]
+        assert psnr(image, beside) > TO_ITS_PLY
+        for mirrored in (image[:, ::-1], image[::-1], image[..., ::-1]):
+            assert psnr(mirrored, wanted) < found[-1] - 12
+    return found
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.quick(1)  # two of each viewer
 def test_sog_in_a_viewer(viewer, degree):
@@ -52,18 +59,8 @@ def test_sog_in_a_viewer(viewer, degree):
     assert count == len(decoded)
     _, same = viewer.draw(ply(decoded), "ply", CAMERAS)
     _, original = viewer.draw(ply(scene), "ply", CAMERAS)
-    for camera, image, beside, before in zip(CAMERAS, drawn, same, original, strict=True):
-        wanted = reference(decoded, camera)
-        reached, of_original = psnr(image, wanted), psnr(before, reference(scene, camera))
-        log.info(
-            "%s, degree %d: %.1f dB to kissgs.render, %.1f of the original .ply, %.1f to the same values in a .ply",
-            *(viewer.name, degree, reached, of_original, psnr(image, beside)),
-        )
-        assert reached > TO_RASTERISER[viewer.name]
-        assert reached > of_original - 1.5
-        assert psnr(image, beside) > TO_ITS_PLY
-        for mirrored in (image[:, ::-1], image[::-1], image[..., ::-1]):
-            assert psnr(mirrored, wanted) < reached - 12
+    for camera, before, reached in zip(CAMERAS, original, assert_alike(viewer, decoded, drawn, same), strict=True):
+        assert reached > psnr(before, reference(scene, camera)) - 1.5
 
 
 OTHERS = [
@@ -84,14 +81,4 @@ def test_other_formats_in_a_viewer(viewer, ending, degree, tmp_path):
     count, drawn = viewer.draw(file.getvalue(), ending, CAMERAS)
     assert count == len(read)
     _, same = viewer.draw(ply(read), "ply", CAMERAS)
-    for camera, image, beside in zip(CAMERAS, drawn, same, strict=True):
-        wanted = reference(read, camera)
-        reached = psnr(image, wanted)
-        log.info(
-            "%s, .%s, degree %d: %.1f dB to kissgs.render, %.1f to the same values in a .ply",
-            *(viewer.name, ending, degree, reached, psnr(image, beside)),
-        )
-        assert reached > TO_RASTERISER[viewer.name]
-        assert psnr(image, beside) > TO_ITS_PLY
-        for mirrored in (image[:, ::-1], image[::-1], image[..., ::-1]):
-            assert psnr(mirrored, wanted) < reached - 12
+    assert_alike(viewer, read, drawn, same)

@@ -1,22 +1,19 @@
 """Streamed scenes in the preview's viewer, in Chromium. Oracle: ``kissgs.render`` of the rows that belong together."""
 
 import json
-import logging
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.streamed_scenes import FAST, small_sizes
+from helpers.streamed_scenes import FAST, write_small
 from helpers.viewers import image_of, opened, pinhole, psnr, scattered, seen_from
 
 import kissgs
 from kissgs.core.splats import concatenate
 from kissgs.rendering.camera import look_at
-from kissgs.streaming.compress import compress_streamed
 
 CAMERA = seen_from((1.2, -1.2, -4.2), (300, 200))
 MANY = 100_000
-log = logging.getLogger(__name__)
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +26,7 @@ def viewer(browser):
 def city(viewer, tmp_path_factory):
     """A folder with levels of 1,200, 600, 300 and 150 Gaussians in 16 leaves, and its address."""
     folder = tmp_path_factory.mktemp("streamed")
-    kissgs.save(scattered(1200, 2), folder / "scene.ply")
-    with pytest.MonkeyPatch.context() as patch:
-        small_sizes(patch, chunk=400, leaf=80, coarsest=200)
-        compress_streamed(folder / "scene.ply", folder / "city" / "lod-meta.json", settings=FAST)
+    write_small(scattered(1200, 2), folder / "city" / "lod-meta.json", chunk=400, leaf=80, coarsest=200)
     files = {str(path.relative_to(folder)): path.read_bytes() for path in (folder / "city").rglob("*.*")}
     return folder / "city", viewer[1].put("streamed", files) + "city/lod-meta.json"
 
@@ -91,7 +85,6 @@ def test_from_the_coarsest_level_to_the_finest(viewer, city):
     last = draw(viewer, CAMERA)
     assert set(levels_drawn(folder, last["ranges"])) == {0}
     to_finest = psnr(last["image"], rendered(kissgs.load(folder)))
-    log.info("the coarsest level: %.1f dB, the finest: %.1f dB to kissgs.render", to_coarse, to_finest)
     assert min(to_coarse, to_finest) > 38
     assert psnr(last["image"], first["image"]) < 30
     assert last["received"] == sum(sizes[path] for path in sizes if path in asked)
@@ -121,7 +114,6 @@ def test_a_small_budget_goes_to_what_is_near(viewer, city):
     rows = rows_of(folder, near["ranges"])
     assert len(rows) == sum(level["gaussians"] for level in near["levels"]) <= 650
     reached = psnr(near["image"], rendered(rows, close))
-    log.info("leaves of levels %s together: %.1f dB to kissgs.render", sorted(levels), reached)
     assert reached > 36
 
 

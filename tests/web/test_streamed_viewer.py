@@ -1,7 +1,5 @@
 """Our streamed SOG in the PlayCanvas engine. Oracle: ``kissgs.render`` of what ``kissgs.load`` reads of each level."""
 
-import logging
-
 import numpy as np
 import pytest
 from helpers.streamed_scenes import small_sizes
@@ -15,7 +13,6 @@ from kissgs.streaming.compress import compress_streamed
 
 FIRST_IMAGE_BYTES = 1_000_000
 TO_RASTERISER = 35  # dB; PlayCanvas ends Gaussians at 2.8 standard deviations
-log = logging.getLogger(__name__)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +39,6 @@ def test_each_level_is_drawn_whole(playcanvas, tmp_path, monkeypatch):
         wanted = [np.clip(kissgs.render(kissgs.load(source, level=level), each)[0], 0, 1) for each in cameras]
         drawn = viewer.draw_level(url, level, cameras)
         reached = [psnr(*both) for both in zip(drawn, wanted, strict=True)]
-        log.info("level %d: %s dB to kissgs.render", level, ", ".join(f"{value:.1f}" for value in reached))
         assert min(reached) > TO_RASTERISER
         assert all(psnr(image[:, ::-1], image) < 30 for image in wanted)
 
@@ -68,7 +64,6 @@ def test_the_environment_is_drawn_at_every_level(playcanvas, tmp_path, monkeypat
         town = scene.select(np.linalg.norm(scene.means, axis=1) < 5)
         whole, without = (np.clip(kissgs.render(each, view)[0], 0, 1) for each in (scene, town))
         (drawn,) = viewer.draw_level(url, level, [view])
-        log.info("level %d: %.1f dB, without the environment %.1f dB", level, psnr(drawn, whole), psnr(drawn, without))
         assert psnr(drawn, whole) > TO_RASTERISER
         assert psnr(whole, without) < 20
 
@@ -81,7 +76,6 @@ def test_the_first_image_needs_less_than_a_megabyte(playcanvas, tmp_path):
     site.late.update({path: 5.0 for path in site.files if "/city/2_0/" not in path and "/city/lod" not in path})
     view = seen_from((1.2, -1.2, -4.2), (300, 200))
     image, files = viewer.first_image(url, view)
-    log.info("%s", files)
     assert 0 < sum(size for _, size in files) <= FIRST_IMAGE_BYTES
     coarsest = np.clip(kissgs.render(kissgs.load(source, level=2), view)[0], 0, 1)
     assert psnr(image, coarsest) > 28  # thousands of Gaussians overlap in each pixel, and the viewer sorts coarsely

@@ -1,10 +1,6 @@
-"""Rendering by Spark; reference: ``kissgs.render``.
-
-``pytest --log-cli-level INFO`` shows how close they are.
-"""
+"""Rendering by Spark; reference: ``kissgs.render``."""
 
 import base64
-import logging
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +13,6 @@ from kissgs.core.splats import SH_REST_COUNTS
 
 pytestmark = pytest.mark.skipif(not (DECODER / "vendor").exists(), reason="scripts/vendor has not run")
 
-log = logging.getLogger(__name__)
 
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <script type="importmap">{"imports": {
@@ -129,7 +124,6 @@ def test_images_agree_with_the_rasteriser(page, degree):
     for camera, drawn in zip((FRONT, SIDE), draw(page, splats, [FRONT, SIDE]), strict=True):
         reference = expected(splats, camera)
         reached = psnr(drawn, reference)
-        log.info("degree %d: %.1f dB", degree, reached)
         assert reached > 40
         assert np.abs((drawn - reference).mean(axis=(0, 1))).max() < 2 / 255
         for mirrored in (drawn[:, ::-1], drawn[::-1], drawn[..., ::-1]):
@@ -140,7 +134,6 @@ def test_a_white_background(page):
     scene = kissgs.sample_scene(3000, sh_degree=1)
     splats = scene.select(np.linalg.norm(scene.means, axis=1) < 2)  # no sky
     (drawn,) = draw(page, splats, [FRONT], background="#ffffff")
-    log.info("on white: %.1f dB", psnr(drawn, expected(splats, FRONT, background=(1, 1, 1))))
     assert psnr(drawn, expected(splats, FRONT, background=(1, 1, 1))) > 40
     assert psnr(drawn, expected(splats, FRONT)) < 30
 
@@ -152,7 +145,6 @@ def test_far_from_the_origin(page):
     camera = seen_from((1001.2, 997.8, 994.8), target=(1000, 999.2, 1000))
     (drawn,) = draw(page, far, [camera])
     reached = psnr(drawn, expected(far, camera))
-    log.info("far from the origin: %.1f dB", reached)
     assert reached > 40
 
 
@@ -169,7 +161,6 @@ def test_a_file_read_by_spark_and_a_decoded_scene_agree(page, ending, beside, tm
     assert count == len(splats)
     for camera, one, other in zip((FRONT, SIDE), drawn, read, strict=True):
         to_decoded, to_reference = psnr(one, other), psnr(other, expected(splats, camera))
-        log.info("read from a .%s: %.1f dB, and %.1f dB to the decoded scene", ending, to_reference, to_decoded)
         assert to_decoded > (45 if beside and ending != "spz" else 38)
         assert to_reference > 38
 

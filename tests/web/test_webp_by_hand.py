@@ -358,9 +358,6 @@ def test_alpha_does_not_depend_on_the_hint(hint, tmp_path):
     assert got["sha256"] == hashlib.sha256(np.ascontiguousarray(wanted)).hexdigest()
 
 
-# --- Files that both decoders refuse ---------------------------------------------------------------------
-
-
 @refused("a transform that occurs twice", range(4))
 def a_transform_twice(kind):
     writer = Writer(4, 4)

@@ -2,14 +2,11 @@
 
 import hashlib
 import itertools
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
 from helpers.reference_vp8l import chunk, riff, stream_of
 from helpers.web_tools import as_rgba, decode_all, pillow, webp
-from PIL import Image
 
 SIZES = [
     *((1, 1), (1, 2), (2, 1), (2, 2), (3, 3), (1, 37), (37, 1), (7, 13), (13, 7), (31, 61), (97, 5)),
@@ -155,23 +152,6 @@ def test_large(tmp_path):
     image[:, :, 0] = np.arange(1500) >> 4
     image[1000:1100, 300:1400] = np.random.default_rng(0).integers(0, 256, (100, 1100, 3))
     assert_exact(tmp_path, [("1500 x 1500", webp(image, method=0, quality=0), image)])
-
-
-def test_near_lossless(tmp_path):
-    """The option of cwebp changes pixels slightly and writes a lossless stream."""
-    if shutil.which("cwebp") is None:
-        pytest.skip("no cwebp is installed")
-    cases = []
-    for content in (photograph, alpha_noise, gradient):
-        Image.fromarray(image_of(content, 131, 67)).save(tmp_path / "x.png")
-        for level in (0, 20, 60, 80):
-            order = ["cwebp", "-quiet", "-near_lossless", str(level), tmp_path / "x.png", "-o", tmp_path / "x.webp"]
-            subprocess.run(order, check=True)
-            cases.append((f"{content.__name__} {level}", (tmp_path / "x.webp").read_bytes(), None))
-    assert_exact(tmp_path, cases)
-
-
-# --- Data around a stream --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("content", [photograph, alpha_noise, palette(4)], ids=lambda content: content.__name__)

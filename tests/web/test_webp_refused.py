@@ -106,8 +106,6 @@ def test_too_many_pixels_are_refused_before_memory_is_allocated(tmp_path):
     assert ["error" in got for got in found] == [False, True, False, True, True, False]
 
 
-# --- Damage ---------------------------------------------------------------------------------------
-
 CHANGES = 2_400
 PARTS = 4
 LIMIT = 1 << 20

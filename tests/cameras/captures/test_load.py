@@ -2,15 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.reference_cameras import (
-    PINHOLE,
-    assert_camera,
-    frames,
-    poses,
-    write_json,
-    write_photo,
-    write_text,
-)
+from helpers.reference_cameras import PINHOLE, assert_camera, frames, poses, write_json, write_photo, write_text
 from PIL import Image
 
 from kissgs.cameras.captures.load import load_views
@@ -121,10 +113,7 @@ def test_cameras_have_the_size_of_their_photographs(tmp_path, size, resolution, 
 
 @pytest.mark.parametrize("width", [1601, 1610, 1999, 5187])
 def test_reduced_sizes_equal_inrias(tmp_path, width):
-    """``int(w / (w / 1600))`` is 1599 for some widths, and published results use these sizes.
-
-    INRIA's code limits the width only and would not reduce portrait photographs.
-    """
+    """``int(w / (w / 1600))`` is 1599 for some widths, and published results use these sizes."""
     capture(tmp_path, ("PINHOLE", width, 1000, (900.0, 900.0, width / 2, 500.0)))
     scale = width / 1600
     camera = load_views(tmp_path).train[0].camera

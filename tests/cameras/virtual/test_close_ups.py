@@ -4,13 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.looked_at import looked_at
 from helpers.whole_scenes import moved, two
 
 from kissgs import render, sample_scene
 from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.cameras.virtual.samples import close_ups, scattered_cameras
 from kissgs.rendering.sensitivity import local_scale
+
+
+def looked_at(scene, cameras):
+    """Return each camera's distance to the Gaussian in the centre of its image, and the index of that Gaussian."""
+    found = []
+    for camera in cameras:
+        offsets = scene.means.astype(np.float64) - camera.position
+        distances = np.linalg.norm(offsets, axis=1)
+        target = int(np.argmax(offsets @ camera.viewmat[2, :3] / distances))
+        found.append((float(distances[target]), target))
+    return found
 
 
 def test_objects_of_all_sizes_have_close_ups():

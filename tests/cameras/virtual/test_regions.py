@@ -1,26 +1,24 @@
 """Oracle: positions and sizes of the objects that scenes are made of."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.fewer_cameras import try_fewer
 from helpers.whole_scenes import SCENES, two
 
-from kissgs import Camera, Splats, clean
+from kissgs import clean
 from kissgs.cameras.virtual.samples import random_poses, scene_views
 
 
 @pytest.fixture(autouse=True)
-def fewer(monkeypatch: pytest.MonkeyPatch):
+def fewer(monkeypatch):
     try_fewer(monkeypatch)
 
 
-def count_near(cameras: list[Camera], position: tuple[float, float, float], radius: float) -> int:
+def count_near(cameras, position, radius):
     return sum(float(np.linalg.norm(camera.position - position)) < radius for camera in cameras)
 
 
-def cameras_of(splats: Splats, count: int = 24) -> list[Camera]:
+def cameras_of(splats, count=24):
     views = scene_views(clean(splats)[0], width=48, height=48, count=count)
     assert len(views.all) == count
     return [view.camera for view in views.all]
@@ -28,7 +26,7 @@ def cameras_of(splats: Splats, count: int = 24) -> list[Camera]:
 
 @pytest.mark.parametrize("distance", [100, 10_000])
 @pytest.mark.quick(1)
-def test_two_distant_objects_both_have_cameras(distance: float):
+def test_two_distant_objects_both_have_cameras(distance):
     cameras = cameras_of(two(distance, count=2000))
     assert count_near(cameras, (0, 0, 0), 30) >= 6
     assert count_near(cameras, (distance, 0, 0), 30) >= 6
