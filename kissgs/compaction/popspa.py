@@ -479,8 +479,7 @@ REFINEMENT = 1_000_000
 POINT_STEPS = {"photos": 3, "renderings": 1}
 """Training steps at a point by the targets, in units of those between two prunings of a compaction to one number.
 
-With photographs, a third of them saves 42 % of the processor time of a first container and takes 5 to 7 % more bytes
-(docs/method/research-log.md, "More training").
+At points that are passed on the way to another, one unit serves (docs/method/research-log.md, "More training").
 """
 
 
@@ -492,6 +491,7 @@ class PathPoint:
     splats: Splats
     index: Int[np.ndarray, " M"]  # in the whole scene, ascending
     trained: bool = False
+    units: int = 0  # of training steps that were made at this point, see POINT_STEPS
     state: Mapping[str, np.ndarray] | None = None  # from which training continues; None if it is forgotten
 
     def __len__(self) -> int:
@@ -523,20 +523,20 @@ class TrainingPath:
         load_kernels(self.compactor.context.progress)
         training = self._at(self.points[-1])
         training.prune(count, self.compactor.context)
-        return self._add(training, len(self.points))
+        return self._add(training, len(self.points), 0)
 
-    def train(self, deadline: Deadline | None = None) -> PathPoint:
+    def train(self, *, passed: bool = False, deadline: Deadline | None = None) -> PathPoint:
         """Train the last point, and return it; reports "sparsify".
 
-        :data:`POINT_STEPS` times ``sparsify_steps / prune_rounds`` steps are made, rounded down; with a deadline, as
-        many of them as fit in.
+        :data:`POINT_STEPS` times ``sparsify_steps / prune_rounds`` steps are made in all, rounded down, or a single
+        time as many if it is ``passed`` on the way to another; with a deadline, as many of them as fit in.
         """
         compactor, point = self.compactor, self.points[-1]
         if compactor.settings.sparsify_steps == 0:
             return point
-        per_point = POINT_STEPS[compactor.load_targets().target_source]
-        steps = per_point * compactor.settings.sparsify_steps // compactor.settings.prune_rounds
-        if steps == 0:
+        units = 1 if passed else POINT_STEPS[compactor.load_targets().target_source]
+        steps = (units - point.units) * compactor.settings.sparsify_steps // compactor.settings.prune_rounds
+        if steps <= 0:
             return point
         training = self._at(point)
         if not point.trained:
@@ -544,7 +544,7 @@ class TrainingPath:
         context = replace(compactor.context, deadline=deadline)
         training.train(Phase("sparsify", steps, len(point)), point.number, context)
         self.points.pop()
-        return self._add(training, point.number)
+        return self._add(training, point.number, units)
 
     def compacted(self, point: PathPoint, *, refine: bool, deadline: Deadline | None = None) -> Compacted:
         """Return a point as a compacted scene; ``refine`` completes its training with falling learning rates.
@@ -576,10 +576,10 @@ class TrainingPath:
             training.restore(point.state, point.index)
         return training
 
-    def _add(self, training: SceneTraining, number: int) -> PathPoint:
+    def _add(self, training: SceneTraining, number: int, units: int) -> PathPoint:
         """Add the state of a training as the last point."""
         state = training.state() if training.begun else None
         if self.points and not self.keep_states:
             self.points[-1] = replace(self.points[-1], state=None)
-        self.points.append(PathPoint(number, training.splats(), training.index, training.begun, state))
+        self.points.append(PathPoint(number, training.splats(), training.index, training.begun, units, state))
         return self.points[-1]

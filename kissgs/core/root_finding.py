@@ -25,6 +25,7 @@ class StopRule:
         tries_bound: whether the bound is tried where long steps make no progress, and if no point met the goal.
         settled: whether the search between a point that meets the goal and the next one that does not can end.
         most_step: largest distance of an evaluation from known points, except for one at a bound.
+        flattest: share of the expected slope below which a measured one is not believed: a loss grows ever faster.
         caution: share of the distance to the nearest point that meets the goal by which the last point is nearer, and
             the largest such step; share by which the last step is longer where no point meets the goal.
     """
@@ -33,6 +34,7 @@ class StopRule:
     tries_bound: bool = True
     settled: Callable[[float, float], bool] = lambda inside, outside: False
     most_step: float = MAX_EXTRAPOLATION
+    flattest: float = 0.1
     caution: tuple[float, float] = (0.0, 0.0)
 
 
@@ -80,7 +82,7 @@ def find_root(
         if stop.tries_bound and (inside is None or outside is None) and _no_progress(known, slope):
             x = bounds[(inside is None) == (slope > 0)]
         else:
-            x = _next(known, slope, tolerance_at(x) / 2, stop.most_step)
+            x = _next(known, slope, tolerance_at(x) / 2, stop)
             if len(known) == attempts - 1:
                 share, most = stop.caution
                 x += share * (x - list(known)[-1]) if inside is None else min(max(share * (inside - x), -most), most)
@@ -96,7 +98,7 @@ def _rounded(x: float, grain: float) -> float:
     return round(x / grain) * grain if grain else x
 
 
-def _next(known: dict[float, float], slope: float, aim: float, most_step: float) -> float:
+def _next(known: dict[float, float], slope: float, aim: float, stop: StopRule) -> float:
     inside, outside = _bracket(known, slope)
     if inside is not None and outside is not None:
         latest = [found >= 0 for found in known.values()][-3:]
@@ -107,9 +109,9 @@ def _next(known: dict[float, float], slope: float, aim: float, most_step: float)
     *before, last = known
     if before and math.isfinite(known[last]) and math.isfinite(known[before[-1]]):
         measured = (known[last] - known[before[-1]]) / (last - before[-1])
-        slope *= min(max(measured / slope, 0.1), 10.0)
+        slope *= min(max(measured / slope, stop.flattest), 10.0)
     start = last if inside is None else inside
-    return start + min(max((aim - known[start]) / slope, -most_step), most_step)
+    return start + min(max((aim - known[start]) / slope, -stop.most_step), stop.most_step)
 
 
 def _bracket(known: Mapping[float, float], slope: float) -> tuple[float | None, float | None]:

@@ -79,8 +79,20 @@ def test_a_point_is_trained_for_so_many_steps(photographed, sparsify_steps, expe
         train = photographs(SCENE, tmp_path, train=5, held_out=0).train
         walked.compactor = replace(walked.compactor, supervision=replace(walked.compactor.supervision, train=train))
     walked.prune(40)
-    assert walked.train(deadline).trained == (expected > 0)
+    assert walked.train(deadline=deadline).trained == (expected > 0)
     assert done == [step / expected for step in range(expected)]
+
+
+def test_a_point_that_is_passed_takes_a_third_of_the_steps_and_the_others_where_it_is_encoded(tmp_path):
+    done = []
+    walked = path(progress=lambda *event: done.append(event[:2]), sparsify_steps=12)
+    train = photographs(SCENE, tmp_path, train=5, held_out=0).train
+    walked.compactor = replace(walked.compactor, supervision=replace(walked.compactor.supervision, train=train))
+    walked.prune(40)
+    for passed, expected in [(True, 4), (True, 0), (False, 8), (False, 0), (True, 0)]:
+        done.clear()
+        walked.train(passed=passed)
+        assert len([stage for stage, fraction in done if stage == "sparsify" and fraction < 1]) == expected
 
 
 def test_an_untrained_point_is_the_pruned_scene():

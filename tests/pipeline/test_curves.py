@@ -122,7 +122,7 @@ def test_three_containers_come_near_the_smallest_loss_of_a_size(size, larger):
     found = max((trial for trial in trials if trial.bytes <= size), key=lambda trial: trial.bytes)
     assert found.bytes > 0.88 * size
     # 220 kB of small containers: a search by size alone sees no loss, and ends near the size with too many Gaussians
-    most = 1.09 if (size, larger) == (220_000, 0.8) else 1.05
+    most = 1.09 if (size, larger) == (220_000, 0.8) else 1.06
     assert found.bytes / larger <= most * smallest(found.drop)
 
 
@@ -169,16 +169,16 @@ def test_a_size_that_a_loss_cannot_have_ends_the_search():
     assert len(trials) == 1
 
 
-@pytest.mark.parametrize(("left", "trials"), [(0.12, 1), (0.14, 2), (0.2, 2)])
-def test_a_container_ends_the_search_if_an_eighth_of_a_halving_or_less_is_left(left, trials):
+@pytest.mark.parametrize(("left", "trials"), [(0.08, 1), (0.1, 2), (0.2, 2)])
+def test_a_container_ends_the_search_if_a_loss_of_three_hundredths_of_a_decibel_is_left(left, trials):
     """A halving typically loses 0.32 dB."""
     made, _ = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=0.2 - 0.32 * left))
     assert len(made) == trials
 
 
-@pytest.mark.parametrize(("at_start", "number", "doublings"), [(-0.15, 8, 0.962), (0.05, 6, 1.009)])
+@pytest.mark.parametrize(("at_start", "number", "doublings"), [(-0.15, 8, 1.012), (0.05, 6, 1.059)])
 def test_a_step_changes_number_and_lambda(at_start, number, doublings):
-    """A step of 1.03 is 1.9 points, rounded to two, and 0.96 doublings; one of 0.4 is less than a point."""
+    """A step of 1.05 is 2.0 points, and 1.01 doublings; one of 0.42 is less than a point."""
     _, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=at_start))
     assert positions[1] == (number, pytest.approx(START + doublings, abs=0.01))
 
