@@ -65,6 +65,8 @@ def main() -> None:
     parser.add_argument("--exact", action="store_true", help="settings of the original rasteriser")
     parser.add_argument("-o", "--output", type=Path, metavar="NAME.csv", help="table")
     given = parser.parse_args()
+    if given.output is not None and given.output.suffix == ".png":
+        parser.error("--output names the table, such as NAME.csv; the contact sheet lies beside it as NAME.png")
     scene = clean(load(given.scene))[0]
     shuffled = scene.select(np.random.Generator(np.random.PCG64(0)).permutation(len(scene)))
     files = [Drawn("scene.ply", as_ply(scene), scene), Drawn("reordered.ply", as_ply(shuffled), shuffled)]

@@ -491,7 +491,7 @@ class PathPoint:
     splats: Splats
     index: Int[np.ndarray, " M"]  # in the whole scene, ascending
     trained: bool = False
-    units: int = 0  # of training steps that were made at this point, see POINT_STEPS
+    steps: int = 0  # of training that were made at this point
     state: Mapping[str, np.ndarray] | None = None  # from which training continues; None if it is forgotten
 
     def __len__(self) -> int:
@@ -535,16 +535,18 @@ class TrainingPath:
         if compactor.settings.sparsify_steps == 0:
             return point
         units = 1 if passed else POINT_STEPS[compactor.load_targets().target_source]
-        steps = (units - point.units) * compactor.settings.sparsify_steps // compactor.settings.prune_rounds
-        if steps <= 0:
+        steps = units * compactor.settings.sparsify_steps // compactor.settings.prune_rounds
+        if steps <= point.steps:
             return point
         training = self._at(point)
         if not point.trained:
             training.begin()
         context = replace(compactor.context, deadline=deadline)
-        training.train(Phase("sparsify", steps, len(point)), point.number, context)
+        made = [point.steps]
+        phase = Phase("sparsify", steps, len(point))
+        training.train(phase, point.number, context, first=point.steps, after=made.append)
         self.points.pop()
-        return self._add(training, point.number, units)
+        return self._add(training, point.number, made[-1])
 
     def compacted(self, point: PathPoint, *, refine: bool, deadline: Deadline | None = None) -> Compacted:
         """Return a point as a compacted scene; ``refine`` completes its training with falling learning rates.
@@ -576,10 +578,10 @@ class TrainingPath:
             training.restore(point.state, point.index)
         return training
 
-    def _add(self, training: SceneTraining, number: int, units: int) -> PathPoint:
+    def _add(self, training: SceneTraining, number: int, steps: int) -> PathPoint:
         """Add the state of a training as the last point."""
         state = training.state() if training.begun else None
         if self.points and not self.keep_states:
             self.points[-1] = replace(self.points[-1], state=None)
-        self.points.append(PathPoint(number, training.splats(), training.index, training.begun, units, state))
+        self.points.append(PathPoint(number, training.splats(), training.index, training.begun, steps, state))
         return self.points[-1]

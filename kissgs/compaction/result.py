@@ -35,7 +35,8 @@ class CountTrial:
 
     count: int
     drop: float  # of PSNR as goals count it, decibels
-    decisive: str = ""  # the loss with the least margin to its limit, in words; empty for that of PSNR
+    ssim_drop: float | None = None  # None where counts are searched for a drop of PSNR alone
+    decisive: str = ""  # the loss with the least margin to its limit, in words; empty for a size or a PSNR
 
     def summary(self) -> str:
         """Return the loss that decides in one phrase: "50,000 Gaussians lose 0.120 dB"."""

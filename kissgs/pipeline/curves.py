@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from kissgs.core.root_finding import StopRule, find_root
 from kissgs.pipeline.goal import Attempt, Goal
@@ -165,9 +165,11 @@ and the coarser levels the smallest container has (docs/method/research-log.md, 
 HALF_ERROR_DB = 10 * math.log10(2)
 """Increase of PSNR, decibels, by half of the squared error, which is that by half of lambda."""
 
-MAX_STEP, FLATTEST, CAUTION = 2.0, {"size": 0.1, "loss": 0.4}, (0.15, 0.1)
-"""Largest step, as log2 of the number of Gaussians. Share of the expected slope that is believed at least: a coarser
-lambda loses little at first, then much. Share of the distance to a container that met the goal by which the
+FLATTEST_LOSS = 0.4
+"""Share of the expected slope of a loss that is believed at least: coarser levels lose little at first, then much."""
+
+MAX_STEP, CAUTION = 2.0, (0.15, 0.1)
+"""Largest step, as log2 of the number of Gaussians. Share of the distance to a container that met the goal by which the
 last one stays nearer to it, and the largest such distance; share of the last step by which it is longer where none met
 the goal. Missing it would lose all of the training."""
 
@@ -230,6 +232,6 @@ def along_path(
             raise NoFurtherError
         return margin
 
-    flattest = FLATTEST["size" if goal.by_size else "loss"]
-    stop = StopRule(most, tries_bound=False, most_step=MAX_STEP, flattest=flattest, caution=CAUTION)
+    stop = StopRule(most, tries_bound=False, most_step=MAX_STEP, caution=CAUTION)
+    stop = stop if goal.by_size else replace(stop, flattest=FLATTEST_LOSS)
     find_root(margin, 0.0, 1.0 if goal.by_size else -1.0, near, (-math.inf, math.inf), stop=stop)

@@ -102,7 +102,7 @@ class Attempt:
             None if self.psnr is None else f"{self.psnr:.2f} dB",
             None if self.drop is None else f"drop {self.drop:.3f} dB{against}",
             None if self.ssim_drop is None else f"SSIM drop {self.ssim_drop:.3g}",
-            None if self.detail is None else f"{-self.detail.worst_percent:.3g} in the worst 1 % of patches",
+            None if self.detail is None else f"in the worst 1 % of patches {0 - self.detail.worst_percent:.3g}",
             None if self.worst is None else f"worst view {self.worst:.1f} dB",
         ]
         return ", ".join(filter(None, parts))
@@ -122,28 +122,35 @@ bytes."""
 
 
 LOSSES = {
-    "max_psnr_drop": "dB",
-    "max_ssim_drop": "of SSIM",
-    "detail": "of SSIM in the worst 1 % of patches",
-    "patch": "of SSIM in the worst patch",
+    "max_psnr_drop": ("{:.3f}", " dB"),
+    "max_ssim_drop": ("{:.3g}", " of SSIM"),
+    "detail": ("{:.3g}", " of SSIM in the worst 1 % of patches"),
+    "patch": ("{:.3g}", " of SSIM in the worst patch"),
 }
-"""Limits of losses, with what follows the number in a sentence."""
+"""Limits of losses, with the format of the number in a sentence, and what follows it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limit:
     """A limit of one figure."""
 
-    setting: str  # its name, if the goal is not a quality
+    name: str  # of the setting; "detail" or "patch" for losses that a quality alone limits
     value: float  # bytes, decibels, or a difference of SSIM
     slope: float  # typical change of the margin per doubling of lambda
     near: float  # margin that is small enough to end a search
     per_halving: float  # typical change of the figure by half as many Gaussians, of a size that of its log2
     quarter_loss: float | None = None  # loss expected with a quarter of the Gaussians and training, on the safe side
+    quality: str = ""  # that it belongs to; empty if the user has named the limit itself
+
+    @property
+    def wanted(self) -> str:
+        """What the user has asked for: "max_psnr_drop 0.1 dB" or "quality same"."""
+        unit = " dB" if self.name in ("psnr", "max_psnr_drop") else ""
+        return f"quality {self.quality}" if self.quality else f"{self.name} {self.value:g}{unit}"
 
     def figure(self, attempt: Attempt) -> float | None:
         """Return what is limited of an attempt, in the unit of ``value``; None if it is unknown."""
-        match self.setting:
+        match self.name:
             case "target_size":
                 return attempt.bytes
             case "psnr":
@@ -154,13 +161,17 @@ class Limit:
                 return attempt.ssim_drop
             case "detail":
                 return None if attempt.detail is None else -attempt.detail.worst_percent
-            case _:
+            case "patch":
                 return None if attempt.detail is None else -attempt.detail.worst
+        raise AssertionError(self.name)
 
-    def loss(self, attempt: Attempt, digits: Callable[[float], str] = "{:.3g}".format) -> str:
+    def loss(self, attempt: Attempt, digits: Callable[[float], str] | None = None) -> str:
         """Return what is limited of an attempt in words, such as "0.003 of SSIM"; empty for bytes and a PSNR."""
         found = self.figure(attempt)
-        return "" if found is None or self.setting not in LOSSES else f"{digits(found)} {LOSSES[self.setting]}"
+        if found is None or self.name not in LOSSES:
+            return ""
+        form, unit = LOSSES[self.name]
+        return (digits or form.format)(found) + unit
 
     def margin(self, attempt: Attempt) -> float:
         """Return by how much an attempt stays within the limit: at least 0 where it is met.
@@ -171,7 +182,7 @@ class Limit:
         found = self.figure(attempt)
         if found is None or math.isnan(found):
             return -math.inf
-        if self.setting == "psnr":
+        if self.name == "psnr":
             return found - self.value
         if found <= 0:  # a container may even be closer to the photographs than the scene
             return math.inf
@@ -180,7 +191,7 @@ class Limit:
 
     def near_enough(self, *, trained: bool) -> float:
         """Return the margin that is small enough to end a search, more if each container takes a training."""
-        factor = TRAINED_SIZE_NEAR if self.setting == "target_size" else TRAINED_NEAR
+        factor = TRAINED_SIZE_NEAR if self.name == "target_size" else TRAINED_NEAR
         return max(min(factor * self.near, MOST_NEAR), self.near) if trained else self.near
 
     def log2_margin(self, attempt: Attempt) -> float:
@@ -188,7 +199,7 @@ class Limit:
         found = self.figure(attempt)
         if found is None:
             return math.nan
-        margin = math.log2(self.value / found) if self.setting == "target_size" else self.value - found
+        margin = math.log2(self.value / found) if self.name == "target_size" else self.value - found
         return margin / self.per_halving
 
 
@@ -199,12 +210,10 @@ class Goal:
     Attributes:
         limits: what the container must meet: its size, or a PSNR, a drop of PSNR, one of SSIM, or several of these.
         most_bytes: for a quality: bytes that the smallest container with it may have at most; None for any number.
-        quality: value of the setting of that name.
     """
 
     limits: tuple[Limit, ...]
     most_bytes: int | None = None
-    quality: str | None = None
 
     @classmethod
     def of(cls, settings: EncodeSettings) -> Goal:
@@ -214,35 +223,38 @@ class Goal:
         container takes some 3 % of bytes.
         """
         limits, size, quality = list[Limit](), settings.target_size, QUALITIES.get(settings.quality or "")
+        name, of_psnr, of_ssim = settings.quality or "", "", ""
         psnr_drop, ssim_drop = settings.max_psnr_drop, settings.max_ssim_drop
-        if quality is not None:
-            psnr_drop = quality.psnr if psnr_drop is None else psnr_drop
-            ssim_drop = quality.ssim if ssim_drop is None else ssim_drop
+        if quality is not None and psnr_drop is None:
+            psnr_drop, of_psnr = quality.psnr, name
+        if quality is not None and ssim_drop is None:
+            ssim_drop, of_ssim = quality.ssim, name
         if settings.psnr is not None:
             limits.append(Limit("psnr", settings.psnr, slope=-1.5, near=0.1, per_halving=math.nan))
         if psnr_drop is not None:
             near = -math.log2(max(1 - 0.02 / psnr_drop, 0.5))
-            limits.append(Limit("max_psnr_drop", psnr_drop, slope=-0.5, near=near, per_halving=0.32, quarter_loss=0.1))
+            psnr = partial(Limit, slope=-0.5, near=near, per_halving=0.32, quarter_loss=0.1)
+            limits.append(psnr("max_psnr_drop", psnr_drop, quality=of_psnr))
         ssim = partial(Limit, slope=-0.6, near=-math.log2(0.95))
         if ssim_drop is not None:
-            limits.append(ssim("max_ssim_drop", ssim_drop, per_halving=0.01, quarter_loss=0.007))
+            limits.append(ssim("max_ssim_drop", ssim_drop, per_halving=0.01, quarter_loss=0.007, quality=of_ssim))
         if quality is not None:
-            limits.append(ssim("detail", quality.detail, per_halving=0.04))
-            limits.append(ssim("patch", quality.patch, per_halving=0.06))
+            limits.append(ssim("detail", quality.detail, per_halving=0.04, quality=name))
+            limits.append(ssim("patch", quality.patch, per_halving=0.06, quality=name))
         if not limits and size is not None:
             limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), per_halving=0.75))
             size = None
-        return cls(tuple(limits), size, settings.quality)
+        return cls(tuple(limits), size)
 
     @property
     def by_size(self) -> bool:
         """Whether the goal is a size, so that no rendering is needed to evaluate it."""
-        return self.limits[0].setting == "target_size"
+        return self.limits[0].name == "target_size"
 
     @property
     def psnr_drop(self) -> float | None:
         """The largest drop of PSNR, decibels; None if it is not limited."""
-        return next((limit.value for limit in self.limits if limit.setting == "max_psnr_drop"), None)
+        return next((limit.value for limit in self.limits if limit.name == "max_psnr_drop"), None)
 
     def decisive(self, attempt: Attempt) -> Limit:
         """Return the limit to which an attempt has the least margin."""
@@ -277,11 +289,9 @@ class Goal:
         finest = max(attempts, key=self.margin)
         missed = {limit: limit.figure(finest) for limit in self.limits if limit.margin(finest) < 0}
         first = next(iter(missed))
-        if first.setting == "psnr":  # one thing at a time
+        if first.name == "psnr":  # one thing at a time
             missed = {first: missed[first]}
-        units = {"psnr": " dB", "max_psnr_drop": " dB"}
-        names = [f"{limit.setting} {limit.value:g}{units.get(limit.setting, '')}" for limit in missed]
-        wanted = f"quality {self.quality}" if self.quality else " and ".join(names)
+        wanted = " and ".join(dict.fromkeys(limit.wanted for limit in missed))
         found = [math.nan if figure is None else figure for figure in missed.values()]
         if any(map(math.isnan, found)):
             return (
@@ -291,14 +301,15 @@ class Goal:
             return (
                 f"{wanted} cannot be met: the scene's renderings equal the photographs, so any loss of PSNR is infinite"
             )
-        if first.setting == "psnr":
+        if first.name == "psnr":
             highest, limit = math.floor(100 * found[0]) / 100, first.value
             return f"{wanted} cannot be met: the finest container found has {highest:.2f} dB; ask for at most that" + (
                 f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if limit > MAX_VIEW_PSNR else ""
             )
         losses = " and ".join(limit.loss(finest, _rounded_up) for limit in missed)
-        mend = "choose a lower quality" if self.quality else "allow at least that"
-        return f"{wanted} cannot be met: the finest container found loses {losses}; {mend}"
+        of_quality = all(limit.quality for limit in missed)
+        lower = "choose a lower quality, or give max_psnr_drop" if of_quality else "allow at least that"
+        return f"{wanted} cannot be met: the finest container found loses {losses}; {lower}"
 
 
 def _rounded_up(value: float) -> str:

@@ -78,6 +78,9 @@ those that are no images before the first container shows how many these are."""
 SIZE_BY_COUNT = 0.6
 """Exponent of the number of Gaussians to which the size of a container grows at equal lambda."""
 
+HALF_LEFT = 1.0
+"""Margin of a point before any encoding that leaves half of the allowed loss to the encoder."""
+
 NEAR_LOG2, NEAR_IN_TIME = 0.09, 0.06
 """Margin, as log2 of the number of Gaussians, below which a container that meets the goal ends the search: 0.03 dB.
 Another one would save some 3 % of its bytes, or 1 to 2 %, which is worth a time that the user has given."""
@@ -312,9 +315,9 @@ class Search:
             for passed in (True, False):  # a few steps show whether the scene is far from the limit
                 point = self._train_to(path, number, passed=passed)
                 self._margins[number] = self.goal.margin(self._try_unencoded(point.splats))
-                if self._margins[number] >= 0:
+                if self._margins[number] >= HALF_LEFT:
                     break
-            else:
+            if self._margins[number] < 0:
                 break
             number += 1
         return number
@@ -374,7 +377,7 @@ class Search:
             evaluation = self.compare(path.points[latest].splats, self.work.context.stage("evaluate"))
             figures = Attempt(len(path.points[latest]), None, 0).with_evaluation(evaluation)
             self._margins[latest] = self.goal.margin(figures)
-        serving = [number for number, margin in self._margins.items() if margin >= 1.0]  # half
+        serving = [number for number, margin in self._margins.items() if margin >= HALF_LEFT]
         number = latest if self.goal.by_size else max(serving, default=None)
         if number is not None:
             self._along_lambda(self._untrained(path, path.points[number]), most=self.encode_settings.max_encodes)
@@ -402,7 +405,8 @@ class Search:
         """Return the figures of a scene that is not encoded, and record them for the report."""
         evaluation = self.compare(splats, self.work.context.stage("evaluate"))
         found = Attempt(len(splats), None, 0).with_evaluation(evaluation)
-        self.tried.append(CountTrial(len(splats), drop_of(evaluation), self.goal.decisive(found).loss(found)))
+        trial = CountTrial(len(splats), drop_of(evaluation), found.ssim_drop, self.goal.decisive(found).loss(found))
+        self.tried = [each for each in self.tried if each.count != trial.count] + [trial]
         return found
 
     def _train_to(self, path: TrainingPath, number: int, *, passed: bool = False) -> PathPoint:
@@ -420,6 +424,7 @@ class Search:
     def _train(self, path: TrainingPath, number: int, *, passed: bool) -> None:
         """Train the last point of the path, on the way to point ``number``."""
         limited, points = self.work.time, number + 2 - len(path.points)
+        points += 2 * passed  # the last one takes three times as many steps
         deadline = None if limited is None else limited.for_point(points, self._containers_left)
         path.train(passed=passed, deadline=deadline)
 
@@ -629,7 +634,8 @@ class Search:
     def _failure(self) -> str:
         """Return why no container meets the goal."""
         if self.best is not None:
-            names = " and ".join(["target_size", *(limit.setting for limit in self.goal.limits)])
+            wanted = dict.fromkeys(limit.wanted if limit.quality else limit.name for limit in self.goal.limits)
+            names = " and ".join(["target_size", *wanted])
             verb = "were not met before the search was stopped" if self.stopped else "cannot be met together"
             return (
                 f"{names} {verb}: the smallest container found with that quality has {self.best.bytes:,} bytes; allow "

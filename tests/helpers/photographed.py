@@ -25,7 +25,7 @@ def photographs(scene, folder, train=12, held_out=3, brightness=2 / 3):
 
 QUICK = {
     "max_compactions": 4,
-    "sparsify_steps": 14,
+    "sparsify_steps": 42,
     "refine_steps": 20,
     "prune_rounds": 2,
     "min_keep_per_scoring": 0.0,

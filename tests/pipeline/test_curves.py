@@ -183,6 +183,18 @@ def test_a_step_changes_number_and_lambda(at_start, number, doublings):
     assert positions[1] == (number, pytest.approx(START + doublings, abs=0.01))
 
 
+def test_a_loss_that_hardly_grows_at_first_is_not_believed_to_go_on_so():
+    """Without a limit of the slope, the third container would lose far too much."""
+
+    def figures(number, x):
+        step = (number - 6) / PER_HALVING + 0.4 * (x - START)
+        return {"bytes": 9 - number, "drop": 0.05 + 0.005 * step + 0.3 * max(step - 0.6, 0)}
+
+    trials, _ = search({"max_psnr_drop": 0.2}, figures)
+    assert len(trials) == 3
+    assert 0.05 < trials[-1].drop <= 0.3
+
+
 def test_the_limit_with_the_least_room_decides():
     """Both losses are below 0 at first; only SSIM then comes near its limit."""
 

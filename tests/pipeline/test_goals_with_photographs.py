@@ -40,18 +40,23 @@ def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal
         detail = found.report.evaluation.detail
         assert mean.reference.psnr - mean.candidate.psnr <= 0.5
         assert mean.reference.ssim - mean.candidate.ssim <= 0.015
-        assert (detail.worst_percent, detail.worst) >= (-0.15, -0.27)
+        assert detail.worst_percent >= -0.15
+        assert detail.worst >= -0.27
     else:
         assert len(found.to_zip()) <= 6200
     report, decoded = found.report, kissgs.decompress(found.files)
     assert report.compaction.count == report.count + report.pruned_by_rd + report.invisible
     moved = np.linalg.norm(decoded.means - scene.means[found.order], axis=1)
-    assert np.median(moved) < 0.2 * np.median(np.linalg.norm(decoded.means[::-1] - scene.means[found.order], axis=1))
+    if len(moved) > 1:
+        apart = np.linalg.norm(decoded.means[::-1] - scene.means[found.order], axis=1)
+        assert np.median(moved) < 0.2 * np.median(apart)
     plain = {"compact": {"ratio": 1}, "finetune": {"enabled": False}}
     without = kissgs.compress(
         scene, settings=Settings.research("balanced", **plain, **FEW_VIEWS, **goal), views=views, evaluate=True
     )
-    if "target_size" in goal:
+    if "quality" in goal:  # of so few Gaussians the metadata have most bytes
+        assert found.report.compaction.count < without.report.count
+    elif "target_size" in goal:
         assert mean.candidate.psnr > without.report.evaluation.mean.candidate.psnr
     else:
         assert len(found.to_zip()) < len(without.to_zip())
@@ -226,8 +231,8 @@ def darkening(monkeypatch):
     """Let what is trained along the path look black until it is trained on."""
     train = TrainingPath.train
 
-    def trained(path, deadline=None):
-        point = train(path, deadline)
+    def trained(path, **arguments):
+        point = train(path, **arguments)
         dark = replace(point.splats, sh0=np.full_like(point.splats.sh0, -9))
         path.points[-1] = replace(point, splats=dark)
         return path.points[-1]

@@ -78,6 +78,26 @@ def test_a_limited_time_trains_if_it_is_long(monkeypatch, units, trained):
         assert "too little time to train a smaller number" in report.compaction.note
 
 
+@pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.5}, {"quality": "good"}])
+@pytest.mark.quick(0)
+def test_a_loss_that_is_estimated_is_called_so_once(goal):
+    """Regression: not where the encoder alone searched."""
+    alone = {"compact": {"auto_count": False}, "finetune": {"enabled": False}}
+    few = {"sensitivity_views": 16, "sensitivity_view_size": 96}
+    for changes in (alone, {"finetune": {"enabled": False}}):
+        report = kissgs.compress(SMALL, settings=kissgs.Settings.research("balanced", **goal, **changes, **few)).report
+        notes = report.note + ("" if report.compaction is None else report.compaction.note)
+        assert notes.count("the drop of PSNR is estimated for a scene that has 30 dB") == 1
+
+
+@pytest.mark.quick(0)
+def test_the_reported_settings_give_the_same_bytes_for_any_number_of_threads():
+    found = kissgs.compress(FEW, settings=settings(steps=20, max_ssim_drop=0.05), threads=1)
+    assert any(trial.count < len(FEW) for trial in found.report.trials)
+    again = kissgs.compress(FEW, settings=Settings.model_validate(found.report.settings), threads=2)
+    assert again.files == found.files
+
+
 def test_ctrl_c_keeps_the_container_of_the_encoder():
     """Pressed in the first training, when containers of the encoder alone exist."""
     stopped = []
