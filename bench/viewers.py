@@ -28,6 +28,7 @@ from helpers.viewers import chromium, opened
 from bench.common import arguments, head, positive, row, run
 from kissgs import Camera, KissgsError, Splats, Views, clean, load
 from kissgs.core.context import Context
+from kissgs.core.positions import with_origin
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import in_scene_frame, render_clamped
 from kissgs.evaluation.html import heat_map, rms_difference
@@ -70,7 +71,9 @@ def main() -> None:
     scene = clean(load(given.scene))[0]
     shuffled = scene.select(np.random.Generator(np.random.PCG64(0)).permutation(len(scene)))
     files = [Drawn("scene.ply", as_ply(scene), scene), Drawn("reordered.ply", as_ply(shuffled), shuffled)]
-    files += [Drawn(splats=clean(load(path))[0], name=path.name, data=path.read_bytes()) for path in given.files]
+    files += [
+        Drawn(path.name, path.read_bytes(), with_origin(clean(load(path))[0], scene.origin)) for path in given.files
+    ]
     draw(files, chosen_cameras(scene, given.views, given.cameras, given.size), given.exact)
     table = list(rows(files))
     head(*map(str, table[0]))

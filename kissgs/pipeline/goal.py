@@ -144,7 +144,7 @@ class Limit:
 
     @property
     def wanted(self) -> str:
-        """What the user has asked for: "max_psnr_drop 0.1 dB" or "quality same"."""
+        """The words of the user: "max_psnr_drop 0.1 dB" or "quality same"."""
         unit = " dB" if self.name in ("psnr", "max_psnr_drop") else ""
         return f"quality {self.quality}" if self.quality else f"{self.name} {self.value:g}{unit}"
 
