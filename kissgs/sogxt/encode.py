@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from functools import partial
 
 import numpy as np
@@ -12,7 +11,7 @@ from kissgs.core.array_types import Float32, UInt8
 from kissgs.core.context import DEFAULT_CONTEXT, Context, load_kernels
 from kissgs.core.resources import blas_workers
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import MAX_CODEBOOK_SIDE, NOTHING_CLEANED, Cleaned, Splats
+from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
 from kissgs.io.images import pixels_crc32
 from kissgs.io.planes import compress_images
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
@@ -53,10 +52,15 @@ def write_files(
     with blas_workers(context.threads) as pool:
         files = compress_images(images, settings, pool, partial(context.progress, "images"))
     scene, count = plan.scene, int(plan.grid.mask.sum())
-    omitted = {*GOALS, "max_encodes"} | (
-        {"sh_codebook_size"} if settings.sh_codebook_size == MAX_CODEBOOK_SIDE**2 else set()
-    )
-    recorded = {**settings.model_dump(exclude=omitted), "rd_lambda": plan.rd_lambda}
+    changed = {
+        "invisible": scene.count - scene.visible,
+        "pruned_by_rd": scene.visible - count,
+        "clipped_colors": plan.clipped_colors,
+        "compacted": compacted,
+        **cleaned.as_dict(),
+    }
+    recorded = settings.model_dump(exclude={*GOALS, "max_encodes"}, exclude_defaults=True)
+    recorded |= {"rd_lambda": plan.rd_lambda, "finetune_steps": finetune_steps or None}
     layout = metadata.Layout(
         grid_side=plan.grid.side,
         codebook_side=plan.codebook.side,
@@ -69,15 +73,8 @@ def write_files(
             sh_degree=scene.sh_degree,
             count=count,
             source_count=scene.count + compacted + cleaned.removed,
-            changed={
-                "invisible": scene.count - scene.visible,
-                "pruned_by_rd": scene.visible - count,
-                "clipped_colors": plan.clipped_colors,
-                **({"compacted": compacted} if compacted else {}),
-                **cleaned.as_dict(),
-            },
-            settings={**recorded, **({"finetune_steps": finetune_steps} if finetune_steps else {})},
-            sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
+            changed={name: number for name, number in changed.items() if number},
+            settings={name: value for name, value in recorded.items() if value is not None},
         ),
         crc32={name: pixels_crc32(image) for name, image in images.items()},
     )

@@ -68,9 +68,8 @@ class Provenance(BaseModel):
         default_factory=dict, description="Number of Gaussians pruned or repaired, by reason."
     )
     settings: dict[str, bool | int | float | str | None] = Field(
-        default_factory=dict, description="Settings of the encoder."
+        default_factory=dict, description="Settings of the encoder that differ from their defaults."
     )
-    sha256: dict[str, str] = Field(default_factory=dict, description="SHA-256 of each image file, hexadecimal.")
 
 
 class Layout(BaseModel):
@@ -147,7 +146,8 @@ class Layout(BaseModel):
             document["kissgs"] = {**self.provenance.model_dump(), **recorded(self.origin)}
             document[CHECKSUM] = self.checksum
         dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-        return yaml.dump(document, Dumper=dumper, sort_keys=False, allow_unicode=False, width=120).encode("ascii")
+        text = yaml.dump(document, Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
+        return text.encode("ascii")
 
     def to_meta_json(self) -> bytes:
         """Return ``meta.json``, version 3, for browsers."""
