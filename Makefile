@@ -6,7 +6,7 @@
 # make test-all           the same with all examples, parameters, trainings and faults; three quarters of an hour
 # make lint               format, lint, types, import contract; of the JavaScript, format and types
 # make docs               what is generated in docs/
-# make setup              .venv alone, which the others make too (PYTHON=… for another Python than python3)
+# make setup              .venv alone, which the others make too (PYTHON=… for another Python, TRAIN=0 without torch)
 # make setup-dev          the same, with what tests and checks need (TORCH_INDEX=… for another build of torch)
 # make clean              removes all that make has made; the data of a service, kissgs-data, stays
 # make help               this list

@@ -12,7 +12,8 @@ from rich.text import Text
 from kissgs.cli.files import gaussians
 from kissgs.core.positions import relative_to
 from kissgs.core.splats import CLEANED_TEXTS
-from kissgs.evaluation.results import Evaluation, ImageMetrics, format_metric
+from kissgs.evaluation.detail import Detail
+from kissgs.evaluation.results import Evaluation, ImageMetrics, detail_text, format_metric
 from kissgs.formats import FORMATS
 
 if TYPE_CHECKING:
@@ -103,7 +104,9 @@ def status_table(status: Mapping[str, Any], target: str) -> RenderableType:
         mean = ImageMetrics(
             psnr=float("inf" if psnr is None else psnr), ssim=evaluation["ssim"], ms_ssim=evaluation["ms_ssim"]
         )
-        details.append(Text(f"{mean.summary} to the scene's own renderings"))
+        patches = evaluation.get("detail")  # services of older versions state none
+        detail = "" if patches is None else f"; {detail_text(Detail(**patches), 'renderings')}"
+        details.append(Text(f"{mean.summary} to the scene's own renderings{detail}"))
     changed = {"invisible": status.get("invisible") or 0, **(status.get("cleaned") or {})}
     return Group(head, *details, parts_table(dict(sorted(sizes["files"].items())), status["kept"]), *_changes(changed))
 

@@ -25,6 +25,16 @@ def format_metric(value: float, digits: int, *, signed: bool = False) -> str:
     return f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # -0.0 + 0.0 is 0.0
 
 
+def detail_text(detail: Detail, against: str) -> str:
+    """Return the changes of SSIM in patches, to "photos" or to "renderings" of the reference, as text."""
+    return (
+        f"SSIM to {'photographs' if against == 'photos' else 'the reference'} in patches of {PATCH}x{PATCH} pixels: "
+        f"{format_metric(detail.worst_percent, 4, signed=True)} in the worst 1 %, "
+        f"{format_metric(detail.worst, 4, signed=True)} in the worst one, "
+        f"{format_metric(100 * detail.share_below, 2)} % lose more than {LARGE_LOSS}"
+    )
+
+
 Split = Literal["test", "train", "all"]
 
 MAX_VIEW_PSNR = 60.0
@@ -223,23 +233,13 @@ class Evaluation:
         return Detail.of([view.patch_changes for view in self.views])
 
     @property
-    def _detail_text(self) -> str:
-        detail, target = self.detail, "photographs" if self.against == "photos" else "the reference"
-        return (
-            f"SSIM to {target} in patches of {PATCH}x{PATCH} pixels: "
-            f"{format_metric(detail.worst_percent, 4, signed=True)} in the worst 1 %, "
-            f"{format_metric(detail.worst, 4, signed=True)} in the worst one, "
-            f"{format_metric(100 * detail.share_below, 2)} % lose more than {LARGE_LOSS}"
-        )
-
-    @property
     def extremes(self) -> str:
         """Worst view and its pose, fifth percentile, detail, and share of the scene that is shown, as text."""
         worst = self.worst
         lowest = worst.comparison.candidate_vs_reference.psnr
         text = (
             f"worst view {format_metric(lowest, 1)} dB ({worst.view.name}, {worst.pose}), "
-            f"5th percentile {format_metric(self.fifth_percentile, 1)} dB; {self._detail_text}"
+            f"5th percentile {format_metric(self.fifth_percentile, 1)} dB; {detail_text(self.detail, self.against)}"
         )
         if self.shown is not None:
             text += f"; the views show {math.floor(100 * self.shown)} % of the scene"

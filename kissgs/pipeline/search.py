@@ -256,7 +256,8 @@ class Search:
             self.best = self.closest
         if self.best is None or self.best.bytes > (self.goal.most_bytes or math.inf):
             raise UnsupportedError(self._failure())
-        return self.best
+        evaluates = self.goal.by_size and self.work.time is None and not self.stopped
+        return self._evaluated(self.best) if evaluates else self.best
 
     # The searches: all Gaussians, fewer of them trained on photographs, and fewer without photographs.
 
@@ -588,6 +589,13 @@ class Search:
         most = ReadOptions.allowing(len(self.work.original))
         threads = self.work.context.threads
         return self.compare(read_scene(made.encoded.files, most, threads=threads), Context(threads))
+
+    def _evaluated(self, best: Attempt) -> Attempt:
+        """Return the best container of a size, which need not have been compared, with what it loses."""
+        evaluated = best.with_evaluation(self._evaluate(best.made))
+        last = max(n for n, attempt in enumerate(self.attempts) if attempt == best)  # equal but for the container
+        self.attempts[last] = replace(evaluated, container=None)
+        return evaluated
 
     def _loss(self, made: Container) -> float:
         """Return the drop of PSNR of a container, decibels; infinite if a rendering failed.
