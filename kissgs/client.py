@@ -24,17 +24,13 @@ from kissgs.settings import GROUPS, Settings
 if TYPE_CHECKING:
     import httpx
 
-BLOCK_BYTES = 1 << 18
-"""Size of the blocks in which files are uploaded and downloaded."""
-
-RETRY_SECONDS = 300.0
-"""Time for which requests to an overloaded or restarting service are repeated."""
+BLOCK_BYTES = 1 << 18  # size of the blocks in which files are uploaded and downloaded
+RETRY_SECONDS = 300.0  # time for which requests to an overloaded or restarting service are repeated
 
 FIRST_RETRY_SECONDS = 8.0
 """Time for which requests to a service that has never answered are repeated: its address may be wrong."""
 
-WAIT = "wait for server"
-"""Stage in which a request is repeated after a while."""
+WAIT = "wait for server"  # stage in which a request is repeated after a while
 
 T = TypeVar("T")
 

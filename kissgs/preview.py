@@ -328,8 +328,7 @@ def _licences(files: dict[str, Path]) -> str:
 # A server of the preview page and one scene.
 
 HOST = "127.0.0.1"
-SLOWEST_SECONDS = 60
-"""A client that sends or takes nothing for this long is disconnected."""
+SLOWEST_SECONDS = 60  # a client that sends or takes nothing for this long is disconnected
 
 _TYPES = {
     ".html": "text/html; charset=utf-8",

@@ -46,8 +46,7 @@ others are decoded whole. Pillow warns above this number."""
 BAND_PIXELS = 1 << 22
 """Number of pixels that are converted to RGB at a time where that needs numbers larger than a byte."""
 
-QUARTER_TURNS = (5, 6, 7, 8)
-"""Values of EXIF's orientation that exchange width and height."""
+QUARTER_TURNS = (5, 6, 7, 8)  # values of EXIF's orientation that exchange width and height
 
 _ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
 
@@ -169,14 +168,12 @@ def _band_to_rgb(band: Image.Image, background: Float32[np.ndarray, "3"]) -> UIn
 # The distortion model is Brown's with OpenCV's coefficients, which COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and
 # FULL_OPENCV and nerfstudio share. Fisheye lenses have other models, which the readers of camera files reject.
 
-MIN_AREA = 0.1
-"""Minimum share of the photograph's area that must remain; real lenses keep more than half."""
+MIN_AREA = 0.1  # minimum share of the photograph's area that must remain; real lenses keep more than half
 
 _BLOCK_PIXELS = 1 << 14
 """Number of pixels undistorted at a time, so that temporaries of about 2 MB stay in the processor's cache."""
 
-_GRID = 33
-"""Points per side at which the interior of a window is checked; its border is checked at every pixel."""
+_GRID = 33  # points per side at which the interior of a window is checked; its border is checked at every pixel
 
 
 @dataclass(frozen=True, slots=True)

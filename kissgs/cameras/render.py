@@ -40,17 +40,13 @@ from kissgs.rendering.rasterizer import BLACK, Colour
 class Orbit:
     """A horizontal circle around a look-at target, and the arc of it from which the scene looks good."""
 
-    target: Vec3
-    """Point that all cameras look at, world units."""
-    radius: float
-    """Distance of the cameras from the target, world units; 0 to look around from the target itself."""
-    elevation: float
-    """Elevation of the cameras as seen from the target, radians."""
+    target: Vec3  # point that all cameras look at, world units
+    radius: float  # distance of the cameras from the target, world units; 0 to look around from the target itself
+    elevation: float  # elevation of the cameras as seen from the target, radians
     up: Vec3
     mid_azimuth: float = 0.0
     """Azimuth of the middle of the arc; of a full circle, the azimuth with the best view; radians."""
-    sweep: float = 2 * np.pi
-    """Length of the arc, radians; 2 pi for a full circle."""
+    sweep: float = 2 * np.pi  # length of the arc, radians; 2 pi for a full circle
 
     @property
     def full(self) -> bool:
@@ -114,29 +110,17 @@ def _swing_phase(frame: int, frames: int) -> int:
 # Horizontal circles of several radii and elevations are scored by thumbnails all along them, like virtual cameras. A
 # scene that was captured from one side dissolves towards the ends of the arc, where the path turns back.
 
-COARSE_STEPS = 24
-"""Number of thumbnails along each circle."""
-
-FINE_STEPS = 72
-"""Number of thumbnails along the circle that is selected."""
+COARSE_STEPS = 24  # number of thumbnails along each circle
+FINE_STEPS = 72  # number of thumbnails along the circle that is selected
 
 FULL_CIRCLE_TOLERANCE = 0.15
 """How much lower than on an arc the scores on a full circle may be: to pass a weak view is better than to turn back."""
 
-MIN_SWEEP = float(np.radians(30))
-"""Shortest arc, radians; on a shorter one the motion would hardly be noticed."""
-
-RADII = (1.1, 1.5, 2.0, 2.6)
-"""Radii of circles around the centre of a scene with a background, in radii of the scene."""
-
-ELEVATIONS = (5, 15, 28)
-"""Elevations of circles as seen from the centre, degrees."""
-
-OBJECT_MARGIN = 1.1
-"""Size of the frame around an object that stands alone, relative to the object."""
-
-LOOK_AROUND_PITCH = 6
-"""Downward pitch of cameras that look around from one position, degrees."""
+MIN_SWEEP = float(np.radians(30))  # shortest arc, radians; on a shorter one the motion would hardly be noticed
+RADII = (1.1, 1.5, 2.0, 2.6)  # radii of circles around the centre of a scene with a background, in radii of the scene
+ELEVATIONS = (5, 15, 28)  # elevations of circles as seen from the centre, degrees
+OBJECT_MARGIN = 1.1  # size of the frame around an object that stands alone, relative to the object
+LOOK_AROUND_PITCH = 6  # downward pitch of cameras that look around from one position, degrees
 
 
 def find_orbit(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: int = 640, height: int = 480) -> Orbit:
@@ -254,8 +238,7 @@ def _with_arc(circle: Orbit, scores: Float64[np.ndarray, " steps"], min_score: f
 IMAGE_SIZE, FRAME_SIZE, CELL_SIZE = (1280, 960), (640, 480), (320, 240)
 """Default (width, height), pixels: of a single image, of an animation's frames, of the images on a contact sheet."""
 
-ANIMATION_FRAMES, SHEET_FRAMES = 48, 24
-"""Default number of images of an orbit, in an animation and on a contact sheet."""
+ANIMATION_FRAMES, SHEET_FRAMES = 48, 24  # default number of images of an orbit, in an animation and on a contact sheet
 
 HELD_OUT = " · held out"
 
@@ -264,24 +247,20 @@ HELD_OUT = " · held out"
 class RenderedImages:
     """Result of a render job."""
 
-    images: Sequence[UInt8[np.ndarray, "H W 3"]]
-    """One image or contact sheet, or the frames of an animation."""
+    images: Sequence[UInt8[np.ndarray, "H W 3"]]  # one image or contact sheet, or the frames of an animation
     views: Sequence[View]
     """The views that were rendered, in the world's coordinates; for a contact sheet, those of all its cells."""
-    description: str
-    """Description of the views, for people."""
+    description: str  # description of the views, for people
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RenderJob:
     """Renderer of a scene with the choices of ``kissgs render``."""
 
-    splats: Splats
-    """Without non-finite values (:func:`kissgs.clean`)."""
+    splats: Splats  # without non-finite values (clean)
     size: tuple[int, int] | None = None
     """(width, height) of each image, pixels; None for the camera's size, else for the default."""
-    background: Colour | None = None
-    """RGB, 0 to 1; None for that of the capture, else black."""
+    background: Colour | None = None  # RGB, 0 to 1; None for that of the capture, else black
     context: Context = DEFAULT_CONTEXT
 
     def single(self, capture: Views | None, which: str | None) -> RenderedImages:

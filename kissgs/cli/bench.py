@@ -39,8 +39,7 @@ if TYPE_CHECKING:
 
 # ``kissgs warmup``: compile all kernels in advance, and measure the speed of the machine.
 
-SAMPLE_COUNT = 20_000
-"""Gaussians of the synthetic scene that is encoded to measure the speed."""
+SAMPLE_COUNT = 20_000  # Gaussians of the synthetic scene that is encoded to measure the speed
 
 
 def warmup() -> None:
@@ -85,11 +84,8 @@ def _measure_speed() -> None:
 
 Measured = TypeVar("Measured")
 
-Row = dict[str, Any]
-"""A line of the CSV file: bytes, seconds and decibels by name."""
-
-TIMES = ("5s", "30s", "2min")
-"""Default time limits."""
+Row = dict[str, Any]  # a line of the CSV file: bytes, seconds and decibels by name
+TIMES = ("5s", "30s", "2min")  # default time limits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -151,8 +151,7 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
 
 # ``kissgs compress --ray``: scenes as work items on the nodes of a Ray cluster.
 
-PROCESS_BYTES = 500_000_000
-"""Memory that a scene of any size needs, bytes: mostly the libraries."""
+PROCESS_BYTES = 500_000_000  # memory that a scene of any size needs, bytes: mostly the libraries
 
 MEMORY_RATIO, TRAINING_RATIO, PACKED_RATIO = 4, 12, 10
 """Memory that a scene needs for each byte of its ``.ply``: without and with training; and by how much the files of

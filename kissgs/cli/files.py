@@ -99,8 +99,7 @@ class Result:
     shown: RenderableType
 
 
-Work = Callable[[str, Path], Result]
-"""Gets an input and the path of its output, "-" for standard output."""
+Work = Callable[[str, Path], Result]  # gets an input and the path of its output, "-" for standard output
 
 Pairs = list[tuple[str, Path]]
 
@@ -230,8 +229,7 @@ def source(name: str) -> Path | bytes:
     return sys.stdin.buffer.read()
 
 
-CHECKPOINT = ".checkpoint.npz"
-"""Ending of checkpoints beside scenes."""
+CHECKPOINT = ".checkpoint.npz"  # ending of checkpoints beside scenes
 
 
 def sibling(name: str, suffix: str) -> Path:

@@ -59,8 +59,7 @@ class SearchNote:
 
 # ``Deadline``: the time until which work shall be finished, and ``Pace``: the steps that fit in until then.
 
-SETTLING_STEPS = 3
-"""Steps that :class:`Pace` leaves out of its mean: they load or compile what all others share."""
+SETTLING_STEPS = 3  # steps that Pace leaves out of its mean: they load or compile what all others share
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +109,7 @@ class Pace:
 
 # ``Context``: what all functions of long work receive.
 
-Device = Literal["cpu", "cuda"]
-"""Device of training and of the rasteriser for images."""
+Device = Literal["cpu", "cuda"]  # device of training and of the rasteriser for images
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,7 @@ UNREADABLE = (ImportError, AttributeError, EOFError, LookupError, TypeError, Val
 """Errors of reading a cache that is damaged, or that another version left and that names modules which are gone."""
 
 _compiling = threading.RLock()
-_uncached: list[str] = []
-"""Names of kernels for which numba found no folder to cache them in."""
+_uncached: list[str] = []  # names of kernels for which numba found no folder to cache them in
 
 
 def compiled(signature: str | Signature, **options: Any) -> Callable[[Kernel], Kernel]:  # noqa: ANN401

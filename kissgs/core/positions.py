@@ -30,11 +30,8 @@ def signed_exp(y: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
 
 # Coarse positions: those that a container would move by more than can be seen, and cuts of space that mend it.
 
-COARSE_ERROR = 0.25
-"""Error of a position, in units of the Gaussian's size, above which it is coarse."""
-
-COARSE_SHARE = 0.01
-"""Share of coarse positions above which a scene has lost something."""
+COARSE_ERROR = 0.25  # error of a position, in units of the Gaussian's size, above which it is coarse
+COARSE_SHARE = 0.01  # share of coarse positions above which a scene has lost something
 
 CONTAINER_LEVELS = (1 << 16) - 1
 """Steps between the smallest and the largest signed logarithm of a container's positions."""
@@ -47,8 +44,7 @@ STREAMED_REMEDY = "no origin helps here, but compressing into FOLDER/lod-meta.js
 LEAST, MOST_CUTS = 32, 12
 """Number of Gaussians in a chunk, and of cuts one after another, up to which chunks are cut for finer positions."""
 
-TRIED = 1 << 16
-"""Largest number of Gaussians with which cuts are tried before they are named as a remedy."""
+TRIED = 1 << 16  # largest number of Gaussians with which cuts are tried before they are named as a remedy
 
 
 def coarse_share(errors: Float[np.ndarray, " N"], scales: Float32[np.ndarray, "N 3"]) -> float:
@@ -133,8 +129,7 @@ class Cuts:
     """Axis-parallel cuts of space: a complete binary tree, whose leaves are the chunks."""
 
     depth: int
-    axes: UInt8[np.ndarray, " nodes"]
-    """Axis of each inner node; node n has the children 2 n and 2 n + 1, the root is 1."""
+    axes: UInt8[np.ndarray, " nodes"]  # axis of each inner node; node n has the children 2 n and 2 n + 1, the root is 1
     values: Float64[np.ndarray, " nodes"]
     """Coordinate of each cut; positions at and above it belong to the second child."""
 
@@ -199,8 +194,7 @@ def cuts_without_coarse(sample: Float32[np.ndarray, "S 4"], cuts: Cuts, count: i
 
 Origin = tuple[float, float, float]
 
-WORLD: Origin = (0.0, 0.0, 0.0)
-"""Origin of a scene whose positions are those of the world."""
+WORLD: Origin = (0.0, 0.0, 0.0)  # origin of a scene whose positions are those of the world
 
 
 def world_positions(splats: Splats) -> Float64[np.ndarray, "N 3"]:

@@ -33,12 +33,10 @@ memory comes from the system and returns there when it is freed."""
 USUAL_TRIM, USUAL_MMAP = 64 << 20, 32 << 20
 """Bytes for these options to which glibc itself goes once arrays of 32 MB have been freed."""
 
-LARGEST_TRIM, LARGEST_MMAP = (1 << 31) - 1, 1 << 30
-"""Bytes for these options with which arrays up to 1 GB are kept."""
+LARGEST_TRIM, LARGEST_MMAP = (1 << 31) - 1, 1 << 30  # bytes for these options with which arrays up to 1 GB are kept
 
 _lock = threading.Lock()
-_keeping = 0
-"""Number of ``with`` blocks of :func:`keep_free_memory` that are running."""
+_keeping = 0  # number of with blocks of keep_free_memory that are running
 
 
 def return_free_memory() -> None:
@@ -104,8 +102,7 @@ class StageTimer:
 
     receiver: Progress
     seconds: dict[str, float] = field(default_factory=dict)
-    cpu_seconds: float = 0.0
-    """Processor time of this process up to the last :meth:`stop`."""
+    cpu_seconds: float = 0.0  # processor time of this process up to the last stop
     _stage: str | None = None
     _since: float = 0.0
     _cpu_since: float = field(default_factory=time.process_time)

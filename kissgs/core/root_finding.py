@@ -6,11 +6,8 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-ATTEMPTS = 10
-"""Default number of evaluations."""
-
-MAX_EXTRAPOLATION = 4.0
-"""Largest distance of an evaluation from known points, except for one at a bound."""
+ATTEMPTS = 10  # default number of evaluations
+MAX_EXTRAPOLATION = 4.0  # largest distance of an evaluation from known points, except for one at a bound
 
 MIN_SLOPE_SHARE = 0.15
 """Share of the expected slope below which, over half of :data:`MAX_EXTRAPOLATION`, the search jumps to the bound."""

@@ -10,33 +10,22 @@ from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 
-UNSEEN = 1e-3
-"""Smallest colour sensitivity, in units of the prior, which ignores occlusion."""
+UNSEEN = 1e-3  # smallest colour sensitivity, in units of the prior, which ignores occlusion
 
 FLOOR = 0.55
 """Smallest sensitivity, in units of the prior times the view uncertainty, so that for a camera nearby the Gaussian's
 quality is within a few decibels of its neighbours'."""
 
-SEEN_COVERAGE = 0.2
-"""Coverage above which a Gaussian was seen well enough to scale the prior by."""
+SEEN_COVERAGE = 0.2  # coverage above which a Gaussian was seen well enough to scale the prior by
 
 LARGEST = 1e25
 """Largest absolute Hessian entry: squares of enormous Gaussians overflow, and sums of costs would be infinite."""
 
-HARMONICS_TOLERANCE = 1.001
-"""Factor by which the squares of mean harmonics may exceed their largest sum by rounding."""
-
-OPACITY, SCALES, ROTATION = (0,), (4, 5, 6), (7, 8, 9)
-"""Indices of the diagonal entries in ``shape_hessian``."""
-
-POSITION = (0, 1, 2)
-"""Indices of the diagonal entries in ``position_hessian``."""
-
-RATIO_SAMPLE = 1 << 18
-"""Largest number of Gaussians from which ratios of sensitivities are estimated."""
-
-BLOCK = 1 << 16
-"""Gaussians per step of array arithmetic, so that temporary arrays stay small."""
+HARMONICS_TOLERANCE = 1.001  # factor by which the squares of mean harmonics may exceed their largest sum by rounding
+OPACITY, SCALES, ROTATION = (0,), (4, 5, 6), (7, 8, 9)  # indices of the diagonal entries in shape_hessian
+POSITION = (0, 1, 2)  # indices of the diagonal entries in position_hessian
+RATIO_SAMPLE = 1 << 18  # largest number of Gaussians from which ratios of sensitivities are estimated
+BLOCK = 1 << 16  # Gaussians per step of array arithmetic, so that temporary arrays stay small
 
 
 @dataclass(frozen=True, slots=True, eq=False)

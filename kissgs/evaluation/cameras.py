@@ -33,16 +33,12 @@ BACKGROUNDS = (0.0, 0.5, 1.0)
 FIELDS_OF_VIEW = np.radians((50.0, 90.0))
 """Smallest and largest field of view along the longer side of the image, radians."""
 
-MAX_DRAWS = 12
-"""Largest number of cameras drawn for one view until one is accepted."""
-
-THUMBNAIL = 64
-"""Longer side of the thumbnails that decide whether a camera is accepted, pixels."""
+MAX_DRAWS = 12  # largest number of cameras drawn for one view until one is accepted
+THUMBNAIL = 64  # longer side of the thumbnails that decide whether a camera is accepted, pixels
 
 # Cameras for overlooked parts of a scene: parts whose loss would hardly change any image of the drawn cameras.
 
-MAX_ADDED = 72
-"""Largest number of added cameras."""
+MAX_ADDED = 72  # largest number of added cameras
 
 VISIBLE_PSNR = 18.0
 """Largest PSNR, decibels, between thumbnails with and without a part at which its loss counts as visible; between full
@@ -125,11 +121,8 @@ def _psnr(one: Float32[np.ndarray, "H W 3"], other: Float32[np.ndarray, "H W 3"]
 # evaluated with the same cameras, these errors would not show. So evaluation chooses its own: cameras are
 # drawn at random instead of optimised, and every Gaussian that can be visible may become a target.
 
-COUNT = 24
-"""Number of evaluation views, without those added for overlooked parts."""
-
-WIDTH, HEIGHT = 320, 240
-"""Size of the images, pixels."""
+COUNT = 24  # number of evaluation views, without those added for overlooked parts
+WIDTH, HEIGHT = 320, 240  # size of the images, pixels
 
 KINDS = ("far", "around", "close-up", "across")
 """Kinds of poses, in turn: outside of the scene; around a part of random size; close to a surface; from one part of the
@@ -141,14 +134,9 @@ EXTENT_SHARES = (1.0, 0.98, 0.9, 0.5)
 CLOSE_UP_RANKS = (100, 1000)
 """Smallest and largest number of Gaussians that are nearer to the target of a close-up than its camera is."""
 
-MIN_SIGMAS = 5.0
-"""Smallest distance of a camera to its target Gaussian, in the Gaussian's standard deviations."""
-
-MIN_MEAN_ALPHA = 0.02
-"""An image with a smaller mean alpha counts as empty."""
-
-INSIDE_SIGMAS = 3.0
-"""A camera within this Mahalanobis distance of a Gaussian's mean counts as inside it."""
+MIN_SIGMAS = 5.0  # smallest distance of a camera to its target Gaussian, in the Gaussian's standard deviations
+MIN_MEAN_ALPHA = 0.02  # an image with a smaller mean alpha counts as empty
+INSIDE_SIGMAS = 3.0  # a camera within this Mahalanobis distance of a Gaussian's mean counts as inside it
 
 MAX_INSIDE_SHARE, MAX_SINGLE_SHARE = 0.5, 0.3
 """Largest shares of an image that Gaussians around the camera, and that a single Gaussian, may cover."""
@@ -231,12 +219,9 @@ def _grey(level: float) -> Float32[np.ndarray, "3"]:
 class _PoseSampler:
     """Draws poses relative to the visible Gaussians of a scene."""
 
-    any_visible: bool
-    """Whether there are any; if not, one at the origin stands in, so that there are cameras."""
-    columns: Float32[np.ndarray, "3 n"]
-    """Positions, as stored."""
-    sizes: Float64[np.ndarray, " n"]
-    """Standard deviations along the middle axis."""
+    any_visible: bool  # whether there are any; if not, one at the origin stands in, so that there are cameras
+    columns: Float32[np.ndarray, "3 n"]  # positions, as stored
+    sizes: Float64[np.ndarray, " n"]  # standard deviations along the middle axis
     gaussians: GaussianSampler
 
     @classmethod

@@ -14,8 +14,7 @@ PatchChanges = Float64[np.ndarray, "_h _w"]
 """Change of SSIM in each patch of an image (:func:`kissgs.rendering.metrics.ssim_with_patches`), negative for a loss: a
 candidate's less the original's, both to a photograph; without photographs the candidate's to the original, less 1."""
 
-LARGE_LOSS = 0.05
-"""Loss of SSIM beyond which a patch counts in :attr:`Detail.share_below`."""
+LARGE_LOSS = 0.05  # loss of SSIM beyond which a patch counts in share_below
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,14 +35,12 @@ have about 8 to 12 dB; renderings of a trained scene have 20 to 35."""
 COMPARED, SIDE = 5, 160
 """Number of photographs that are compared, and of pixels on the longer side of each, samples of the photograph."""
 
-CAMERAS = 16
-"""Number of cameras that tell, where there are no photographs, how much of the scene they show."""
+CAMERAS = 16  # number of cameras that tell, where there are no photographs, how much of the scene they show
 
 GAINS = 0.25, 4.0
 """Limits of the factor by which a photograph may be darker or brighter than renderings of the same scene."""
 
-MIN_ALPHA = 0.02
-"""Smallest mean alpha of a rendering that is compared where the scene is opaque."""
+MIN_ALPHA = 0.02  # smallest mean alpha of a rendering that is compared where the scene is opaque
 
 NOT_COMPARED = "no photograph of the capture can be compared with, so whether it belongs to this scene is not known"
 """Note on a capture whose cameras see the scene, but that has no photographs."""

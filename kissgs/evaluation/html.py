@@ -42,8 +42,7 @@ INFERNO = (
 FULL_SCALES = (1, 2, 3, 5, 10, 15, 20, 30, 50, 100, 255)
 """Errors that the brightest colour may stand for, levels of an 8-bit image."""
 
-WINDOW = 32
-"""Side of the square over which the largest error is searched, pixels."""
+WINDOW = 32  # side of the square over which the largest error is searched, pixels
 
 
 def rms_difference(
@@ -168,20 +167,11 @@ def _row(name: str, comparison: Comparison) -> str:
     return f"<tr><td>{name}</td>{cells}</tr>"
 
 
-MAX_VIEWS = 12
-"""Largest number of views shown with images, about 10 MB in all."""
-
-MAX_SURROUNDINGS = 4
-"""Largest number of views of the surroundings shown with images."""
-
-MAX_PATCHES = 6
-"""Largest number of patches shown, those that lose most SSIM."""
-
-MAX_SIDE = 1280
-"""Longer side of the large images, pixels; larger ones are reduced."""
-
-QUALITY = 90
-"""WebP quality of the large images; lossless, they would be five times as large."""
+MAX_VIEWS = 12  # largest number of views shown with images, about 10 MB in all
+MAX_SURROUNDINGS = 4  # largest number of views of the surroundings shown with images
+MAX_PATCHES = 6  # largest number of patches shown, those that lose most SSIM
+MAX_SIDE = 1280  # longer side of the large images, pixels; larger ones are reduced
+QUALITY = 90  # WebP quality of the large images; lossless, they would be five times as large
 
 MAX_CROP, MIN_CROP = 160, 64
 """Limits of the side of an enlarged crop, pixels; within them it is half of the image's shorter side."""
@@ -244,8 +234,7 @@ def _worst_first(evaluation: Evaluation) -> list[int]:
     return sorted(range(len(evaluation.views)), key=lambda i: evaluation.views[i].ranking_psnr)
 
 
-Patch = tuple[int, int, int]
-"""Index of a view, and row and column of a patch in it."""
+Patch = tuple[int, int, int]  # index of a view, and row and column of a patch in it
 
 
 def _patches_to_show(evaluation: Evaluation) -> list[Patch]:

@@ -307,8 +307,7 @@ SEARCH_SEED = 20_011
 """Seed of the cameras that evaluate the trials of a search. ``evaluate`` has seed 0: a result selected with some
 cameras is better from these than from others."""
 
-WORST_SHARE = 0.05
-"""Share of the views, the worst ones, that a goal limits separately."""
+WORST_SHARE = 0.05  # share of the views, the worst ones, that a goal limits separately
 
 MAX_ERROR_RATIO = 20.0
 """Largest ratio of the worst views' squared error to that of the goal. The mean alone would accept the loss of a part

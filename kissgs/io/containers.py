@@ -14,22 +14,16 @@ from typing import Literal, NamedTuple, Protocol, runtime_checkable
 from kissgs.core.errors import InvalidContainerError
 from kissgs.io.files import reason_of
 
-MAX_ZIP_ENTRIES = 1000
-"""Largest number of entries: a container has 12 files, to which users may add notes and previews."""
-
-MAX_TREE_ENTRIES = 20_000
-"""Largest number of entries of a zip of many containers, each of which has up to eight files."""
-
-MAX_DIRECTORY_BYTES = 1 << 21
-"""Largest list of entries in a zip, which is read whole."""
+MAX_ZIP_ENTRIES = 1000  # largest number of entries: a container has 12 files, to which users may add notes and previews
+MAX_TREE_ENTRIES = 20_000  # largest number of entries of a zip of many containers, each of which has up to eight files
+MAX_DIRECTORY_BYTES = 1 << 21  # largest list of entries in a zip, which is read whole
 
 META_NAME = "meta.json"
 
 MAX_METADATA_BYTES = 1 << 20
 """Largest size of a metadata file, bytes; kissgs writes 4 kB for SOG-XT, and 15 kB for SOG with its codebooks."""
 
-MAX_SIGNED_LOG = 88.7
-"""Largest signed logarithm of a position: exp of more exceeds float32."""
+MAX_SIGNED_LOG = 88.7  # largest signed logarithm of a position: exp of more exceeds float32
 
 _END, _END64 = b"PK\x05\x06", b"PK\x06\x07"
 _END_SIZE, _MAX_COMMENT = 22, 0xFFFF
@@ -38,8 +32,7 @@ _LOCAL = struct.Struct("<4s22xHH")
 _STORED, _DEFLATED = 0, 8
 _BLOCK = 1 << 20
 
-ZIP_MAGICS = (b"PK\x03\x04", _END)
-"""First bytes of a zip file, and of an empty one."""
+ZIP_MAGICS = (b"PK\x03\x04", _END)  # first bytes of a zip file, and of an empty one
 
 
 @runtime_checkable

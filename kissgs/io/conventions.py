@@ -10,8 +10,7 @@ from kissgs.core.splats import OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_C0, Spla
 
 # Values and 8-bit codes of other formats -> the stored (pre-activation) parameters of a scene.
 
-ROWS = 1 << 14
-"""Gaussians per step, so that temporaries stay in the processor's cache."""
+ROWS = 1 << 14  # Gaussians per step, so that temporaries stay in the processor's cache
 
 _SLOTS = np.array([[0, 1, 2, 3], [1, 0, 2, 3], [1, 2, 0, 3], [1, 2, 3, 0]])
 """Indices of the four components in (largest, first, second, third of the others), by the index of the largest."""
@@ -32,11 +31,8 @@ def log_scales(scales: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
     return logs
 
 
-OPACITY_OF_BYTE = opacity_logits(np.arange(256) / 255)
-"""Opacity logit of each 8-bit opacity."""
-
-SH0_OF_BYTE = ((np.arange(256) / 255 - 0.5) / SH_C0).astype(np.float32)
-"""Constant SH coefficient of each 8-bit colour."""
+OPACITY_OF_BYTE = opacity_logits(np.arange(256) / 255)  # opacity logit of each 8-bit opacity
+SH0_OF_BYTE = ((np.arange(256) / 255 - 0.5) / SH_C0).astype(np.float32)  # constant SH coefficient of each 8-bit colour
 
 
 def look_up(
@@ -120,8 +116,7 @@ def note_clamped(notes: list[str], what: str, values: np.ndarray, low: float, hi
 
 # Axes of other formats, and those of a ``.ply``: x right, y down, z forward.
 
-Signs = tuple[int, int, int]
-"""Sign of each axis, 1 or -1."""
+Signs = tuple[int, int, int]  # sign of each axis, 1 or -1
 
 
 def axis_signs(frame: str) -> Signs:
@@ -196,8 +191,7 @@ def _quaternion(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 4
 
 # Morton order: Gaussians that follow one another are close to one another.
 
-_BITS = 21
-"""Bits per axis: three axes fill 63 of 64 bits."""
+_BITS = 21  # bits per axis: three axes fill 63 of 64 bits
 
 _OUTSIDE = 1e-3
 """Share of the Gaussians at either end of an axis that is not resolved, so that outliers do not coarsen the rest."""

@@ -80,8 +80,7 @@ def _refuse_constant(name: str) -> NoReturn:
 
 # Atomic output: a temporary file beside the destination, renamed when it is complete.
 
-BLOCK = 4096
-"""Bytes that :func:`check_writable` writes: at least one block of the file system."""
+BLOCK = 4096  # bytes that check_writable writes: at least one block of the file system
 
 
 @contextlib.contextmanager

@@ -84,8 +84,7 @@ _NEEDED_VALUES = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 _USUAL = {"projection": "perspective", "sortingMethod": "cameraDistance"}
 """How they are drawn here, by key of the extension; other ways are left out, with a note."""
 
-TO_PLY: Signs = (-1, -1, 1)
-"""Signs from glTF's axes to those of a ``.ply``."""
+TO_PLY: Signs = (-1, -1, 1)  # signs from glTF's axes to those of a .ply
 
 MAX_JSON_BYTES, MAX_GLTF_BYTES = 1 << 22, 1 << 30
 """Largest size of the JSON in a GLB, some kilobytes for a scene; and of a ``.gltf``, whose buffers may be in it."""
@@ -507,8 +506,7 @@ def _turn_to_ply(splats: Splats) -> None:
 # In the form of floats, colours and opacities are also there as ``COLOR_0``, so that programs without the extension
 # show coloured points.
 
-MAX_GLB_BYTES = (1 << 32) - 1
-"""Largest GLB: its header has 32 bits for the size."""
+MAX_GLB_BYTES = (1 << 32) - 1  # largest GLB: its header has 32 bits for the size
 
 _NOT_IN_SPZ = (f"{EXTENSION}:OPACITY", _BANDS[0][0])
 """Attributes that the extension for ``.spz`` gives no source: there, ``COLOR_0`` is colour and opacity."""

@@ -14,14 +14,9 @@ from kissgs.settings import EncodeSettings
 HIGHEST_EFFORT, HIGH_EFFORT = (100, 6), (100, 5)
 """Quality and method of libwebp for the codebook, and at least for small images that gain from more effort."""
 
-NO_GAIN = ("mask", "means", "labels")
-"""Parts of the names of images that no effort makes smaller."""
-
-USUAL_EFFORT = (75, 4)
-"""Quality and method up to which large images take less effort."""
-
-LARGE = 500_000
-"""Pixels from which an image is large: more effort than :func:`effort_of` gives saves 0.1 % in twice the time."""
+NO_GAIN = ("mask", "means", "labels")  # parts of the names of images that no effort makes smaller
+USUAL_EFFORT = (75, 4)  # quality and method up to which large images take less effort
+LARGE = 500_000  # pixels from which an image is large: more effort than effort_of gives saves 0.1 % in twice the time
 
 
 def compress_images(

@@ -44,17 +44,13 @@ from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, Re
 # Element ``chunk`` holds the bounds of each 256 Gaussians, ``vertex`` four packed words per Gaussian, and the optional
 # ``sh`` their ``f_rest_*``. Older files have no colour bounds: their colours span 0 to 1.
 
-_CHUNK = BLOCK_ALIGNMENT
-"""Gaussians per row of element ``chunk``, given by the format; blocks of rows are multiples of it."""
+_CHUNK = BLOCK_ALIGNMENT  # Gaussians per row of element chunk, given by the format; blocks of rows are multiples of it
 
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 """Properties of element ``vertex``: one word each."""
 
-_HALVES = (slice(0, 3), slice(3, 6))
-"""Columns of minima and of maxima among the six bounds of an attribute."""
-
-_MAX_SCALE = 20.0
-"""Bound of log-scales that a file holds, as the format's own tool has it."""
+_HALVES = (slice(0, 3), slice(3, 6))  # columns of minima and of maxima among the six bounds of an attribute
+_MAX_SCALE = 20.0  # bound of log-scales that a file holds, as the format's own tool has it
 
 
 def is_compressed(header: Header) -> bool:
@@ -265,8 +261,7 @@ _SCALE = ("scale_0", "scale_1", "scale_2")
 _OPACITY = ("opacity",)
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 _RGB = ("red", "green", "blue")
-_FILTER = "filter_3d"
-"""Name of Mip-Splatting's property in lower case; its own spelling is ``filter_3D``."""
+_FILTER = "filter_3d"  # name of Mip-Splatting's property in lower case; its own spelling is filter_3D
 
 _KNOWN = {*_POSITION, *_NORMAL, *_ROTATION, *_SCALE, *_OPACITY, *_COLOUR, *_RGB, "alpha", *PACKED}
 """Properties that are read or repeat what others say, as ``red`` does beside ``f_dc_0``; INRIA's normals are zero."""
@@ -289,14 +284,10 @@ _IN_TIME = re.compile(
 class PlyInfo:
     """Properties of a scene that the header of its file states."""
 
-    count: int
-    """Number of Gaussians."""
-    sh_degree: int
-    """SH degree, 0 to 3."""
-    encoding: Encoding
-    """Encoding of the body, as the header names it."""
-    compressed: bool
-    """Whether it is PlayCanvas' compressed ``.ply``."""
+    count: int  # number of Gaussians
+    sh_degree: int  # SH degree, 0 to 3
+    encoding: Encoding  # encoding of the body, as the header names it
+    compressed: bool  # whether it is PlayCanvas' compressed .ply
     antialiased: bool = False
     """Whether a comment of Brush or Postshot says that the scene was trained with antialiasing."""
 

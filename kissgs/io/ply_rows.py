@@ -88,8 +88,7 @@ class Header:
     elements: dict[str, Element]
     nbytes: int
     lines: int
-    antialiased: bool
-    """Whether a comment says that the scene was trained with antialiasing."""
+    antialiased: bool  # whether a comment says that the scene was trained with antialiasing
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,11 +243,8 @@ def _quote(word: str) -> str:
 
 # Rows of a PLY element, binary or ascii, block by block.
 
-BLOCK_BYTES = 1 << 20
-"""Bytes per block: small enough to stay in the processor's cache until all columns are copied."""
-
-BLOCK_ALIGNMENT = 256
-"""Row count that the blocks of :func:`rows`, except the last, are multiples of in binary files."""
+BLOCK_BYTES = 1 << 20  # bytes per block: small enough to stay in the processor's cache until all columns are copied
+BLOCK_ALIGNMENT = 256  # row count that the blocks of rows, except the last, are multiples of in binary files
 
 _INFINITY = re.compile(r"(?<!\S)([+-]?)1\.#inf\d*(e[+-]?\d+)?(?!\S)", re.IGNORECASE)
 _NAN = re.compile(r"(?<!\S)[+-]?(nan(\([^\s()]*\)|[qs])|[qs]nan|1\.#[a-z]+\d*(e[+-]?\d+)?|1\.\$)(?!\S)", re.IGNORECASE)

@@ -29,8 +29,7 @@ from kissgs.io.conventions import (
 from kissgs.io.files import BinaryWriter, SceneFile, open_scene_file, refuse_more_than
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions
 
-ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-"""One Gaussian."""
+ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])  # one Gaussian
 
 
 def read_splat(

@@ -40,8 +40,7 @@ _GZIP = 16 + zlib.MAX_WBITS
 
 _BLOCK_BYTES = 1 << 20
 
-_MAX_RATIO = 1032
-"""Largest ratio of deflate: 258 bytes of two bits."""
+_MAX_RATIO = 1032  # largest ratio of deflate: 258 bytes of two bits
 
 _MIN_WINDOW_LOG = 27
 """Windows of zstd up to 128 MiB are accepted in any case: its command line makes no larger ones unless asked to."""
@@ -112,14 +111,12 @@ def unpack_frame(frame: bytes, size: int, what: str) -> bytes:
 
 _BYTE = np.arange(256)
 
-SCALE_OF_BYTE = (_BYTE / 16 - 10).astype(np.float32)
-"""Natural logarithm of a standard deviation, in steps of 1/16."""
+SCALE_OF_BYTE = (_BYTE / 16 - 10).astype(np.float32)  # natural logarithm of a standard deviation, in steps of 1/16
 
 COLOR_OF_BYTE = ((_BYTE / 255 - 0.5) / 0.15).astype(np.float32)
 """Constant SH coefficient; 0.15, not the harmonic's value, is the format's factor."""
 
-SH_OF_BYTE = ((_BYTE - 128) / 128).astype(np.float32)
-"""Other SH coefficients."""
+SH_OF_BYTE = ((_BYTE - 128) / 128).astype(np.float32)  # other SH coefficients
 
 SH_STEPS = (4, 8)
 """Steps of the codes that are written, in the first band and above: 6 and 5 bits. Readers need not know them.
@@ -216,12 +213,10 @@ _EXTENSION = struct.Struct("<II")
 
 _ANTIALIASED, _HAS_EXTENSIONS, _SPARK_TREE = 1, 2, 0x80
 
-_COEFFICIENTS = (*SH_REST_COUNTS, 24)
-"""Number of SH coefficients beyond the constant one in a file of degree 0 to 4."""
+_COEFFICIENTS = (*SH_REST_COUNTS, 24)  # number of SH coefficients beyond the constant one in a file of degree 0 to 4
 
 _COORDINATES = 0xADBE0003
-_EXTENSION_NAMES = {0xADBE0002: "the limits of the camera"}
-"""Contents of other known extension records."""
+_EXTENSION_NAMES = {0xADBE0002: "the limits of the camera"}  # contents of other known extension records
 
 _FRAMES = ("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 """Frame of each value of the extension for coordinate systems; the first is unspecified.
@@ -232,13 +227,11 @@ rotations of its Gaussians in opposite directions, so that it is unknown how fil
 
 DEFAULT_FRAME, PLY_FRAME = "RUB", "RDF"
 
-_LARGEST_ROW = 20 + 3 * _COEFFICIENTS[-1]
-"""Bytes of a Gaussian before compression, with all SH coefficients."""
+_LARGEST_ROW = 20 + 3 * _COEFFICIENTS[-1]  # bytes of a Gaussian before compression, with all SH coefficients
 
 _MAX_FRACTIONAL_BITS = 31
 
-MAX_EXTENSION_BYTES = 1 << 20
-"""Largest size of all extension records: the known ones take 12 and 20 bytes."""
+MAX_EXTENSION_BYTES = 1 << 20  # largest size of all extension records: the known ones take 12 and 20 bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -51,11 +51,8 @@ class WorkItem:
 
     resources: Resources = Resources()
 
-    seconds: float | None = None
-    """Limit of the time since the start of its process."""
-
-    memory_limit: int | None = None
-    """Limit of the memory of its process, bytes, enforced on Linux."""
+    seconds: float | None = None  # limit of the time since the start of its process
+    memory_limit: int | None = None  # limit of the memory of its process, bytes, enforced on Linux
 
     folder: str | None = None
     """Current folder of its process; None for a new temporary one on the machine that runs it, which is removed when
@@ -66,8 +63,7 @@ class WorkItem:
     to a temporary one, and what is new or changed there comes back, all through Ray's object store: now and then the
     files directly in it, and after success those in its folders, too. Without files, the node must see the folder."""
 
-    retries: int = 3
-    """Number of times that it is started again after its node was lost."""
+    retries: int = 3  # number of times that it is started again after its node was lost
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:

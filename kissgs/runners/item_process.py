@@ -23,8 +23,7 @@ from kissgs.core.context import Progress
 from kissgs.core.errors import KissgsError
 from kissgs.runners.contract import MEMORY_LIMIT
 
-EVENT_SECONDS = 0.25
-"""Minimum seconds between progress events of a stage."""
+EVENT_SECONDS = 0.25  # minimum seconds between progress events of a stage
 
 WITHOUT_MEMORY = ("can't start new thread", "error return without exception set", "failed to map")
 """Parts of messages of Python and of its loader of libraries when there is no memory."""

@@ -38,8 +38,7 @@ from kissgs.runners.contract import (
     report,
 )
 
-PREFIX = "kissgs-item-"
-"""Beginning of the names of temporary folders of items."""
+PREFIX = "kissgs-item-"  # beginning of the names of temporary folders of items
 
 
 @contextlib.contextmanager
@@ -89,18 +88,12 @@ OUT_OF_MEMORY = re.compile(
 )
 """Messages of Python, C++, LLVM, OpenBLAS and the C library when an allocation fails; any of them may be the first."""
 
-NEAR_LIMIT = 0.8
-"""Share of the memory limit above which a crash without such a message is attributed to the limit."""
-
-SAMPLE_SECONDS = 0.1
-"""Seconds between looks at a process's time and memory."""
-
-LOG_BYTES = 4000
-"""Bytes of the end of standard error that are kept."""
+NEAR_LIMIT = 0.8  # share of the memory limit above which a crash without such a message is attributed to the limit
+SAMPLE_SECONDS = 0.1  # seconds between looks at a process's time and memory
+LOG_BYTES = 4000  # bytes of the end of standard error that are kept
 
 
-ProgressEvent = tuple[str, float, str]
-"""Stage, completed fraction and note, see :class:`kissgs.Progress`."""
+ProgressEvent = tuple[str, float, str]  # stage, completed fraction and note of Progress
 
 
 class ItemProcess:

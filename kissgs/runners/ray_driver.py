@@ -31,26 +31,16 @@ from kissgs.core.errors import OutputError, RunnerError
 from kissgs.runners import ray_node
 from kissgs.runners.contract import INTERNAL, LOST, NODE_UNUSABLE, Outcome, WorkItem
 
-CONNECT_SECONDS = 5.0
-"""Maximum seconds for a connection to the head's port."""
+CONNECT_SECONDS = 5.0  # maximum seconds for a connection to the head's port
 
 OBJECT_STORE_BYTES = 80 << 20
 """Size of the object store of a cluster that is started here: nearly the smallest; nothing is kept there."""
 
-NODES_SECONDS = 1.0
-"""Seconds between two looks at the cluster's nodes."""
-
-RETRY_SECONDS = 1.0
-"""Seconds before an item whose node was lost is started again: Ray may not know of the loss yet."""
-
-FORCE_SECONDS = 5.0
-"""Seconds after which a cancelled task that has not ended is killed."""
-
-EVENTS_AHEAD = 4
-"""Events of a start that have not been read, beyond which its task waits: they may be blocks of files."""
-
-LOCAL = "local"
-"""Argument instead of an address: start a cluster on this machine."""
+NODES_SECONDS = 1.0  # seconds between two looks at the cluster's nodes
+RETRY_SECONDS = 1.0  # seconds before an item whose node was lost is started again: Ray may not know of the loss yet
+FORCE_SECONDS = 5.0  # seconds after which a cancelled task that has not ended is killed
+EVENTS_AHEAD = 4  # events of a start that have not been read, beyond which its task waits: they may be blocks of files
+LOCAL = "local"  # argument instead of an address: start a cluster on this machine
 
 Send = Callable[[dict[str, Any]], None]
 

@@ -25,11 +25,8 @@ from kissgs.core.errors import RunnerError
 from kissgs.runners.contract import UNREACHABLE, Outcome, Resources, RunHandle, WorkItem, log, refusal_of, report
 from kissgs.runners.process import child_environment, json_lines
 
-CONNECT_SECONDS = 60.0
-"""Maximum seconds for the connection to a cluster, or the start of one on this machine."""
-
-RECONNECT_SECONDS = 5.0
-"""Minimum seconds between two attempts to connect again."""
+CONNECT_SECONDS = 60.0  # maximum seconds for the connection to a cluster, or the start of one on this machine
+RECONNECT_SECONDS = 5.0  # minimum seconds between two attempts to connect again
 
 CLOSE_SECONDS = 20.0
 """Maximum seconds for the end of all items and of the driver; then it is killed, and Ray ends the items."""

@@ -26,11 +26,8 @@ from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG
 
 # Description of SOG 2 for the planner: its tables, and no mask for padding.
 
-FIRST_DRAWN = 2
-"""Smallest level of opacity that viewers draw: they leave out opacities of 1/255 and less."""
-
-LAST_DRAWN = 254
-"""Largest level to use: 255 is an opacity of 1, whose logit no decoder can give back."""
+FIRST_DRAWN = 2  # smallest level of opacity that viewers draw: they leave out opacities of 1/255 and less
+LAST_DRAWN = 254  # largest level to use: 255 is an opacity of 1, whose logit no decoder can give back
 
 SOG = ContainerModel(
     tables=ByteTables(
@@ -44,8 +41,7 @@ SOG = ContainerModel(
 MEANS, QUATS, SCALES, SH0 = ("means_l.webp", "means_u.webp"), "quats.webp", "scales.webp", "sh0.webp"
 SHN = ("shN_centroids.webp", "shN_labels.webp")
 
-FILES = (META_NAME, *MEANS, QUATS, SCALES, SH0, *SHN)
-"""Names of all files that a container may have."""
+FILES = (META_NAME, *MEANS, QUATS, SCALES, SH0, *SHN)  # names of all files that a container may have
 
 
 def write_files(plan: EncodingPlan, settings: EncodeSettings, context: Context = DEFAULT_CONTEXT) -> Encoded:

@@ -24,17 +24,10 @@ from kissgs.io.containers import (
 from kissgs.io.conventions import OPACITY_OF_BYTE
 from kissgs.io.files import is_number, listed, parse_json, whole_number
 
-ENTRIES_PER_ROW = 64
-"""Entries of the SH codebook in a row of its image."""
-
-FIRST_TAG = 252
-"""Alpha of a rotation whose largest component is w; 253 to 255 are x, y, z."""
-
-MAX_SH_ENTRIES = 1 << 16
-"""Largest number of entries of the SH codebook: labels have two bytes."""
-
-MAX_FLOAT32 = 3e38
-"""Bound of numbers, which float32 must hold."""
+ENTRIES_PER_ROW = 64  # entries of the SH codebook in a row of its image
+FIRST_TAG = 252  # alpha of a rotation whose largest component is w; 253 to 255 are x, y, z
+MAX_SH_ENTRIES = 1 << 16  # largest number of entries of the SH codebook: labels have two bytes
+MAX_FLOAT32 = 3e38  # bound of numbers, which float32 must hold
 
 _LEVELS = 256
 
@@ -48,10 +41,8 @@ _KNOWN = {"version", "count", "asset", "model", "means", "scales", "quats", "sh0
 class Rest:
     """View-dependent colour: the codebook, and the files of its entries and of each Gaussian's entry."""
 
-    entries: int | None
-    """Number of entries; None: as many as the image has (version 1)."""
-    coefficients: int
-    """3, 8 or 15."""
+    entries: int | None  # number of entries; None: as many as the image has (version 1)
+    coefficients: int  # 3, 8 or 15
     table: Float32[np.ndarray, " 256"]
     centroids: str
     labels: str
@@ -71,15 +62,12 @@ class SogLayout:
     scales: Float32[np.ndarray, "3 256"]
     sh0: Float32[np.ndarray, "3 256"]
     opacities: Float32[np.ndarray, " 256"]
-    files: dict[str, str]
-    """Names of the images ``means_low``, ``means_high``, ``scales``, ``quats``, ``sh0``."""
+    files: dict[str, str]  # names of the images means_low, means_high, scales, quats, sh0
     rest: Rest | None
-    model: str | None
-    """Variant of the renderer that the scene was made for, such as "antialiased"."""
+    model: str | None  # variant of the renderer that the scene was made for, such as "antialiased"
     generator: str | None
     origin: Origin
-    unknown: tuple[str, ...]
-    """Keys of the file that are not read."""
+    unknown: tuple[str, ...]  # keys of the file that are not read
 
     @property
     def notes(self) -> tuple[str, ...]:

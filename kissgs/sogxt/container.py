@@ -19,11 +19,8 @@ from kissgs.io.files import atomic_file, check_writable, move_into_place, path_s
 
 YAML_NAME, JSON_NAME, SCENE_NAME = "container_meta.yaml", "meta.json", "scene.json"
 
-FORMAT = "sog-xt"
-"""Name of the format in ``meta.json``."""
-
-CHECKSUM = "kissgs_crc32"
-"""Key of the metadata's checksum, outside ``kissgs``, so that it shows a loss of that block."""
+FORMAT = "sog-xt"  # name of the format in meta.json
+CHECKSUM = "kissgs_crc32"  # key of the metadata's checksum, outside kissgs, so that it shows a loss of that block
 
 PLANES = (
     "active_mask.webp",

@@ -34,11 +34,8 @@ CHANNELS_OF_PLAIN = {"quaternions": 4, "scales": 3, "f_dc": 3, "opacities": 1}
 """Number of channels of the attributes that are one image of 8-bit levels each."""
 
 
-MAX_PLANE_BYTES = 1 << 30
-"""Largest size of the mask, bytes."""
-
-MAX_FILE_BYTES = 1 << 28
-"""Largest size of a zip in a streamed scene, bytes; one of 400,000 Gaussians takes about 5 MB."""
+MAX_PLANE_BYTES = 1 << 30  # largest size of the mask, bytes
+MAX_FILE_BYTES = 1 << 28  # largest size of a zip in a streamed scene, bytes; one of 400,000 Gaussians takes about 5 MB
 
 
 def describe(path: Path | bytes, level: int) -> Facts:

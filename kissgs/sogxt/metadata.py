@@ -38,8 +38,7 @@ ATTRIBUTE_OF = {field: field for field in CHANNELS} | {"quaternions": "quats", "
 CHECKED = ("f_dc", "opacities", "scales", "quaternions", "means", "f_rest_centroids")
 """Order of the ranges in the checksum of the metadata."""
 
-FLOAT32_OVERFLOW = 2.0**128 - 2.0**103
-"""Smallest number that does not round to a finite float32."""
+FLOAT32_OVERFLOW = 2.0**128 - 2.0**103  # smallest number that does not round to a finite float32
 
 
 def _no_bool(value: Any) -> Any:  # noqa: ANN401
@@ -224,8 +223,7 @@ def scene_json(files: Mapping[str, bytes]) -> bytes:
 MAX_YAML_EVENTS = 20_000
 """Largest number of values, and beginnings and ends of lists and mappings, of the YAML; kissgs writes about 500."""
 
-MAX_YAML_DEPTH = 50
-"""Largest nesting; kissgs writes 6 levels."""
+MAX_YAML_DEPTH = 50  # largest nesting; kissgs writes 6 levels
 
 MAX_YAML_ALIASES = 20
 """Largest number of aliases: dumpers write one if two fields share a list; thousands would take long to go through."""
@@ -246,8 +244,7 @@ _NUMBER = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]
 
 _WORD = re.compile(r"""[^ \t\r\n,:"'\[\]{}]+""")
 
-MISSING = object()
-"""Placeholder for a missing checksum: other encoders and early versions of kissgs write none."""
+MISSING = object()  # placeholder for a missing checksum: other encoders and early versions of kissgs write none
 
 
 def read_layout(source: Source) -> Layout:

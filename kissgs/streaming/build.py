@@ -59,8 +59,7 @@ from kissgs.streaming.levels import (
 
 # Settings of the files of a level.
 
-COARSER_DB = 6.0
-"""Decibels by which coarser levels are encoded less accurately, with rate-distortion planning."""
+COARSER_DB = 6.0  # decibels by which coarser levels are encoded less accurately, with rate-distortion planning
 
 COARSER_STEPS = 1.6
 """Steps of coarser levels of SH degree 0 in units of the finest level's, without rate-distortion planning."""
@@ -96,11 +95,8 @@ VIEWS_PER_CHUNK, MOST_VIEWS = 2, 1024
 """Least number of cameras per chunk, because a large scene needs more than the default, which falls with its size; and
 the largest number of all cameras, whose choice would take hours."""
 
-MIN_SIZE = 64
-"""Smallest side of the images in which coarse levels are measured, pixels."""
-
-REACH = 1.3
-"""Size of the image in which a sampled Gaussian counts as seen, in units of the image's."""
+MIN_SIZE = 64  # smallest side of the images in which coarse levels are measured, pixels
+REACH = 1.3  # size of the image in which a sampled Gaussian counts as seen, in units of the image's
 
 
 def measure_file(
@@ -155,18 +151,14 @@ def _rows(sensitivity: Sensitivity, rows: slice) -> Sensitivity:
 # The steps. Every one reads and writes files of the work folder, and the last file that it writes marks it as done. So
 # interrupted work goes on where it was, and steps may run in any process that sees the folder.
 
-Blocks = Callable[[], Iterable[Splats]]
-"""Function that reads the scene from its beginning, some Gaussians at a time."""
-
-CHUNK = 400_000
-"""Largest number of Gaussians in a chunk, but for the scatter of estimated medians."""
+Blocks = Callable[[], Iterable[Splats]]  # function that reads the scene from its beginning, some Gaussians at a time
+CHUNK = 400_000  # largest number of Gaussians in a chunk, but for the scatter of estimated medians
 
 LEAF, MOST_ENTRIES = 32_768, 4096
 """Largest number of Gaussians in a leaf; and about that of leaves times levels, because the manifest takes about 105
 bytes for each level of each leaf, before the first image: large scenes have larger leaves."""
 
-UNEVEN = 1.1
-"""Ratio of the largest to the mean size of chunks: their cuts are medians of a sample."""
+UNEVEN = 1.1  # ratio of the largest to the mean size of chunks: their cuts are medians of a sample
 
 COARSEST = 50_000
 """Largest number of Gaussians in the coarsest level, which with the manifest makes a viewer's first image."""

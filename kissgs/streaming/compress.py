@@ -61,8 +61,7 @@ SHARES = {
 """Share of each stage in the CPU seconds of a million Gaussians of degree 3, without and with rate-distortion planning,
 that is, with the presets ``fast`` and ``balanced``."""
 
-LEAST_SECONDS = 5.0
-"""Time after which the pace of the work is known well enough."""
+LEAST_SECONDS = 5.0  # time after which the pace of the work is known well enough
 
 
 def with_time_left(progress: Progress, rate_distortion: bool) -> Progress:
@@ -95,8 +94,7 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-REPORT = "report.json"
-"""File of the work folder: the report, once everything is made."""
+REPORT = "report.json"  # file of the work folder: the report, once everything is made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,14 +222,9 @@ def _make(
 # Work items: the levels of a chunk ("chunk"), or a container of the result ("file"). Those of a step do not depend on
 # each other. One that is run twice, because its node was given up, writes the same bytes again.
 
-PROCESS_BYTES = 500_000_000
-"""Memory of an item for libraries, bytes."""
-
-MEMORY_RATIO = 5
-"""Memory of an item for each byte of the Gaussians of its file as float32."""
-
-POLL_SECONDS = 0.5
-"""Seconds between reports of progress, which may also stop the work."""
+PROCESS_BYTES = 500_000_000  # memory of an item for libraries, bytes
+MEMORY_RATIO = 5  # memory of an item for each byte of the Gaussians of its file as float32
+POLL_SECONDS = 0.5  # seconds between reports of progress, which may also stop the work
 
 
 def _is_made(item: dict[str, Any]) -> bool:

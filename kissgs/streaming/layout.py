@@ -12,14 +12,12 @@ from kissgs.formats import MANIFESTS, ContainerName
 from kissgs.io.containers import META_NAME
 from kissgs.io.files import atomic_file
 
-CONTEXT = 280_000
-"""Largest number of Gaussians of the level that stands for other chunks where sensitivity is measured."""
+CONTEXT = 280_000  # largest number of Gaussians of the level that stands for other chunks where sensitivity is measured
 
 PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"
 """Names in the work folder: the marker of the partition, the cameras, and the folder of the result."""
 
-ENVIRONMENT = "environment"
-"""Name of the environment's container."""
+ENVIRONMENT = "environment"  # name of the environment's container
 
 
 @dataclass(frozen=True, slots=True)

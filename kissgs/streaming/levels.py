@@ -110,17 +110,13 @@ def leaf_groups(
 #
 # The leaf is drawn alone. Other Gaussians in front of it could only hide differences.
 
-SIZE = 128
-"""Width and height of the images, pixels; the leaf fills them."""
+SIZE = 128  # width and height of the images, pixels; the leaf fills them
 
 DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
 """Directions from which a leaf is seen."""
 
-DISTANCE = 4.0
-"""Distance of the cameras, in radii of the leaf."""
-
-INSIDE = 0.9
-"""Share of a leaf's Gaussians within its radius: a few may be far away."""
+DISTANCE = 4.0  # distance of the cameras, in radii of the leaf
+INSIDE = 0.9  # share of a leaf's Gaussians within its radius: a few may be far away
 
 BACKGROUND = (0.5, 0.5, 0.5)
 
@@ -157,8 +153,7 @@ def _radius(offsets: Float64[np.ndarray, "N 3"], leaf: Splats) -> float:
 
 # Levels of detail of one chunk: each leaf merged to half its Gaussians, again and again.
 
-MERGING = 0.7
-"""Share of merging in the time for the levels of a chunk; the rest measures their errors."""
+MERGING = 0.7  # share of merging in the time for the levels of a chunk; the rest measures their errors
 
 
 def chunk_levels(
@@ -200,14 +195,12 @@ def bounds(splats: Splats) -> Float64[np.ndarray, "2 3"]:
 # They look alike from everywhere in the scene, so no distance says which of their levels to draw; and they would widen
 # the boxes of the leaves that they are in.
 
-FAR = 8.0
-"""Distance from which Gaussians belong to the environment, in units of their median distance from the centre."""
+FAR = 8.0  # distance from which Gaussians belong to the environment, in units of their median distance from the centre
 
 FEWEST, MOST = 1_000, 65_536
 """Least and largest number of Gaussians in an environment. Viewers draw it always and whole, so it must be small."""
 
-LARGEST_SHARE = 0.3
-"""Largest share of a scene in its environment."""
+LARGEST_SHARE = 0.3  # largest share of a scene in its environment
 
 ONE_SIDED = 0.7
 """Length of the mean direction of Gaussians from which they do not surround the scene. Half a sphere has 0.5."""

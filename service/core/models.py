@@ -11,8 +11,7 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 SCHEMA_VERSION = 4
 """Version of the tables below and of the results in them. A database of another version is refused, not misread."""
 
-NOTE_CHARS = 200
-"""Maximum length of a progress note; longer notes are truncated."""
+NOTE_CHARS = 200  # maximum length of a progress note; longer notes are truncated
 
 
 class State(StrEnum):

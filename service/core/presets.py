@@ -64,17 +64,10 @@ def presets() -> Presets:
     )
 
 
-START_SECONDS = 1.0
-"""Fixed seconds of every job, to start a process and import the library."""
-
-BUSY_CORES = 1.8
-"""Average number of busy cores on a two-core server."""
-
-SEARCH_FACTOR = 4.0
-"""Factor on the total time of a job that searches for a goal, which encodes several times."""
-
-TUNED_CONTAINERS = 2.0
-"""Containers that a search for the number of Gaussians fine-tunes."""
+START_SECONDS = 1.0  # fixed seconds of every job, to start a process and import the library
+BUSY_CORES = 1.8  # average number of busy cores on a two-core server
+SEARCH_FACTOR = 4.0  # factor on the total time of a job that searches for a goal, which encodes several times
+TUNED_CONTAINERS = 2.0  # containers that a search for the number of Gaussians fine-tunes
 
 
 def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:

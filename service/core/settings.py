@@ -19,8 +19,7 @@ CLIENT_NAMES = {"KISSGS_SERVER", "KISSGS_KEY"}
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
-OWNER = r"[A-Za-z0-9._@-]{1,64}"
-"""Valid names of key owners."""
+OWNER = r"[A-Za-z0-9._@-]{1,64}"  # valid names of key owners
 
 Seconds = Annotated[float, Field(gt=0, le=10 * 365 * 86400)]
 

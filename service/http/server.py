@@ -30,20 +30,14 @@ HEADER_SECONDS = 20.0
 """Timeout for the headers of a request, and for the remaining body of a refused request, whose client is still to
 receive the response."""
 
-READ_SECONDS = 60.0
-"""Timeout for a client to receive any bytes of a pending response."""
-
-MAX_HEADER_BYTES = 64 << 10
-"""Maximum bytes of the headers of a request."""
-
-READ_BYTES = 32 << 10
-"""Maximum bytes per read from a connection."""
+READ_SECONDS = 60.0  # timeout for a client to receive any bytes of a pending response
+MAX_HEADER_BYTES = 64 << 10  # maximum bytes of the headers of a request
+READ_BYTES = 32 << 10  # maximum bytes per read from a connection
 
 PARSE_SECONDS_PER_BYTE = 2e-7
 """Allowed CPU seconds per received byte. A normal body needs a hundredth; one in chunks of single bytes, tenfold."""
 
-MAX_PARSE_DEBT_SECONDS = 0.1
-"""CPU seconds beyond the allowance after which a connection is closed."""
+MAX_PARSE_DEBT_SECONDS = 0.1  # CPU seconds beyond the allowance after which a connection is closed
 
 MAX_CONNECTIONS = 1000
 """Maximum number of connections. Beyond it, the address with the most loses one, so that no address, by event streams

@@ -28,12 +28,10 @@ RAW_TYPES = ("", "application/octet-stream", "application/ply", "application/x-p
 FORM_TYPE = "multipart/form-data"
 log = logging.getLogger("kissgs.service")
 
-STOPPING = "stopping"
-"""Subscription that only the closing of the notifier wakes."""
+STOPPING = "stopping"  # subscription that only the closing of the notifier wakes
 
 MAX_OPTIONS_BYTES = 64 << 10
-MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)
-"""Maximum bytes of a form in addition to the scene."""
+MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)  # maximum bytes of a form in addition to the scene
 
 
 @dataclass(frozen=True, slots=True)

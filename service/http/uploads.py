@@ -28,8 +28,7 @@ from ..jobs.admission import Admission
 
 MAX_PART_HEADER_BYTES = 8192
 
-MAX_PREAMBLE_BYTES = 8192
-"""Maximum bytes before the first boundary, where RFC 2046 allows text, which is ignored."""
+MAX_PREAMBLE_BYTES = 8192  # maximum bytes before the first boundary, where RFC 2046 allows text, which is ignored
 
 
 _PARAMETER = re.compile(rb';[ \t]*([^\s;="]+)[ \t]*=[ \t]*("(?:[^"\\]|\\.)*"|[^;"]*)')
@@ -163,22 +162,19 @@ async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterato
         raise invalid("the form ends before its last boundary; send it again")
 
 
-BLOCK_BYTES = 1 << 20
-"""Bytes per write. Each write is one call to a thread; memory holds one or two blocks per upload."""
+BLOCK_BYTES = 1 << 20  # bytes per write. Each write is one call to a thread; memory holds one or two blocks per upload.
 
 LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")
 """Last line of a header, matched as a whole because a comment may end with ``end_header``."""
 
-HEAD_BYTES = 512
-"""Bytes from which a format is recognised."""
+HEAD_BYTES = 512  # bytes from which a format is recognised
 
 GAUSSIANS_PER_BYTE = 2
 """Largest number of Gaussians per byte of an upload. Real files have up to 0.12 (``fast``), and 0.23 at the lowest
 quality; a position alone takes more than 4 bits. Images of equal pixels hold millions in 4 kB, which keep a worker for
 hours: all of them cover the same pixels, and each takes 2 ms. No setting, because no real file comes near it."""
 
-FREE_GAUSSIANS = 1 << 16
-"""Number of Gaussians that an upload of any size may have."""
+FREE_GAUSSIANS = 1 << 16  # number of Gaussians that an upload of any size may have
 
 CLOSE = {"Connection": "close"}
 

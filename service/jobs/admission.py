@@ -18,8 +18,7 @@ from ..storage.job_files import JobStorage
 from ..storage.job_records import LimitExceeded, Store
 from .status import QueueEstimator
 
-BUSY_SECONDS = 5.0
-"""``Retry-After`` of refusals because of simultaneous uploads, seconds."""
+BUSY_SECONDS = 5.0  # Retry-After of refusals because of simultaneous uploads, seconds
 
 PARSES_AT_ONCE = 2
 """Uploads whose headers are read at a time, which takes up to 30 MB and half a second each. One hostile upload does not

@@ -30,8 +30,7 @@ from .job_process import without_paths
 
 log = logging.getLogger("kissgs.service")
 
-COMPRESS, DECODE = "job_process:compress", "job_process:decode"
-"""Functions of this package that tasks name."""
+COMPRESS, DECODE = "job_process:compress", "job_process:decode"  # functions of this package that tasks name
 
 UNUSABLE_NODES = "the machines that run jobs cannot work on this one; try again later"
 UNUSABLE_MACHINE = "the job's files cannot be used on this machine; try again later"

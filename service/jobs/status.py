@@ -179,8 +179,7 @@ def _links(job: Job) -> Links:
 KEEPALIVE_SECONDS = 15.0
 """Seconds without an event after which a comment is sent, so that the connection is not taken for dead."""
 
-RETRY_MILLISECONDS = 1000
-"""Delay after which a browser reconnects, milliseconds."""
+RETRY_MILLISECONDS = 1000  # delay after which a browser reconnects, milliseconds
 
 
 @dataclass(frozen=True)

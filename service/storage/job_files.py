@@ -36,8 +36,7 @@ from ..core.settings import SettingsError
 
 log = logging.getLogger("kissgs.service")
 
-ORPHANED = ".orphaned"
-"""Name of the folder, within ``jobs``, for folders that no job of the database owns."""
+ORPHANED = ".orphaned"  # name of the folder, within jobs, for folders that no job of the database owns
 
 JOB = re.compile("[0-9a-f]{32}")
 
@@ -46,8 +45,7 @@ RESERVE_BYTES = 1 << 20
 
 _UPLOAD = re.compile(r"[0-9a-f]{16}\.part")
 
-RESULT = "result"
-"""Name of the folder of a job's result."""
+RESULT = "result"  # name of the folder of a job's result
 
 UNFINISHED = ("work-*", ".*.part")
 """Patterns of incomplete files in a job's folder: work folders, and checkpoints that are being written."""

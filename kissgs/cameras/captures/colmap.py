@@ -29,8 +29,7 @@ from kissgs.cameras.views import rotation_matrices
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
-MAX_NAME_BYTES = 4096
-"""Maximum bytes of an image's name; no file system has longer paths."""
+MAX_NAME_BYTES = 4096  # maximum bytes of an image's name; no file system has longer paths
 
 MAX_LINE_BYTES = 1 << 26
 """Maximum bytes of a line in a text file; the longest lines hold the points of an image, about 40 MB per million."""

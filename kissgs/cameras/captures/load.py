@@ -31,8 +31,7 @@ DEFAULT_RESOLUTION = 1600
 """Default maximum of the longer side, pixels. For landscape photographs this is the protocol of 3DGS, on which
 published results depend; INRIA's code limits only the width, so that portrait photographs stay larger."""
 
-HOLD_OUT = 8
-"""Every eighth view, starting with the first, is held out: the protocol of 3DGS and Mip-NeRF 360."""
+HOLD_OUT = 8  # every eighth view, starting with the first, is held out: the protocol of 3DGS and Mip-NeRF 360
 
 MAX_ASPECT_ERROR = 0.01
 """Maximum relative difference between the aspect ratios of a photograph and its camera; scaled copies round sides."""

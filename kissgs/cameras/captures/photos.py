@@ -21,8 +21,7 @@ from kissgs.cameras.photographs import EXTENSIONS, NO_DISTORTION, Distortion, Le
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
 
-MAX_JSON_BYTES = 1 << 28
-"""Maximum bytes of a JSON file; ten thousand cameras take about 10 MB."""
+MAX_JSON_BYTES = 1 << 28  # maximum bytes of a JSON file; ten thousand cameras take about 10 MB
 
 
 @contextlib.contextmanager
@@ -68,8 +67,7 @@ def composed(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-MAX_SIDE = 1_000_000
-"""Maximum side of a photograph, pixels; the largest stitched panoramas have a few hundred thousand."""
+MAX_SIDE = 1_000_000  # maximum side of a photograph, pixels; the largest stitched panoramas have a few hundred thousand
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,31 +104,22 @@ class Intrinsics:
 class PosedImage:
     """A photograph with its pose and intrinsics."""
 
-    name: str
-    """Unique in most captures."""
-    photo: str
-    """According to the camera file; absolute, or relative to the capture's root."""
-    where: str
-    """Camera file and entry, for error messages."""
-    viewmat: Float64[np.ndarray, "4 4"]
-    """Rigid transform from world to camera, with the axes of ``Camera``."""
+    name: str  # unique in most captures
+    photo: str  # according to the camera file; absolute, or relative to the capture's root
+    where: str  # camera file and entry, for error messages
+    viewmat: Float64[np.ndarray, "4 4"]  # rigid transform from world to camera, with the axes of Camera
     intrinsics: Intrinsics
-    split: Literal["train", "test"] | None = None
-    """None if the capture does not define it."""
+    split: Literal["train", "test"] | None = None  # None if the capture does not define it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
     """All posed images of a capture, in the order of its camera file."""
 
-    images: tuple[PosedImage, ...]
-    """One or more."""
-    root: Path
-    """Folder that paths of photographs are relative to."""
-    source: str
-    """Description of the files that were read, for messages."""
-    white: bool = False
-    """Whether transparent pixels are composited over white."""
+    images: tuple[PosedImage, ...]  # one or more
+    root: Path  # folder that paths of photographs are relative to
+    source: str  # description of the files that were read, for messages
+    white: bool = False  # whether transparent pixels are composited over white
     applied: Float64[np.ndarray, "4 4"] | None = None
     """Rotation and translation from the coordinates of a former model to those of the poses, if there was one."""
 
@@ -147,14 +136,12 @@ def _focal(length: float | None, angle: float | None, side: int) -> float | None
 # in folders such as ``images_4`` next to the former ``images``, or only with ``input``, from which INRIA's
 # ``convert.py`` makes ``images``.
 
-MAX_FACTOR = 64
-"""Maximum scale of a folder; a larger number after the underscore, such as a year, is part of the name."""
+MAX_FACTOR = 64  # maximum scale of a folder; a larger number after the underscore, such as a year, is part of the name
 
 IMAGES, INPUT = "images", "input"
 """Usual folder of photographs, and the folder of originals that replaces it if it is missing."""
 
-MAX_LISTED_FOLDERS = 4
-"""Maximum number of folders named in a message."""
+MAX_LISTED_FOLDERS = 4  # maximum number of folders named in a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,10 +149,8 @@ class FoundPhoto:
     """File of a photograph."""
 
     path: Path
-    factor: int
-    """Original size divided by this photograph's size, according to the folder's name."""
-    folder: Path
-    """Folder of photographs that contains the file, perhaps in a subfolder."""
+    factor: int  # original size divided by this photograph's size, according to the folder's name
+    folder: Path  # folder of photographs that contains the file, perhaps in a subfolder
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,12 +158,9 @@ class _SearchFolder:
     """Folder in which a photograph is searched for."""
 
     folder: Path
-    factor: int
-    """Original size divided by the size of its photographs."""
-    names: tuple[str, ...]
-    """Names to try, in order, relative to the folder."""
-    has_photos: bool
-    """Whether the folder exists and is certainly for photographs, unlike the capture's own folder."""
+    factor: int  # original size divided by the size of its photographs
+    names: tuple[str, ...]  # names to try, in order, relative to the folder
+    has_photos: bool  # whether the folder exists and is certainly for photographs, unlike the capture's own folder
 
 
 def find_photos(

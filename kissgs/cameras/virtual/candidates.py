@@ -24,10 +24,8 @@ UP_AXES = (UP, np.array([0.0, 0.0, 1.0]))
 class SceneBounds:
     """Position, size and orientation of a scene's densest part."""
 
-    centre: Vec3
-    """Centre of the densest part, world units."""
-    radius: float
-    """Distance from the centre within which half of the opacity of that part lies, world units."""
+    centre: Vec3  # centre of the densest part, world units
+    radius: float  # distance from the centre within which half of the opacity of that part lies, world units
     up: Vec3
 
 
@@ -122,14 +120,12 @@ def _ground_normal(axis: Vec3, normals: Float64[np.ndarray, "N 3"], weights: Flo
 
 # View scores: how useful a camera is, from a thumbnail of what it sees.
 
-PROXY_GAUSSIANS = 30_000
-"""Largest number of Gaussians in the proxy scene that thumbnails show."""
+PROXY_GAUSSIANS = 30_000  # largest number of Gaussians in the proxy scene that thumbnails show
 
 OPAQUE = 0.01
 """Transmittance at which the list of a thumbnail's pixel ends: what is behind does not change its statistics."""
 
-TOO_NEAR = 0.35
-"""Depth in radii of the scene; anything nearer to the camera counts as an obstruction."""
+TOO_NEAR = 0.35  # depth in radii of the scene; anything nearer to the camera counts as an obstruction
 
 CENTRE_SCALE = 30.0
 """Factor by which the mark of central Gaussians is scaled, so that it uses half the range of a colour channel."""
@@ -139,17 +135,13 @@ CENTRE_SCALE = 30.0
 class ViewStats:
     """Statistics of a thumbnail."""
 
-    alpha: float
-    """Mean alpha, 0 to 1."""
+    alpha: float  # mean alpha, 0 to 1
     log_size: float
     """Median logarithm of the largest scale of the Gaussians, world units. Parts that no photograph shows have
     large Gaussians."""
-    log_angle: float
-    """Median logarithm of the angle that these scales subtend, radians."""
-    near: float
-    """Mean alpha of what is nearer than :data:`TOO_NEAR`, 0 to 1."""
-    centre: float
-    """Mean alpha of the central Gaussians, those within two radii of the centre, 0 to 1."""
+    log_angle: float  # median logarithm of the angle that these scales subtend, radians
+    near: float  # mean alpha of what is nearer than TOO_NEAR, 0 to 1
+    centre: float  # mean alpha of the central Gaussians, those within two radii of the centre, 0 to 1
 
 
 class ViewScorer:
@@ -238,26 +230,13 @@ def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[
     return np.asarray(1 - holes - 0.4 * excess_size - 0.35 * excess_angle - near - 0.5 * off_centre)
 
 
-FIELD_OF_VIEW = np.radians(60)
-"""Angle of view along the longer side, radians; roughly that of a phone."""
-
-AZIMUTHS = 16
-"""Number of azimuths on each orbit."""
-
-ORBIT_RADII = (0.7, 1.1, 1.7, 2.6)
-"""Radii of the orbits, in radii of the scene."""
-
-ORBIT_ELEVATIONS = (-5, 12, 35)
-"""Elevations of the orbits as seen from the centre, degrees."""
-
-OBJECT_ELEVATIONS = (-10, 12, 35, 60)
-"""Elevations of the cameras around an object, degrees."""
-
-INSIDE_DIRECTIONS = 8
-"""Number of viewing directions from each position inside the scene."""
-
-CLOSE_UP_INTERVAL = 4
-"""One in this many cameras around an object is at half the distance."""
+FIELD_OF_VIEW = np.radians(60)  # angle of view along the longer side, radians; roughly that of a phone
+AZIMUTHS = 16  # number of azimuths on each orbit
+ORBIT_RADII = (0.7, 1.1, 1.7, 2.6)  # radii of the orbits, in radii of the scene
+ORBIT_ELEVATIONS = (-5, 12, 35)  # elevations of the orbits as seen from the centre, degrees
+OBJECT_ELEVATIONS = (-10, 12, 35, 60)  # elevations of the cameras around an object, degrees
+INSIDE_DIRECTIONS = 8  # number of viewing directions from each position inside the scene
+CLOSE_UP_INTERVAL = 4  # one in this many cameras around an object is at half the distance
 
 
 def horizontal_axes(up: Vec3) -> tuple[Vec3, Vec3]:

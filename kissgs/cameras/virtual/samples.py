@@ -41,23 +41,12 @@ from kissgs.rendering.sensitivity import Coverage, WeightedCameras, local_scale
 # Gaussians that they do not see, or see too small to resolve, further regions are found: a distant or a much smaller
 # object, the inside of another room.
 
-MAX_FURTHER_REGIONS = 16
-"""Largest number of further regions that are looked for."""
-
-MIN_SHARE = 0.01
-"""Share of the scene's visible opacity that a further region must add, and below which the search ends."""
-
-MIN_UNSEEN_GAUSSIANS = 8
-"""Number of unseen Gaussians below which the search ends."""
-
-CANDIDATES_PER_REGION = 40
-"""Number of candidate cameras around each further region."""
-
-PROBE_CAMERAS = 6
-"""Number of a region's cameras from which coverage is measured."""
-
-PROBE_SIZE = 160
-"""Longer side of the images in which coverage is measured, pixels."""
+MAX_FURTHER_REGIONS = 16  # largest number of further regions that are looked for
+MIN_SHARE = 0.01  # share of the scene's visible opacity that a further region must add, and below which the search ends
+MIN_UNSEEN_GAUSSIANS = 8  # number of unseen Gaussians below which the search ends
+CANDIDATES_PER_REGION = 40  # number of candidate cameras around each further region
+PROBE_CAMERAS = 6  # number of a region's cameras from which coverage is measured
+PROBE_SIZE = 160  # longer side of the images in which coverage is measured, pixels
 
 TYPICAL_SIZE = 384
 """Longer side of the images that the selected cameras will have, pixels; what they resolve depends on it."""
@@ -186,11 +175,8 @@ fall apart, and the photographed parts lose almost nothing by it."""
 WIDE_FOCAL_SCALE = 0.6
 """Focal length of every other virtual camera, relative to the others: parts just outside their images count too."""
 
-MAX_VIEWS, MIN_VIEWS = 48, 16
-"""Largest and smallest number of cameras that are chosen by the size of the scene."""
-
-FEW_GAUSSIANS = 150_000
-"""Number of Gaussians up to which there are :data:`MAX_VIEWS`."""
+MAX_VIEWS, MIN_VIEWS = 48, 16  # largest and smallest number of cameras that are chosen by the size of the scene
+FEW_GAUSSIANS = 150_000  # number of Gaussians up to which there are MAX_VIEWS
 
 
 def default_view_count(gaussians: int) -> int:
@@ -251,17 +237,10 @@ NEAREST_RADII, FARTHEST_RADII = 0.8, 2.6
 MIN_ELEVATION, MAX_ELEVATION = -np.pi / 6, np.pi / 3
 """Elevations above the ground as seen from the centre, radians, where the scene does not enclose the cameras."""
 
-TARGET_SPREAD = 0.35
-"""Standard deviation of the look-at target around the centre along each axis, radii of the scene."""
-
-MAX_COUNT_FACTOR = 4.0
-"""Largest number of views of a scene with several regions, relative to ``count``."""
-
-MAX_ATTEMPTS = 8
-"""Largest number of poses that are drawn for each camera."""
-
-Pose = tuple[Vec3, Vec3]
-"""Position and look-at target, world units."""
+TARGET_SPREAD = 0.35  # standard deviation of the look-at target around the centre along each axis, radii of the scene
+MAX_COUNT_FACTOR = 4.0  # largest number of views of a scene with several regions, relative to count
+MAX_ATTEMPTS = 8  # largest number of poses that are drawn for each camera
+Pose = tuple[Vec3, Vec3]  # position and look-at target, world units
 
 
 def random_poses(splats: Splats, context: Context = DEFAULT_CONTEXT, *, side: int, count: int, seed: int = 0) -> Views:
@@ -353,11 +332,8 @@ class _PoseSampler:
 # Close-ups see what views of whole objects are too far away to resolve: a scene that is pruned without them gets holes
 # behind and between what other cameras see.
 
-PHOTOGRAPH_FIELD_OF_VIEW = np.radians(70)
-"""Angle of view along both sides, radians, where no longer lens is needed."""
-
-OCTAVES = 3.0
-"""Distances are one local scale (:func:`~kissgs.rendering.sensitivity.local_scale`) to this many octaves more."""
+PHOTOGRAPH_FIELD_OF_VIEW = np.radians(70)  # angle of view along both sides, radians, where no longer lens is needed
+OCTAVES = 3.0  # distances are one local scale (local_scale) to this many octaves more
 
 
 def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[Camera]:
@@ -381,8 +357,7 @@ NEAREST, FARTHEST = 10.0, 3.0
 """Smallest distance from the Gaussian in the centre, local scales (:func:`~kissgs.rendering.sensitivity.local_scale`)
 of the proxy scene but at most a radius of the scene, and the largest one, radii."""
 
-ACROSS = 3
-"""One in this many cameras stands beside another Gaussian, and looks across the scene."""
+ACROSS = 3  # one in this many cameras stands beside another Gaussian, and looks across the scene
 
 MAX_BESIDE = 8.0
 """Largest distance of such a camera from the Gaussian beside it, local scales; the smallest one is a local scale."""

@@ -18,8 +18,7 @@ from ...jobs.container import Owner, Service, ServiceContainer
 from ...jobs.status import job_status
 from ...storage.job_files import JOB
 
-MAX_WAIT_SECONDS = 30.0
-"""Maximum duration of a long poll, shorter than typical idle time-outs of proxies."""
+MAX_WAIT_SECONDS = 30.0  # maximum duration of a long poll, shorter than typical idle time-outs of proxies
 
 NO_STORE = {"Cache-Control": "no-store"}
 

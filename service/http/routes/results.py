@@ -101,12 +101,10 @@ Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 BINARY = "application/octet-stream"
 _MEDIA_TYPES = {".webp": "image/webp", ".json": "application/json", ".yaml": "application/yaml"}
 
-CONTAINER_TYPES = tuple(file.media_type for file in CONTAINER_FILES.values())
-"""Media types of containers."""
+CONTAINER_TYPES = tuple(file.media_type for file in CONTAINER_FILES.values())  # media types of containers
 
 _PRIVATE = {"Cache-Control": "private, no-cache"}
-_FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
-"""Headers of container files, which never change."""
+_FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}  # headers of container files, which never change
 
 _UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range")
 
