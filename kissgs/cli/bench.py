@@ -115,8 +115,7 @@ def bench(
     ] = None,
     views: ViewsOption = None,
     output: Annotated[
-        Path | None,
-        output_option("Write the table as CSV, and beside it a plot as PNG.", metavar="FILE.csv"),
+        Path | None, output_option("Write the table as CSV, and beside it a plot as PNG.", metavar="FILE.csv")
     ] = None,
     force: ForceOption = False,
 ) -> None:

@@ -78,8 +78,7 @@ class CompactionOptions:
 def compact(
     scenes: ScenesArgument,
     output: Annotated[
-        str | None,
-        output_option("Output NAME.ply, a folder, or '-' for standard output. Required."),
+        str | None, output_option("Output NAME.ply, a folder, or '-' for standard output. Required.")
     ] = None,
     *,
     compaction: CompactionOptions,

@@ -100,8 +100,7 @@ def convert(
         ),
     ],
     to: Annotated[
-        str | None,
-        typer.Option("--to", help=f"Format where OUT has no ending: {alternatives(OUTPUT_FORMATS)}."),
+        str | None, typer.Option("--to", help=f"Format where OUT has no ending: {alternatives(OUTPUT_FORMATS)}.")
     ] = None,
     origin: OriginOption = None,
     force: ForceOption = False,

@@ -37,8 +37,7 @@ app = typer.Typer(
 def compress(
     scenes: FilesArgument,
     output: Annotated[
-        str | None,
-        output_option("Output NAME.zip, NAME.sog or a folder. Default: next to the scene."),
+        str | None, output_option("Output NAME.zip, NAME.sog or a folder. Default: next to the scene.")
     ] = None,
     server: ServerOption = DEFAULT_SERVER,
     *,

@@ -187,10 +187,7 @@ class ReportScene:
 
 
 def html_report(
-    evaluation: Evaluation,
-    reference: ReportScene,
-    candidate: ReportScene,
-    context: Context = DEFAULT_CONTEXT,
+    evaluation: Evaluation, reference: ReportScene, candidate: ReportScene, context: Context = DEFAULT_CONTEXT
 ) -> str:
     """Return an evaluation as one HTML page with images of the worst views, then of the worst surroundings."""
     shown = _worst_first(evaluation)[:MAX_VIEWS]

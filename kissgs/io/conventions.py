@@ -89,9 +89,7 @@ def to_bytes(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     return to_codes(values).astype(np.uint8)
 
 
-def split_largest(
-    quats: Float32[np.ndarray, "B 4"],
-) -> tuple[Int64[np.ndarray, " B"], Float64[np.ndarray, "B 3"]]:
+def split_largest(quats: Float32[np.ndarray, "B 4"]) -> tuple[Int64[np.ndarray, " B"], Float64[np.ndarray, "B 3"]]:
     """Return the index of each quaternion's largest component, and the others once it is positive."""
     wide = quats.astype(np.float64)
     index = np.abs(wide).argmax(axis=1)[:, None]

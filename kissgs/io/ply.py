@@ -557,8 +557,5 @@ def _describe(path: Path | bytes, level: int) -> Facts:
 
 
 FORMAT = Codec(
-    sniff=_sniff,
-    info=_describe,
-    read=read_ply,
-    write={".ply": write_ply, ".compressed.ply": write_compressed},
+    sniff=_sniff, info=_describe, read=read_ply, write={".ply": write_ply, ".compressed.ply": write_compressed}
 )

@@ -479,11 +479,7 @@ def _describe(path: Path | bytes, level: int) -> Facts:
         title=titled("SPZ scene", f"version {found.version}", antialiased),
         count=found.count,
         sh_degree=found.sh_degree,
-        details={
-            "version": found.version,
-            "antialiased": found.antialiased,
-            "fractional_bits": found.fractional_bits,
-        },
+        details={"version": found.version, "antialiased": found.antialiased, "fractional_bits": found.fractional_bits},
     )
 
 

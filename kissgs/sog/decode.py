@@ -163,10 +163,7 @@ def _decode_colors(images: _Images, out: Splats) -> None:
 
 
 def _decode_levels(
-    name: str,
-    levels: UInt8[np.ndarray, "N 3"],
-    table: Float32[np.ndarray, "3 256"],
-    out: Float32[np.ndarray, "N 3"],
+    name: str, levels: UInt8[np.ndarray, "N 3"], table: Float32[np.ndarray, "3 256"], out: Float32[np.ndarray, "N 3"]
 ) -> None:
     for channel in range(3):
         _check_levels(name, levels[:, channel], table[channel])

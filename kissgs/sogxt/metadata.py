@@ -127,11 +127,7 @@ class Layout(BaseModel):
     def to_yaml(self) -> bytes:
         """Return ``container_meta.yaml``: ASCII, floats always with a point, so that YAML 1.1 readers see numbers."""
         document: dict[str, Any] = {
-            "meta": {
-                "grid_side": self.grid_side,
-                "f_rest_centroids_side": self.codebook_side,
-                "image_codec": "webp",
-            },
+            "meta": {"grid_side": self.grid_side, "f_rest_centroids_side": self.codebook_side, "image_codec": "webp"},
             "ops": [
                 {
                     "input_fields": [field],

@@ -44,13 +44,7 @@ def from_rows(rows: Float32[np.ndarray, "N F"], *, antialiased: bool) -> Splats:
     means, quats, scales, opacities, sh0, rest = parts
     shN = rest.reshape(len(rows), rest.shape[1] // 3, 3)
     return Splats(
-        means=means,
-        quats=quats,
-        scales=scales,
-        opacities=opacities[:, 0],
-        sh0=sh0,
-        shN=shN,
-        antialiased=antialiased,
+        means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh0=sh0, shN=shN, antialiased=antialiased
     )
 
 

@@ -25,8 +25,7 @@ Seconds = Annotated[float, Field(gt=0, le=10 * 365 * 86400)]
 
 
 Words = Annotated[
-    tuple[str, ...],
-    BeforeValidator(lambda value: _words(value.lower()) if isinstance(value, str) else value),
+    tuple[str, ...], BeforeValidator(lambda value: _words(value.lower()) if isinstance(value, str) else value)
 ]
 """Words of a text, in lower case, as browsers send them."""
 

@@ -22,9 +22,7 @@ from kissgs.cameras.captures.photos import (
     open_file,
     quoted,
 )
-from kissgs.cameras.photographs import (
-    Distortion,
-)
+from kissgs.cameras.photographs import Distortion
 from kissgs.cameras.views import rotation_matrices
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError

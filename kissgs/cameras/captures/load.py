@@ -8,20 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.cameras.captures.colmap import MODEL_FOLDERS, find_colmap, missing_part, read_colmap
-from kissgs.cameras.captures.photos import (
-    Capture,
-    FoundPhoto,
-    PosedImage,
-    find_photos,
-    searched_folders,
-)
+from kissgs.cameras.captures.photos import Capture, FoundPhoto, PosedImage, find_photos, searched_folders
 from kissgs.cameras.captures.transforms_json import read_split_transforms, read_transforms, similarities
-from kissgs.cameras.photographs import (
-    QUARTER_TURNS,
-    full_window,
-    orientation,
-    read_photo_header,
-)
+from kissgs.cameras.photographs import QUARTER_TURNS, full_window, orientation, read_photo_header
 from kissgs.cameras.views import View, Views
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import InvalidViewsError

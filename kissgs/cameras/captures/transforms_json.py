@@ -83,12 +83,7 @@ def read_cameras(path: Path) -> tuple[View, ...]:
 
 def camera_as_dict(camera: Camera) -> dict[str, object]:
     """Return a camera in the JSON format of kissgs, with all digits; a camera that is read has the usual dilation."""
-    return {
-        "viewmat": camera.viewmat.tolist(),
-        "K": camera.K.tolist(),
-        "width": camera.width,
-        "height": camera.height,
-    }
+    return {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
 
 
 def write_camera(path: Path, camera: Camera, *, overwrite: bool = False) -> None:

@@ -18,13 +18,7 @@ from kissgs.cameras.virtual.candidates import (
     proxy_scene,
     scene_bounds,
 )
-from kissgs.cameras.virtual.select import (
-    ScoredCandidates,
-    score_candidates,
-    select_diverse,
-    split_views,
-    with_size,
-)
+from kissgs.cameras.virtual.select import ScoredCandidates, score_candidates, select_diverse, split_views, with_size
 from kissgs.core.array_types import Bool, Float32, Int
 from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress
 from kissgs.core.resources import Workers
@@ -185,12 +179,7 @@ def default_view_count(gaussians: int) -> int:
 
 
 def sensitivity_cameras(
-    splats: Splats,
-    views: Views | None,
-    context: Context = DEFAULT_CONTEXT,
-    *,
-    count: int,
-    size: int,
+    splats: Splats, views: Views | None, context: Context = DEFAULT_CONTEXT, *, count: int, size: int
 ) -> WeightedCameras:
     """Return the cameras, each with its weight, that measure sensitivity and refit colours.
 
