@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kissgs.core.array_types import Float, Float32, Float64, Int, Int64, Shaped, UInt8
+from kissgs.core.errors import UnsupportedError
 from kissgs.core.spherical_harmonics import sh_basis
 from kissgs.core.splats import OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_C0, Splats
 
@@ -97,19 +98,24 @@ def split_largest(quats: Float32[np.ndarray, "B 4"]) -> tuple[Int64[np.ndarray, 
     return index[:, 0], sign * np.take_along_axis(wide, _OTHERS[index[:, 0]], axis=1)
 
 
-def note_mark(notes: list[str], antialiased: bool) -> None:
-    """Append to ``notes`` that a format without a place for the mark of an antialiased scene leaves it out."""
-    if antialiased:
-        notes.append("the mark of antialiasing is left out, and viewers will draw small and thin Gaussians too opaque")
+def refuse_empty(splats: Splats, ending: str) -> None:
+    """Raise UnsupportedError for a scene without Gaussians, which the format with this ending cannot hold."""
+    if not len(splats):
+        raise UnsupportedError(f"a scene without Gaussians cannot be written as {ending}; write it as .ply")
 
 
-def note_clamped(notes: list[str], what: str, values: np.ndarray, low: float, high: float, limits: str) -> None:
-    """Append to ``notes`` how many Gaussians have a value below ``low`` or above ``high``, if there are any."""
+def marks_left_out(splats: Splats) -> list[str]:
+    """Return what is lost of an antialiased scene in a format without a place for its mark."""
+    text = "the mark of antialiasing is left out, and viewers will draw small and thin Gaussians too opaque"
+    return [text] * splats.antialiased
+
+
+def clamped(what: str, values: np.ndarray, low: float, high: float, limits: str) -> list[str]:
+    """Return a phrase about the number of Gaussians with a value below ``low`` or above ``high``, if there are any."""
     if values.size == 0 or (values.min() >= low and values.max() <= high):
-        return
-    rows = ((values < low) | (values > high)).reshape(len(values), -1).any(axis=1)
-    count = int(rows.sum())
-    notes.append(f"{what} of {count:,} Gaussian{'s' if count > 1 else ''} are clamped to {limits}")
+        return []
+    count = int(((values < low) | (values > high)).reshape(len(values), -1).any(axis=1).sum())
+    return [f"{what} of {count:,} Gaussian{'s' * (count > 1)} are clamped to {limits}"]
 
 
 # Axes of other formats, and those of a ``.ply``: x right, y down, z forward.

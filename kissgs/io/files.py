@@ -205,9 +205,11 @@ class SceneFile:
 
     def cut_short(self, needed: int) -> InvalidSceneError:
         """Return the error of a file that should have ``needed`` bytes or more."""
-        return InvalidSceneError(
-            f"{self.name} is cut short: it needs {needed:,} bytes but has {self.size:,}; export or download it again"
-        )
+        return self.invalid(f"is cut short: it needs {needed:,} bytes but has {self.size:,}")
+
+    def invalid(self, problem: str) -> InvalidSceneError:
+        """Return the error of a file with a problem, which is the predicate of a sentence."""
+        return InvalidSceneError(f"{self.name} {problem}; export or download it again")
 
 
 @runtime_checkable
@@ -229,11 +231,9 @@ def open_scene_file(source: Path | bytes, remedy: str = "name a scene file") -> 
             reason = "it is a folder or a device" if source.exists() else "there is no such file"
             raise InvalidSceneError(f"cannot read {source}: {reason}; {remedy}")
         with source.open("rb") as file:
-            size = file.seek(0, io.SEEK_END)
-            file.seek(0)
-            yield SceneFile(source.name, file, size)
+            yield SceneFile(source.name, file, os.fstat(file.fileno()).st_size)
     except OSError as error:
-        raise InvalidSceneError(f"cannot read {source}: {(error.strerror or str(error)).lower()}") from error
+        raise InvalidSceneError(f"cannot read {source}: {reason_of(error)}") from error
 
 
 def listed(names: Sequence[str]) -> str:

@@ -28,11 +28,12 @@ from kissgs.io.conventions import (
     Signs,
     colors_of,
     log_scales,
+    marks_left_out,
     mirror,
     move,
-    note_mark,
     opacities_of,
     opacity_logits,
+    refuse_empty,
     sh_signs,
     steps,
     to_bytes,
@@ -136,11 +137,9 @@ class _Document:
         """Return the error of a file that contradicts the format."""
         return InvalidSceneError(f"{self.name} is not valid glTF: {problem}; export it again")
 
-    def unread(self, extension: str) -> UnsupportedError:
+    def unread(self, name: str) -> UnsupportedError:
         """Return the error of a file with an extension without which the Gaussians would be others."""
-        return UnsupportedError(
-            f"{self.name} needs the extension {extension[:60]!r}, which is not read; export it without"
-        )
+        return UnsupportedError(f"{self.name} needs the extension {name[:60]!r}, which is not read; export it without")
 
     def value(self, parent: dict[str, Any], key: str, kind: type, default: int | None = None) -> Any:  # noqa: ANN401
         """Return a list, an object, both empty by default, or a whole number of an object."""
@@ -290,7 +289,7 @@ def _split(opened: SceneFile) -> tuple[bytes, tuple[int, int] | None]:
         raise InvalidSceneError(f"{opened.name} is not valid GLB: its first chunk is not JSON; export it again")
     if length > opened.size:
         raise opened.cut_short(length)
-    text, start = opened.read(20, size), 28 + size
+    text, start = opened.read(20, size), 28 + size  # of the second chunk's data
     if start > length:
         return text, None
     size, kind = struct.unpack("<I4s", opened.read(start - 8, 8))
@@ -521,19 +520,15 @@ class _Column:
     values: Callable[[slice], Shaped[np.ndarray, "B width"]]
     dtype: str = "<f4"
 
-    @property
-    def row_bytes(self) -> int:
-        return self.width * np.dtype(self.dtype).itemsize
-
 
 def write_glb(
     file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
 ) -> tuple[str, ...]:
     """Write a scene in glTF's axes."""
-    ends = _ends(splats.means)
+    ends = _ends(splats)
     columns, views, start = list(_columns(splats)), list[dict[str, int]](), 0
     for column in columns:
-        length = len(splats) * column.row_bytes
+        length = len(splats) * column.width * np.dtype(column.dtype).itemsize
         views.append({"buffer": 0, "byteOffset": start, "byteLength": length, "target": 34962})  # ARRAY_BUFFER
         start += length
     _write_head(file, splats, columns, ends, views)
@@ -541,9 +536,7 @@ def write_glb(
         for rows in steps(len(splats)):
             file.write(column.values(rows).astype(column.dtype).tobytes())
         progress("write", done / len(columns))
-    notes: list[str] = []
-    note_mark(notes, splats.antialiased)
-    return tuple(notes)
+    return tuple(marks_left_out(splats))
 
 
 def write_spz_glb(
@@ -554,7 +547,7 @@ def write_spz_glb(
     The ``.spz`` has its own axes (x right, y up, z back), as the extension wants it, whose text has the library of
     ``.spz`` turn them from and to those of glTF. Accessors have types and counts, and no data.
     """
-    ends = _ends(splats.means)
+    ends = _ends(splats)
     packed = io.BytesIO()  # its size stands before it
     notes = write_spz(packed, splats, progress=progress)
     bits = fractional_bits_for(float(np.abs(splats.means).max()))
@@ -568,11 +561,10 @@ def write_spz_glb(
     return notes
 
 
-def _ends(means: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "2 3"]:
+def _ends(splats: Splats) -> Float32[np.ndarray, "2 3"]:
     """Return the smallest and the largest coordinates of a scene, which must have Gaussians."""
-    if not len(means):
-        raise UnsupportedError("a scene without Gaussians cannot be written as .glb; write it as .ply")
-    return np.stack([means.min(axis=0), means.max(axis=0)])
+    refuse_empty(splats, ".glb")
+    return np.stack([splats.means.min(axis=0), splats.means.max(axis=0)])
 
 
 def _columns(splats: Splats) -> Iterator[_Column]:
@@ -610,28 +602,11 @@ def _write_head(
     views: list[dict[str, int]],
     compression: dict[str, Any] | None = None,
 ) -> None:
-    """Write all that stands before the buffer; ``compression`` is the extension that gives accessors their data."""
-    text = _json(splats, columns, ends, views, compression or {})
-    body = sum(view["byteLength"] for view in views)
-    body += -body % 4
-    size = 12 + 8 + len(text) + 8 + body
-    if size > MAX_GLB_BYTES:
-        raise UnsupportedError(
-            f"{len(splats):,} Gaussians take {size:,} bytes, and .glb ends at 4 GiB; write .spz or .ply"
-        )
-    file.write(struct.pack("<4sIII4s", _MAGIC, 2, size, len(text), b"JSON") + text)
-    file.write(struct.pack("<I4s", body, b"BIN\0"))
+    """Write all that stands before the buffer; ``compression`` is the extension that gives accessors their data.
 
-
-def _json(
-    splats: Splats,
-    columns: list[_Column],
-    ends: Float32[np.ndarray, "2 3"],
-    views: list[dict[str, int]],
-    compression: dict[str, Any],
-) -> bytes:
-    """Return the JSON, filled up with spaces to a multiple of four bytes; the node moves positions to the world."""
-    accessors: list[dict[str, Any]] = []
+    The JSON is filled up with spaces to a multiple of four bytes; its node moves positions to the world.
+    """
+    compression, accessors = compression or {}, list[dict[str, Any]]()
     for column in columns:
         component = {"componentType": 5126} if column.dtype == "<f4" else {"componentType": 5121, "normalized": True}
         accessors.append({**component, "count": len(splats), "type": _TYPES[column.width]})
@@ -640,6 +615,7 @@ def _json(
     if not compression:
         for i, accessor in enumerate(accessors):
             accessor["bufferView"] = i
+    body = sum(view["byteLength"] for view in views)
     translation = [sign * value + 0.0 for sign, value in zip(TO_PLY, splats.origin, strict=True)]
     primitive = {
         "mode": 0,  # points
@@ -656,10 +632,17 @@ def _json(
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": sum(view["byteLength"] for view in views)}],
+        "buffers": [{"byteLength": body}],
     }
     text = json.dumps(root, separators=(",", ":")).encode("ascii")
-    return text + b" " * (-len(text) % 4)
+    text += b" " * (-len(text) % 4)
+    body += -body % 4
+    size = 12 + 8 + len(text) + 8 + body
+    if size > MAX_GLB_BYTES:
+        count = f"{len(splats):,} Gaussians"
+        raise UnsupportedError(f"{count} take {size:,} bytes, and .glb ends at 4 GiB; write .spz or .ply")
+    file.write(struct.pack("<4sIII4s", _MAGIC, 2, size, len(text), b"JSON") + text)
+    file.write(struct.pack("<I4s", body, b"BIN\0"))
 
 
 FORMAT = Codec(

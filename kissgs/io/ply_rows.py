@@ -7,7 +7,7 @@ import contextlib
 import io
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -43,9 +43,6 @@ _LOOKALIKES = {
     b"pk\x03\x04": "this is a ZIP archive, unpack it or name the scene by its real extension",
 }
 """Hints for other files that are often given as a scene, by their first bytes in lower case."""
-
-MIP_COMMENT = "comment SplatRenderMode: mip"
-"""Line that marks a scene as antialiased, as Brush and splat-transform write it."""
 
 _MARK = re.compile(
     r"(?:(?:splat_?render_?mode|rasteri[sz]e[-_ ]?mode)\s*[:=]?\s*([\w-]+)|"
@@ -107,6 +104,12 @@ def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFi
     with open_scene_file(source) as opened:
         header = _read_header(opened)
         yield PlyFile(opened.name, opened.file, opened.size if size is None else size, header)
+
+
+def header_bytes(lines: Sequence[str], antialiased: bool) -> bytes:
+    """Return the header of elements and properties; a scene is marked as Brush and splat-transform mark it."""
+    mark = ["comment SplatRenderMode: mip"] * antialiased
+    return "\n".join(["ply", "format binary_little_endian 1.0", *mark, *lines, "end_header\n"]).encode("ascii")
 
 
 def sh_degree(element: Element, name: str) -> int:
