@@ -18,8 +18,7 @@ from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 from kissgs.core.positions import Origin, with_origin
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
-from kissgs.evaluation.detail import PatchChanges
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, PatchChanges, Split, ViewComparison
 from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.metrics import Flip, Lpips, ms_ssim, psnr, ssim_with_patches

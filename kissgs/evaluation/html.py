@@ -17,9 +17,8 @@ from PIL import Image
 from kissgs.core.array_types import Float32, Float64, UInt8
 from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
-from kissgs.evaluation.detail import LARGE_LOSS
 from kissgs.evaluation.evaluate import background_of, render_clamped
-from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison, format_metric
+from kissgs.evaluation.results import LARGE_LOSS, Comparison, Evaluation, ViewComparison, format_metric
 from kissgs.rendering.images import to_bytes
 from kissgs.rendering.metrics import PATCH, patch_edges
 

@@ -17,7 +17,7 @@ from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.containers import META_NAME
 from kissgs.io.conventions import OPACITY_OF_BYTE
-from kissgs.io.planes import compress_images
+from kissgs.io.images import compress_images
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.quantize import ByteTables, ContainerModel, Quantized
 from kissgs.planning.sh_codebook import COEFFICIENTS
