@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -80,13 +81,14 @@ def coarse_note(
         rows = np.column_stack([positions, sizes]).astype(np.float32)[:: 1 + len(sizes) // TRIED]
         return coarse_in_chunks(rows, cuts_without_coarse(rows, Cuts.of(rows[:, :3], 0), count))
 
+    def coarse_nearby() -> float:
+        return float(coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean())
+
     remedies: dict[str, Callable[[], float]] = {
-        f"{ORIGIN} moves the scene there": lambda: float(
-            coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean()
-        ),
+        f"{ORIGIN} moves the scene there": coarse_nearby,
         STREAMED_REMEDY: lambda: coarse_in_parts(wide),
-        f"compressing into FOLDER/lod-meta.json with {ORIGIN} gives its parts fine steps": lambda: coarse_in_parts(
-            near
+        f"compressing into FOLDER/lod-meta.json with {ORIGIN} gives its parts fine steps": partial(
+            coarse_in_parts, near
         ),
     }
     helpful = (name for name, coarse in remedies.items() if coarse() <= COARSE_SHARE)
@@ -105,8 +107,7 @@ def coarse_chances(
     Positions and :func:`visible_sizes` are in world units, extents in signed logarithms.
     """
     half_steps = np.maximum(container_steps(positions, extents) / 2, 1e-300)
-    chances: Float64[np.ndarray, " N"] = 1 - np.minimum(COARSE_ERROR * sizes[:, None] / half_steps, 1).prod(axis=1)
-    return chances
+    return np.asarray(1 - np.minimum(COARSE_ERROR * sizes[:, None] / half_steps, 1).prod(axis=1))
 
 
 def container_steps(
@@ -114,14 +115,12 @@ def container_steps(
 ) -> Float64[np.ndarray, "N 3"]:
     """Return a container's finest steps at positions, world units, with the rounding of the range's ends to float32."""
     rounded = np.spacing(np.abs(signed_log(positions)).astype(np.float32))
-    steps: Float64[np.ndarray, "N 3"] = (1 + np.abs(positions)) * (extents / CONTAINER_LEVELS + rounded)
-    return steps
+    return np.asarray((1 + np.abs(positions)) * (extents / CONTAINER_LEVELS + rounded))
 
 
 def visible_sizes(scales: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
     """Return the second of the three standard deviations: the smaller one that a flat Gaussian shows from its front."""
-    sizes: Float64[np.ndarray, " N"] = np.exp(np.sort(scales, axis=1)[:, 1].astype(np.float64))
-    return sizes
+    return np.asarray(np.exp(np.sort(scales, axis=1)[:, 1].astype(np.float64)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -72,9 +72,8 @@ def find_root(
     while len(known) < attempts and x not in known:
         known[x] = margin(x)
         inside, outside = _bracket(known, slope)
-        if 0 <= known[x] <= tolerance_at(x) or (
-            inside is not None and outside is not None and stop.settled(inside, outside)
-        ):
+        settled = inside is not None and outside is not None and stop.settled(inside, outside)
+        if 0 <= known[x] <= tolerance_at(x) or settled:
             break
         if stop.tries_bound and (inside is None or outside is None) and _no_progress(known, slope):
             x = bounds[(inside is None) == (slope > 0)]

@@ -74,16 +74,14 @@ class Splats:
         n = len(self.means) if self.means.ndim else -1
         k = self.shN.shape[1] if self.shN.ndim == 3 else -1
         if k not in SH_REST_COUNTS:
-            raise InvalidSceneError(
-                f"shN has shape {self.shN.shape}; it must be (N, K, 3) with K one of {SH_REST_COUNTS}"
-            )
+            shape = self.shN.shape
+            raise InvalidSceneError(f"shN has shape {shape}; it must be (N, K, 3) with K one of {SH_REST_COUNTS}")
         shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 3), (n, k, 3))
         for name, shape in zip(ATTRIBUTES, shapes, strict=True):
             array = getattr(self, name)
             if array.shape != shape or array.dtype != np.float32:
-                raise InvalidSceneError(
-                    f"{name} is {array.dtype} of shape {array.shape}; it must be float32 of shape {shape}"
-                )
+                found = f"{array.dtype} of shape {array.shape}"
+                raise InvalidSceneError(f"{name} is {found}; it must be float32 of shape {shape}")
 
     def __len__(self) -> int:
         return len(self.means)

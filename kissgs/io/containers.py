@@ -243,7 +243,7 @@ def _read_directory(file: io.BufferedIOBase, label: str, most: int) -> list[_Ent
 
 
 def zip_names(file: io.BufferedIOBase) -> list[str]:
-    """Return the names of all entries of a zip, folders included; none if it cannot be read."""
+    """Return the names of all entries of a zip, folders included; none of a file that is none."""
     try:
         return [entry.path for entry in _read_directory(file, "the file", MAX_TREE_ENTRIES)]
     except InvalidContainerError:
@@ -279,20 +279,18 @@ def open_source(source: Path | bytes | Mapping[str, bytes], root: str | None = N
     """
     if isinstance(source, bytes):
         yield ZipSource(io.BytesIO(source), "the input", root)
-    elif not isinstance(source, Path):
+        return
+    if not isinstance(source, Path):
         yield MemorySource(source)
-    else:
-        try:
-            if source.exists() and not (source.is_file() or source.is_dir()):
-                raise InvalidContainerError(f"{source} is neither a file nor a folder")
-            file = None if source.is_dir() else source.open("rb")
-        except (OSError, ValueError) as error:
-            raise InvalidContainerError(f"cannot read {source}: {reason_of(error)}") from error
-        if file is None:
-            yield DirectorySource(source)
-            return
-        with file:
-            yield ZipSource(file, str(source), root)
+        return
+    try:
+        if source.exists() and not (source.is_file() or source.is_dir()):
+            raise InvalidContainerError(f"{source} is neither a file nor a folder")
+        file = None if source.is_dir() else source.open("rb")
+    except (OSError, ValueError) as error:
+        raise InvalidContainerError(f"cannot read {source}: {reason_of(error)}") from error
+    with file or contextlib.nullcontext():
+        yield DirectorySource(source) if file is None else ZipSource(file, str(source), root)
 
 
 def _refuse_larger(name: str, size: int, limit: int) -> None:

@@ -29,13 +29,9 @@ from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG
 FIRST_DRAWN = 2  # smallest level of opacity that viewers draw: they leave out opacities of 1/255 and less
 LAST_DRAWN = 254  # largest level to use: 255 is an opacity of 1, whose logit no decoder can give back
 
-SOG = ContainerModel(
-    tables=ByteTables(
-        opacity_logits=OPACITY_OF_BYTE.astype(np.float64), first_drawn=FIRST_DRAWN, last_drawn=LAST_DRAWN
-    ),
-    padding_last=True,
-    entry_bits=130,
-)
+_LOGITS = OPACITY_OF_BYTE.astype(np.float64)
+_TABLES = ByteTables(opacity_logits=_LOGITS, first_drawn=FIRST_DRAWN, last_drawn=LAST_DRAWN)
+SOG = ContainerModel(tables=_TABLES, padding_last=True, entry_bits=130)
 
 
 MEANS, QUATS, SCALES, SH0 = ("means_l.webp", "means_u.webp"), "quats.webp", "scales.webp", "sh0.webp"

@@ -125,10 +125,14 @@ def _read(document: dict[str, Any], version: int) -> SogLayout:
     table = _even_table if first else _codebook
     colors = table(document, "sh0", 4 if first else 3)
     asset = document.get("asset")
+    low, high = (_numbers(_part(document, "means"), key, "means.", 3) for key in ("mins", "maxs"))
+    if max(np.abs(low).max(), np.abs(high).max()) > MAX_SIGNED_LOG:
+        raise _MetadataError(f"the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold")
     return SogLayout(
         version=version,
         count=_first_count(document) if first else _whole(document, "count", "", 0, 1 << 32),
-        **_means(document),
+        low=low,
+        high=high,
         scales=table(document, "scales", 3),
         sh0=colors[:3],
         opacities=np.clip(colors[3], OPACITY_OF_BYTE[0], OPACITY_OF_BYTE[-1]) if first else OPACITY_OF_BYTE,
@@ -187,13 +191,6 @@ def _part(document: dict[str, Any], key: str) -> dict[str, Any]:
     return part
 
 
-def _means(document: dict[str, Any]) -> dict[str, Float64[np.ndarray, " 3"]]:
-    low, high = (_numbers(_part(document, "means"), key, "means.", 3) for key in ("mins", "maxs"))
-    if max(np.abs(low).max(), np.abs(high).max()) > MAX_SIGNED_LOG:
-        raise _MetadataError(f"the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold")
-    return {"low": low, "high": high}
-
-
 def _numbers(part: dict[str, Any], key: str, where: str, count: int) -> Float64[np.ndarray, " count"]:
     values = part.get(key)
     values = values if isinstance(values, list) else [values]
@@ -236,9 +233,7 @@ def _files(document: dict[str, Any]) -> dict[str, str]:
 def _names(part: dict[str, Any], key: str, count: int) -> list[str]:
     names = part.get("files")
     if not isinstance(names, list) or len(names) != count or not all(map(is_file_name, names)):
-        raise _MetadataError(
-            f"{key}.files does not name {count} image{'s' if count > 1 else ''}; export the scene again"
-        )
+        raise _MetadataError(f"{key}.files does not name {count} image{'s' * (count > 1)}; export the scene again")
     return names
 
 

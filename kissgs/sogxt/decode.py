@@ -121,17 +121,10 @@ class _Planes:
 
     def load(self, pool: Workers) -> None:
         """Decode all images in parallel, the slowest first."""
-        jobs = [
-            self.load_means,
-            self.load_codebook,
-            self.load_labels,
-            *(lambda field=field: self.load_plain(*field) for field in CHANNELS_OF_PLAIN.items()),
-            self.load_mask,
-        ]
-        pool.map(lambda job: job(), jobs)
+        plain = (lambda field=field: self.load_plain(*field) for field in CHANNELS_OF_PLAIN.items())
+        pool.map(lambda job: job(), [self.load_means, self.load_codebook, self.load_labels, *plain, self.load_mask])
 
     def load_mask(self) -> None:
-        """Load the mask of the cells that hold a Gaussian."""
         self.mask = self.grid_plane("active_mask", 1)
 
     def load_plain(self, field: str, channels: int) -> None:

@@ -52,9 +52,8 @@ def write_files(
     with blas_workers(context.threads) as pool:
         files = compress_images(images, settings, pool, partial(context.progress, "images"))
     scene, count = plan.scene, int(plan.grid.mask.sum())
-    omitted = {*GOALS, "max_encodes"} | (
-        {"sh_codebook_size"} if settings.sh_codebook_size == MAX_CODEBOOK_SIDE**2 else set()
-    )
+    usual_codebook = settings.sh_codebook_size == MAX_CODEBOOK_SIDE**2
+    omitted = {*GOALS, "max_encodes", *["sh_codebook_size"] * usual_codebook}
     recorded = {**settings.model_dump(exclude=omitted), "rd_lambda": plan.rd_lambda}
     layout = metadata.Layout(
         grid_side=plan.grid.side,

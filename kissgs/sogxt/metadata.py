@@ -126,15 +126,13 @@ class Layout(BaseModel):
 
     def to_yaml(self) -> bytes:
         """Return ``container_meta.yaml``: ASCII, floats always with a point, so that YAML 1.1 readers see numbers."""
+
+        def quantize(field: str) -> dict[str, Any]:
+            return {"simple_quantize": self._range_entry(field, "min_values", "max_values")}
+
         document: dict[str, Any] = {
             "meta": {"grid_side": self.grid_side, "f_rest_centroids_side": self.codebook_side, "image_codec": "webp"},
-            "ops": [
-                {
-                    "input_fields": [field],
-                    "transforms": [{"simple_quantize": self._range_entry(field, "min_values", "max_values")}],
-                }
-                for field in CHANNELS
-            ],
+            "ops": [{"input_fields": [field], "transforms": [quantize(field)]} for field in CHANNELS],
         }
         if self.model is not None:
             document["model"] = self.model
@@ -273,7 +271,9 @@ def _layout_of(raw: dict[str, Any], name: str) -> Layout:
         # Some YAML dumpers write numbers as text, so that is accepted; in JSON it is refused, as in browsers.
         layout = Layout.model_validate(raw, strict=name == JSON_NAME)
     except ValidationError as error:
-        raise InvalidContainerError(f"{name}: {_first_problem(error)}") from error
+        problem = error.errors()[0]
+        where = ".".join(map(str, problem["loc"]))
+        raise InvalidContainerError(f"{name}: {where}: {problem['msg'].lower()}") from error
     _check_ranges(layout, name)
     if checksum is not MISSING and checksum != layout.checksum:
         raise InvalidContainerError(f"{name} is damaged: its numbers do not give its {CHECKSUM}; copy it again")
@@ -323,9 +323,8 @@ def _check_ranges(layout: Layout, name: str) -> None:
             if len(values) != channels:
                 raise InvalidContainerError(f"{name}: the range of {field} has {len(values)} numbers, not {channels}")
     if np.abs(layout.limits("means")).max() > MAX_SIGNED_LOG:
-        raise InvalidContainerError(
-            f"{name}: the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold"
-        )
+        reason = f"the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold"
+        raise InvalidContainerError(f"{name}: {reason}")
 
 
 def _from_yaml(data: bytes) -> dict[str, Any]:
@@ -338,9 +337,7 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InvalidContainerError(f"{YAML_NAME} is not readable YAML") from error
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
-        raise InvalidContainerError(
-            f"{YAML_NAME} lacks 'meta' or 'ops', or they are not of the expected form"
-        ) from error
+        raise InvalidContainerError(f"{YAML_NAME} lacks 'meta' or 'ops', or they are of another form") from error
     _require_webp(sides.get("image_codec") if isinstance(sides, dict) else None)
     recorded = document.get("kissgs")
     return {
@@ -504,8 +501,3 @@ def _spread(values: Any, channels: int) -> list[Any]:  # noqa: ANN401
     """Return one number per channel: repeat a number, or the first of a list of another length, as browsers do."""
     numbers = values if isinstance(values, list) else [values]
     return numbers if len(numbers) == channels else numbers[:1] * channels
-
-
-def _first_problem(error: ValidationError) -> str:
-    problem = error.errors()[0]
-    return f"{'.'.join(map(str, problem['loc']))}: {problem['msg'].lower()}"
