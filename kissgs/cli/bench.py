@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
+from typer import Argument, Option
 
 from kissgs.cli.files import progress_bar, show, write_output
 from kissgs.cli.options import ForceOption, ViewsOption, chosen, open_views, output_option
@@ -100,14 +101,13 @@ class Measurement:
 
 
 def bench(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene of any format that kissgs reads.")],
+    scene: Annotated[Path, Argument(metavar="SCENE", help="Scene of any format that kissgs reads.")],
     presets: Annotated[
-        list[str] | None,
-        typer.Option("--preset", "-p", help="Preset to measure; repeatable. Default, without --time: all."),
+        list[str] | None, Option("--preset", "-p", help="Preset to measure; repeatable. Default, without --time: all.")
     ] = None,
     times: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--time",
             metavar="TIME",
             help="Time limit to measure; repeatable. Default, without --preset: 5s, 30s and 2min.",
