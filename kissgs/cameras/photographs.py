@@ -190,7 +190,6 @@ class Distortion:
     k6: float = 0.0
 
     def __bool__(self) -> bool:
-        """Whether the lens distorts at all."""
         return any(astuple(self))
 
     def apply(

@@ -300,7 +300,6 @@ def discard_stdout() -> None:
 
 
 def write_stdout(data: bytes) -> None:
-    """Write bytes to standard output."""
     with stdout():
         sys.stdout.buffer.write(data)
 
@@ -329,5 +328,4 @@ def show(what: RenderableType) -> None:
 
 
 def print_json(report: object) -> None:
-    """Print indented JSON."""
     write_stdout((json.dumps(report, indent=2) + "\n").encode())

@@ -61,7 +61,6 @@ def _changes(changed: Mapping[str, int]) -> list[Text]:
 
 
 def report_table(report: Report, target: str) -> RenderableType:
-    """Format the report of one compression."""
     head = _result(
         target,
         bytes_of=(report.source_bytes, report.container_bytes),
@@ -129,7 +128,6 @@ def _result(
 
 
 def compaction_table(report: CompactionReport, target: str) -> RenderableType:
-    """Format the report of one compaction."""
     head = Text.assemble(
         (target, "bold"),
         f"  {report.source_count:,} -> ",
@@ -140,7 +138,6 @@ def compaction_table(report: CompactionReport, target: str) -> RenderableType:
 
 
 def streamed_table(report: StreamedReport, target: str) -> RenderableType:
-    """Format the report of a streamed compression."""
     stored = report.counts[0] + report.environment_count
     head = Text.assemble(
         (target, "bold"),

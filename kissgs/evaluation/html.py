@@ -129,12 +129,10 @@ def _worst_views(evaluation: Evaluation) -> str:
 
 
 def _change(comparison: Comparison) -> str:
-    """Return the change of the PSNR to the photograph as HTML."""
     return "" if comparison.change is None else _red_if_negative(format_metric(comparison.change, 2, signed=True))
 
 
 def _signed(change: float) -> str:
-    """Return a change of SSIM as HTML."""
     return _red_if_negative(format_metric(change, 4, signed=True))
 
 

@@ -25,7 +25,6 @@ _HEADER = struct.Struct(">I4sIIB")
 
 
 def is_png(data: bytes) -> bool:
-    """Whether bytes begin like PNG."""
     return data.startswith(_MAGIC)
 
 

@@ -257,7 +257,6 @@ class SpzInfo:
 
 
 def read_spz_info(source: Path | bytes) -> SpzInfo:
-    """Read the header."""
     with open_scene_file(source) as opened:
         return _read_header(opened)
 
@@ -402,7 +401,6 @@ def _read_extensions(extensions: bytes, name: str) -> tuple[str, list[str]]:
 def write_spz(
     file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
 ) -> tuple[str, ...]:
-    """Write a scene."""
     count = len(splats)
     refuse_empty(splats, ".spz")
     reach = float(np.abs(splats.means).max())

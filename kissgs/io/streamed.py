@@ -46,8 +46,6 @@ class Container:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Contents of a manifest."""
-
     levels: int
     filenames: tuple[str, ...]  # files of the containers: their metadata, or they themselves
     rows: tuple[tuple[tuple[int, int, int], ...], ...]
@@ -90,8 +88,6 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class StreamedFormat:
-    """Format of streamed scenes."""
-
     title: str
     manifest: str  # file name of the manifest
     containers: str | None
@@ -100,7 +96,6 @@ class StreamedFormat:
 
     @property
     def codec(self) -> Codec:
-        """Code of the format."""
         return Codec(info=self.describe, read=self.decode)
 
     def describe(self, path: Path | bytes, level: int) -> Facts:

@@ -28,7 +28,6 @@ _FREE_PIXELS = 1 << 20
 
 
 def describe(path: Path | bytes, level: int) -> Facts:
-    """Return the facts of a SOG container."""
     with open_source(path) as files:
         layout = read_layout(files)
         parts = {name: stored_size(files, name) for name in (META_NAME, *layout.images)}
@@ -196,7 +195,6 @@ FORMAT = Codec(info=describe, read=decode)
 
 
 def _opened(files: Source, name: str) -> Container:
-    """Read the container of a metadata file."""
     layout, folder = read_layout(files, name), name[: name.rfind("/") + 1]
 
     def stored() -> tuple[str, int]:

@@ -325,18 +325,15 @@ def coarse_note(work: Path, layout: Layout) -> str:
 
 
 def environment_count(work: Path) -> int:
-    """Return the number of Gaussians in the file of the environment."""
     return sum(read_counts(work, ENVIRONMENT)["counts"])
 
 
 def read_environment(work: Path, layout: Layout) -> Splats:
-    """Return the Gaussians of the environment."""
     rows = read_rows(environment_file(work), layout.sh_degree, layout.environment)
     return from_rows(rows, antialiased=layout.antialiased)
 
 
 def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -> Splats:
-    """Return the Gaussians of a level of some chunks."""
     rows = [
         read_rows(level_file(work, chunk, level), layout.sh_degree, sum(read_leaves(work, chunk)["counts"][level]))
         for chunk in chunks

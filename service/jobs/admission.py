@@ -57,7 +57,6 @@ class Admission:
 
     @property
     def uploads(self) -> int:
-        """Number of uploads in progress."""
         return self._uploads.total()
 
     @contextlib.contextmanager

@@ -227,7 +227,6 @@ class Worker:
     _postponed_reason: str = ""
 
     def start(self) -> None:
-        """Start to run jobs."""
         self._loops = [asyncio.create_task(self._loop(i)) for i in range(self.settings.workers)]
 
     def health_problem(self) -> str | None:
@@ -259,7 +258,6 @@ class Worker:
         await asyncio.gather(*self._loops, return_exceptions=True)
 
     def kill_running(self) -> None:
-        """Kill all job processes."""
         for process in self._processes.values():
             process.kill()
 

@@ -50,7 +50,6 @@ class Store:
         self.changes = 0  # of the queue so far
 
     def close(self) -> None:
-        """Close all connections."""
         self._engine.dispose()
         self.monitor.close()
 
@@ -85,7 +84,6 @@ class Store:
         return job if job is not None and owner in (None, job.owner) else None
 
     def by_idempotency_key(self, owner: str, key: str) -> Job | None:
-        """Return the job that ``owner`` submitted with this key; None if there is none."""
         with self._reading() as session:
             return session.scalar(sa.select(Job).where(Job.owner == owner, Job.idempotency_key == key))
 
@@ -119,19 +117,16 @@ class Store:
     # Sums ----------------------------------------------------------------------------------------------------------
 
     def counts(self) -> dict[State, int]:
-        """Return the number of jobs in each state."""
         with self._reading() as session:
             rows = session.execute(sa.select(Job.state, sa.func.count()).group_by(Job.state)).all()
         found = {State(state): count for state, count in rows}
         return {state: found.get(state, 0) for state in State}
 
     def active_of(self, owner: str) -> int:
-        """Return the number of queued and running jobs of an owner."""
         with self._reading() as session:
             return _count(session, Job.owner == owner, Job.state.in_(ACTIVE))
 
     def disk_bytes(self) -> int:
-        """Return the disk space of all jobs, bytes."""
         with self._reading() as session:
             return session.scalar(sa.select(sa.func.sum(Job.disk_bytes))) or 0
 
@@ -145,7 +140,6 @@ class Store:
         return [spent / count for spent, count in latest if spent and count >= 10_000][:21]
 
     def ids(self, *states: State) -> set[str]:
-        """Return the ids of all jobs in ``states``, by default of all jobs."""
         with self._reading() as session:
             return set(session.scalars(sa.select(Job.id).where(Job.state.in_(states or tuple(State)))))
 
@@ -162,7 +156,6 @@ class Store:
             return session.scalar(query)
 
     def reclaimable_bytes(self) -> int:
-        """Return the bytes of all reclaimable files of ended jobs."""
         query = sa.select(sa.func.sum(Job.reclaimable_bytes)).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
         with self._reading() as session:
             return session.scalar(query) or 0
@@ -244,7 +237,6 @@ class Store:
             session.execute(sa.update(Job).where(Job.number == number).values(**values))
 
     def forget(self, number: int) -> None:
-        """Remove a job and its events."""
         with self._write() as session:
             session.execute(sa.delete(Event).where(Event.job == number))
             session.execute(sa.delete(Job).where(Job.number == number))

@@ -146,8 +146,6 @@ MAX_LISTED_FOLDERS = 4  # maximum number of folders named in a message
 
 @dataclass(frozen=True, slots=True)
 class FoundPhoto:
-    """File of a photograph."""
-
     path: Path
     factor: int  # original size divided by this photograph's size, according to the folder's name
     folder: Path  # folder of photographs that contains the file, perhaps in a subfolder
@@ -155,8 +153,6 @@ class FoundPhoto:
 
 @dataclass(frozen=True, slots=True)
 class _SearchFolder:
-    """Folder in which a photograph is searched for."""
-
     folder: Path
     factor: int  # original size divided by the size of its photographs
     names: tuple[str, ...]  # names to try, in order, relative to the folder

@@ -133,8 +133,6 @@ CENTRE_SCALE = 30.0
 
 @dataclass(frozen=True, slots=True)
 class ViewStats:
-    """Statistics of a thumbnail."""
-
     alpha: float  # mean alpha, 0 to 1
     log_size: float
     """Median logarithm of the largest scale of the Gaussians, world units. Parts that no photograph shows have

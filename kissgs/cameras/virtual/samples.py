@@ -131,7 +131,6 @@ def _further_region(splats: Splats, bounds: SceneBounds, like: Camera, pool: Wor
 
 
 def _within(means: Float32[np.ndarray, "N 3"], centre: Vec3, radius: float) -> Bool[np.ndarray, " N"]:
-    """Return which positions are within ``radius`` of ``centre``."""
     found = np.empty(len(means), bool)
     for first in range(0, len(means), BLOCK):
         offsets = means[first : first + BLOCK] - centre
