@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.text import Text
 
 from kissgs.cli.files import CHECKPOINT, Result, output, progress_bar, say_notes, sibling, source, write_stdout
-from kissgs.cli.main import NOTHING_LEFT, say_when_interrupted
+from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
 from kissgs.cli.options import open_views
 from kissgs.cli.signals import stoppable
 from kissgs.cli.tables import report_table, streamed_table

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option
 
 from kissgs.cli.files import Result, check_input, for_each_input, progress_bar, say_notes, show, source, write_output
-from kissgs.cli.main import Interrupted
+from kissgs.cli.interrupts import Interrupted
 from kissgs.cli.options import CaptureOptions, ForceOption, SceneOptions, output_option, with_option_groups
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.formats import names_folder

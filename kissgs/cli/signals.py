@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from kissgs.cli.main import (
+from kissgs.cli.interrupts import (
     NOTHING_LEFT,
     Interrupted,
     exit_by_signal,

@@ -24,9 +24,8 @@ OWNER = r"[A-Za-z0-9._@-]{1,64}"  # valid names of key owners
 Seconds = Annotated[float, Field(gt=0, le=10 * 365 * 86400)]
 
 
-Words = Annotated[
-    tuple[str, ...], BeforeValidator(lambda value: _words(value.lower()) if isinstance(value, str) else value)
-]
+_LOWER = BeforeValidator(lambda value: _words(value.lower()) if isinstance(value, str) else value)
+Words = Annotated[tuple[str, ...], _LOWER]
 """Words of a text, in lower case, as browsers send them."""
 
 

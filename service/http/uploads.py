@@ -191,11 +191,6 @@ class Received:
     sha256: str
     info: kissgs.SceneInfo
 
-    @property
-    def file_name(self) -> str:
-        """Name of the upload in the folder of its job."""
-        return f"scene{UPLOADS[self.info.format]}"
-
 
 class Spool:
     """Writes one scene to disk. As a context manager, removes it unless :meth:`finish` has succeeded.
@@ -280,8 +275,7 @@ class Spool:
             yield self._file
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
-            text = f"the upload cannot be written: {reason}; try again later"
-            raise disk_full(text) from error
+            raise disk_full(f"the upload cannot be written: {reason}; try again later") from error
 
     def _read_info(self) -> kissgs.SceneInfo:
         """Read the headers of the complete upload; refuse formats that are not one binary file."""
@@ -289,19 +283,14 @@ class Spool:
         try:
             kind = kissgs.recognise(self._path, name=name)
             if kind not in UPLOADS:
-                raise ProblemError(
-                    "unsupported",
-                    f"the upload is a zip file, but not a .sog; send a {alternatives(tuple(UPLOADS.values()))}",
-                )
-            if kind == "gltf" and not self._is_glb():  # as large as the upload, and would be parsed in this process
-                raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")
+                wanted = alternatives(tuple(UPLOADS.values()))
+                raise ProblemError("unsupported", f"the upload is a zip file, but not a .sog; send a {wanted}")
+            with self._path.open("rb") as file:  # JSON is as large as the upload, and would be parsed in this process
+                if kind == "gltf" and file.read(4) != b"glTF":
+                    raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")
             return kissgs.read_scene_info(self._path, name=name)
         except kissgs.KissgsError as error:
             raise self._named(error) from error
-
-    def _is_glb(self) -> bool:
-        with self._path.open("rb") as file:
-            return file.read(4) == b"glTF"
 
     def _check_header(self) -> None:
         """Validate the header as soon as it has arrived, long before the last byte of an invalid file."""
@@ -384,9 +373,8 @@ async def _next(chunks: AsyncIterator[bytes], stopped: asyncio.Future[Any], idle
             raise ProblemError("upload-timeout", text, headers=CLOSE)
         return coming.result()
     except ClientDisconnect as error:
-        raise ProblemError(
-            "upload-aborted", "the connection closed before the upload was complete; send it again"
-        ) from error
+        text = "the connection closed before the upload was complete; send it again"
+        raise ProblemError("upload-aborted", text) from error
     finally:
         coming.cancel()
 

@@ -93,7 +93,11 @@ class Admission:
                 oldest = self.store.oldest_reclaimable()
                 if oldest is None:
                     raise self._full(size)
-                self._reclaim(oldest)
+                # Its upload, and its decoded scene, which can be decoded again.
+                self.store.monitor.check_files()
+                self.storage.reclaim(oldest.id)
+                left = self.storage.job_bytes(oldest.id)
+                self.store.update(oldest.number, upload_kept=False, reclaimable_bytes=0, disk_bytes=left)
             self._reserved += size
 
     def wrote(self, size: int) -> None:
@@ -107,26 +111,14 @@ class Admission:
             self._reserved -= size
             self._written -= written
 
-    def _reclaim(self, job: Job) -> None:
-        """Remove the upload of an ended job, and its decoded scene, which can be decoded again."""
-        self.store.monitor.check_files()
-        self.storage.reclaim(job.id)
-        left = self.storage.job_bytes(job.id)
-        self.store.update(job.number, upload_kept=False, reclaimable_bytes=0, disk_bytes=left)
-
     def _fits(self, size: int, reclaimable: int = 0) -> bool:
-        taken = self.store.disk_bytes() + self._reserved - reclaimable
-        free = self.storage.free_bytes() - (self._reserved - self._written)
-        return (
-            taken + size <= self.settings.max_disk_bytes and free + reclaimable - size >= self.settings.min_free_bytes
-        )
+        taken = self.store.disk_bytes() + self._reserved - reclaimable + size
+        free = self.storage.free_bytes() - (self._reserved - self._written) + reclaimable - size
+        return taken <= self.settings.max_disk_bytes and free >= self.settings.min_free_bytes
 
     def _full(self, size: int) -> ProblemError:
-        text = (
-            f"the server has no disk space for {size:,} more bytes; try again later, "
-            "or delete jobs that you no longer need"
-        )
-        return disk_full(text)
+        remedy = "try again later, or delete jobs that you no longer need"
+        return disk_full(f"the server has no disk space for {size:,} more bytes; {remedy}")
 
     def _refused(self, limit: str) -> ProblemError:
         seconds = self.queue.current().seconds_to_room()

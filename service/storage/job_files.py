@@ -66,9 +66,8 @@ class JobStorage:
                 folder.mkdir(exist_ok=True)
             self._lock: IO[str] = (self.root / "lock").open("a")
         except OSError as error:
-            raise SettingsError(
-                f"KISSGS_DATA_DIR: cannot use {root}: {(error.strerror or str(error)).lower()}"
-            ) from error
+            reason = (error.strerror or str(error)).lower()
+            raise SettingsError(f"KISSGS_DATA_DIR: cannot use {root}: {reason}") from error
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -267,9 +266,8 @@ class JobStorage:
         for job_id in unknown:
             self._move_to_orphaned(self.jobs / job_id)
         if unknown:
-            log.warning(
-                "folders of jobs that the database does not know were moved to %s: %d", self.orphaned, len(unknown)
-            )
+            text = "folders of jobs that the database does not know were moved to %s: %d"
+            log.warning(text, self.orphaned, len(unknown))
 
     def count_orphaned(self) -> int:
         try:
@@ -290,16 +288,15 @@ class JobStorage:
     def health_problem(self) -> str | None:
         """Return why files cannot be stored; None if they can. Takes microseconds."""
         for folder, opened in self._opened.items():
+            unusable = f"the data folder cannot be used: its folder {folder.name}"
             try:
                 same = os.path.samestat(folder.stat(), os.fstat(opened))
             except OSError:
-                return f"the data folder cannot be used: its folder {folder.name} is missing; restore it"
+                return f"{unusable} is missing; restore it"
             if not same:
-                return f"the data folder cannot be used: its folder {folder.name} was replaced; restart the service"
+                return f"{unusable} was replaced; restart the service"
             if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
-                return (
-                    f"the data folder cannot be used: its folder {folder.name} is not writable; change its permissions"
-                )
+                return f"{unusable} is not writable; change its permissions"
         return None
 
     def check(self) -> None:

@@ -12,7 +12,7 @@ from helpers.command_line import failure, run
 
 import kissgs
 from kissgs.cli import bench
-from kissgs.cli.main import Interrupted
+from kissgs.cli.interrupts import Interrupted
 
 
 def table(path):

@@ -153,8 +153,5 @@ def _disk_problem(context: ServiceContainer) -> str | None:
         free = context.storage.free_bytes()
     except OSError as error:
         return f"the data folder cannot be used: {(error.strerror or str(error)).lower()}"
-    return (
-        None
-        if free >= needed
-        else f"the disk has {free:,} free bytes, fewer than KISSGS_MIN_FREE_BYTES ({needed:,}); free some space"
-    )
+    low = f"the disk has {free:,} free bytes, fewer than KISSGS_MIN_FREE_BYTES ({needed:,}); free some space"
+    return None if free >= needed else low

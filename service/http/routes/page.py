@@ -105,6 +105,5 @@ def _page() -> Response:
         raise ProblemError("not-found", "this service was installed without its preview page") from error
     maps = re.findall(rb'<script type="importmap">(.*?)</script>', page.replace(b"\r\n", b"\n"), re.DOTALL)
     hashes = "".join(f" 'sha256-{base64.b64encode(hashlib.sha256(text).digest()).decode()}'" for text in maps)
-    return Response(
-        page, media_type="text/html", headers={**REVALIDATE, "Content-Security-Policy": POLICY.format(hashes=hashes)}
-    )
+    headers = {**REVALIDATE, "Content-Security-Policy": POLICY.format(hashes=hashes)}
+    return Response(page, media_type="text/html", headers=headers)
