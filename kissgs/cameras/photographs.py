@@ -20,16 +20,11 @@ from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
 # EXIF orientation is ignored, as by COLMAP and 3DGS trainers: cameras refer to the pixels as stored.
 
-FORMATS = tuple(
-    plugin.format
-    for plugin in (
-        JpegImagePlugin.JpegImageFile,
-        PngImagePlugin.PngImageFile,
-        WebPImagePlugin.WebPImageFile,
-        TiffImagePlugin.TiffImageFile,
-        BmpImagePlugin.BmpImageFile,
-    )
+_PLUGINS = (
+    *(JpegImagePlugin.JpegImageFile, PngImagePlugin.PngImageFile, WebPImagePlugin.WebPImageFile),
+    *(TiffImagePlugin.TiffImageFile, BmpImagePlugin.BmpImageFile),
 )
+FORMATS = tuple(plugin.format for plugin in _PLUGINS)
 """Formats that are read; Pillow's rarely used readers are kept away from untrusted files."""
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})

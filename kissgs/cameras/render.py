@@ -36,7 +36,7 @@ from kissgs.rendering.images import Label, contact_sheet, reframed, render_all
 from kissgs.rendering.rasterizer import BLACK, Colour
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Orbit:
     """A horizontal circle around a look-at target, and the arc of it from which the scene looks good."""
 
@@ -74,12 +74,8 @@ class Orbit:
             azimuths = self.mid_azimuth + np.arange(frames) * (2 * np.pi / frames)
             return [self.camera(float(azimuth), width, height) for azimuth in azimuths]
         phases = [_swing_phase(frame, frames) for frame in range(frames)]
-        by_phase = {
-            phase: self.camera(
-                self.mid_azimuth + 0.5 * self.sweep * float(np.sin(np.pi * phase / frames)), width, height
-            )
-            for phase in sorted(set(phases))
-        }
+        swings = {phase: 0.5 * self.sweep * float(np.sin(np.pi * phase / frames)) for phase in sorted(set(phases))}
+        by_phase = {phase: self.camera(self.mid_azimuth + swing, width, height) for phase, swing in swings.items()}
         return [by_phase[phase] for phase in phases]
 
     def sheet_cameras(self, frames: int, width: int, height: int) -> list[Camera]:
@@ -134,8 +130,7 @@ def find_orbit(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: int
             circles = list(_circles_in_scene(bounds, enclosed=candidates.kind == "enclosed"))
         scores = _scores(circles, COARSE_STEPS, candidates)
         ranks = [
-            _rank(score - min_score, circle.radius / bounds.radius)
-            for circle, score in zip(circles, scores, strict=True)
+            _rank(score - min_score, each.radius / bounds.radius) for each, score in zip(circles, scores, strict=True)
         ]
         best = circles[max(range(len(circles)), key=lambda n: ranks[n])]
         fine_scores = _scores([best], FINE_STEPS, candidates)[0]
@@ -154,16 +149,11 @@ def _circles_in_scene(bounds: SceneBounds, *, enclosed: bool) -> Iterator[Orbit]
     """Yield circles around the centre; if the scene encloses the cameras, also orbits of radius 0 that look around."""
     for radius in RADII:
         for elevation in ELEVATIONS:
-            yield Orbit(
-                target=bounds.centre,
-                radius=radius * bounds.radius,
-                elevation=float(np.radians(elevation)),
-                up=bounds.up,
-            )
+            yield Orbit(bounds.centre, radius * bounds.radius, float(np.radians(elevation)), bounds.up)
     if enclosed:
         for rise in (0.0, 0.4):
             position = bounds.centre + rise * bounds.radius * bounds.up
-            yield Orbit(target=position, radius=0.0, elevation=float(np.radians(LOOK_AROUND_PITCH)), up=bounds.up)
+            yield Orbit(position, 0.0, float(np.radians(LOOK_AROUND_PITCH)), bounds.up)
 
 
 def _circles_around_object(splats: Splats, bounds: SceneBounds, aspect: float) -> Iterator[Orbit]:
@@ -183,7 +173,7 @@ def _circles_around_object(splats: Splats, bounds: SceneBounds, aspect: float) -
         half_extent_up = half_height * np.cos(elevation) + radius * np.sin(elevation)
         half_depth = radius * np.cos(elevation) + half_height * np.sin(elevation)
         distance = max(OBJECT_MARGIN * max(radius / slopes[0], half_extent_up / slopes[1]), 2 * NEAR) + half_depth
-        yield Orbit(target=target, radius=float(distance), elevation=float(elevation), up=bounds.up)
+        yield Orbit(target, float(distance), float(elevation), bounds.up)
 
 
 def _rank(surplus: Float64[np.ndarray, " steps"], radii: float) -> tuple[bool, float]:

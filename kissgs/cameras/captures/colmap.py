@@ -337,15 +337,8 @@ def _intrinsics(camera: CameraRecord, where: str) -> Intrinsics:
         raise InvalidViewsError(f"{where}: {camera.width}x{camera.height} pixels is not a valid image size")
     values = dict(zip(names, camera.parameters, strict=True))
     focal = values.pop("f", None)
-    return Intrinsics(
-        width=camera.width,
-        height=camera.height,
-        fx=values.pop("fx", focal),
-        fy=values.pop("fy", focal),
-        cx=values.pop("cx"),
-        cy=values.pop("cy"),
-        distortion=Distortion(**values),
-    )
+    fx, fy, cx, cy = values.pop("fx", focal), values.pop("fy", focal), values.pop("cx"), values.pop("cy")
+    return Intrinsics(camera.width, camera.height, fx, fy, cx, cy, distortion=Distortion(**values))
 
 
 def _viewmat(record: ImageRecord, where: str) -> Float64[np.ndarray, "4 4"]:

@@ -43,9 +43,8 @@ def read_json(path: Path) -> bytes:
     """Return the bytes of a JSON file without a byte order mark, at most :data:`MAX_JSON_BYTES`."""
     with open_file(path) as (file, size):
         if size > MAX_JSON_BYTES:
-            raise InvalidViewsError(
-                f"{path} has {size:,} bytes; at most {MAX_JSON_BYTES:,} are read; is it a camera file?"
-            )
+            most = f"at most {MAX_JSON_BYTES:,} are read"
+            raise InvalidViewsError(f"{path} has {size:,} bytes; {most}; is it a camera file?")
         return file.read().removeprefix(codecs.BOM_UTF8)
 
 
@@ -178,7 +177,10 @@ def find_photos(
             for name in names
         ]
     else:
-        folder = _named_folder(images, root, listing)
+        named = (listing.spelled(images), listing.spelled(root / images))
+        folder = next((folder for folder in named if _is_folder(folder)), None)
+        if folder is None:
+            raise InvalidViewsError(f"there is neither a folder {images} nor {root / images}; check --images")
         searched = [[_within(folder, name)] for name in names]
     found = [listing.find_first(folders) for folders in searched]
     missing = [i for i, photo in enumerate(found) if photo is None]
@@ -312,9 +314,8 @@ def _search_folder(
     if factor not in variants:
         wanted = folder.name if factor == 1 else f"{folder.name}_{factor}"
         existing = ", ".join(variants[known].name for known in sorted(variants))
-        raise InvalidViewsError(
-            f"there is no folder {wanted} in {folder.parent}, only {existing}; choose another --scale"
-        )
+        place = f"in {folder.parent}, only {existing}"
+        raise InvalidViewsError(f"there is no folder {wanted} {place}; choose another --scale")
     # A folder named input may hold something else than photographs, unless the camera file names it.
     has_photos = folder.name == INPUT or variants[factor].name != INPUT
     return _SearchFolder(variants[factor], factor, names, has_photos)
@@ -341,13 +342,6 @@ def _candidates(name: str, root: Path) -> list[tuple[Path, tuple[str, ...]]]:
 def _suffixes(parts: Sequence[str]) -> tuple[str, ...]:
     """Return all suffixes of a path, the longest first."""
     return tuple("/".join(parts[i:]) for i in range(len(parts)))
-
-
-def _named_folder(images: Path, root: Path, listing: _FolderListing) -> Path:
-    for folder in (listing.spelled(images), listing.spelled(root / images)):
-        if _is_folder(folder):
-            return folder
-    raise InvalidViewsError(f"there is neither a folder {images} nor {root / images}; check --images")
 
 
 def _within(folder: Path, name: str) -> _SearchFolder:

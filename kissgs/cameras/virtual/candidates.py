@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -167,13 +168,13 @@ class ViewScorer:
         """Render log size, log depth and centrality as the three colours, so that blending averages what is visible."""
         proxy = self._proxy
         log_depth = np.log(np.maximum(proxy.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3], 1e-12))
-        values = self._log_sizes, log_depth, CENTRE_SCALE * self._central
-        colours = np.stack([_to_sh0(value) for value in values], axis=1)
+        values = self._log_sizes, log_depth, CENTRE_SCALE * self._central  # colours from 0 to 1 stand for -30 to 30
+        colours = np.stack([(np.clip(value / 60 + 0.5, 0, 1) - 0.5) / SH_C0 for value in values], axis=1)
         coloured = replace(proxy, sh0=colours.astype(np.float32), shN=np.empty((len(proxy), 0, 3), np.float32))
         with Workers(1) as single:  # cameras are already rendered in parallel
             frame = draw(coloured, camera, black(), single, OPAQUE)
         alpha = 1 - frame.transmittance.astype(np.float64)
-        size, depth, centre = (_from_colour(frame.image[:, :, c] / np.maximum(alpha, 1e-6)) for c in range(3))
+        size, depth, centre = ((frame.image[:, :, c] / np.maximum(alpha, 1e-6) - 0.5) * 60 for c in range(3))
         near = (np.exp(depth) < TOO_NEAR * self.bounds.radius) * alpha
         return ViewStats(
             alpha=float(alpha.mean()),
@@ -184,30 +185,15 @@ class ViewScorer:
         )
 
 
-def _to_sh0(logarithm: np.ndarray) -> np.ndarray:
-    """Return the SH coefficient of a colour from 0 to 1 that stands for logarithms from -30 to 30."""
-    return (np.clip(logarithm / 60 + 0.5, 0, 1) - 0.5) / SH_C0
-
-
-def _from_colour(colour: np.ndarray) -> np.ndarray:
-    """Return the logarithm that a colour from 0 to 1 stands for."""
-    return (colour - 0.5) * 60
-
-
 def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.ndarray, " m"] | None = None) -> Splats:
     """Return evenly selected Gaussians ``among`` some, or all, without SH rest, enlarged to cover the same area."""
     count = len(splats) if among is None else len(among)
     step = max(1, -(-count // max_count))
     chosen = slice(None, None, step) if among is None else among[::step]
-    return replace(
-        splats,
-        means=np.ascontiguousarray(splats.means[chosen]),
-        quats=np.ascontiguousarray(splats.quats[chosen]),
-        scales=splats.scales[chosen] + np.float32(np.log(step) / 2),
-        opacities=np.ascontiguousarray(splats.opacities[chosen]),
-        sh0=np.ascontiguousarray(splats.sh0[chosen]),
-        shN=np.empty((-(-count // step), 0, 3), np.float32),
-    )
+    names = ("means", "quats", "opacities", "sh0")
+    arrays: dict[str, Any] = {name: np.ascontiguousarray(getattr(splats, name)[chosen]) for name in names}
+    scales = splats.scales[chosen] + np.float32(np.log(step) / 2)
+    return replace(splats, **arrays, scales=scales, shN=np.empty((-(-count // step), 0, 3), np.float32))
 
 
 def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[np.ndarray, " n"]:
@@ -220,9 +206,7 @@ def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[
     names = ("alpha", "log_size", "log_angle", "near", "centre")
     alpha, log_size, log_angle, near, centre = (np.array([getattr(view, name) for view in stats]) for name in names)
     enough = alpha >= 0.5 * alpha.max()
-    excess_size, excess_angle = (
-        np.maximum(value - np.quantile(value[enough], 0.1), 0) for value in (log_size, log_angle)
-    )
+    excess_size, excess_angle = (np.maximum(each - np.quantile(each[enough], 0.1), 0) for each in (log_size, log_angle))
     holes = 2 * (1 - alpha) if fills_image else np.maximum(0.5 - alpha / max(alpha.max(), 1e-9), 0)
     off_centre = np.maximum(1 - centre / 0.25, 0) if fills_image else np.zeros(len(stats))
     return np.asarray(1 - holes - 0.4 * excess_size - 0.35 * excess_angle - near - 0.5 * off_centre)
@@ -300,11 +284,9 @@ def _framing_camera(
 ) -> Camera:
     """Return a camera in ``direction`` that frames 98 % of the weight along each image axis, with a 15 % margin."""
     width, height = size
-    towards = look_at(
-        bounds.centre + direction, bounds.centre, bounds.up, fov=FIELD_OF_VIEW, width=width, height=height
-    )
-    right, down, _ = towards.viewmat[:3, :3]
     target, half_extents = bounds.centre.copy(), []
+    towards = look_at(target + direction, target, bounds.up, fov=FIELD_OF_VIEW, width=width, height=height)
+    right, down, _ = towards.viewmat[:3, :3]
     for axis in (right, down, direction):
         along = (means - bounds.centre) @ axis
         low, high = weighted_quantiles(along, weights, 0.01, 0.99)
