@@ -78,9 +78,8 @@ class Parts:
         remaining = list(parts)
         for _ in range(MAX_DRAWS):
             drawn = [(part, self._draw_camera(self.parts[part], rng)) for part in remaining]
-            for part, found in zip(
-                remaining, pool.map(lambda each: self._over_best_background(*each), drawn), strict=True
-            ):
+            found_views = pool.map(lambda each: self._over_best_background(*each), drawn)
+            for part, found in zip(remaining, found_views, strict=True):
                 if part not in best or found[0] < best[part][0]:
                     best[part] = found
             remaining = [part for part in remaining if best[part][0] > VISIBLE_PSNR]

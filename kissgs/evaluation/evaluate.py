@@ -189,8 +189,7 @@ def _samples(views: Views) -> list[_Sample]:
         sampled = view.sampled(math.ceil(max(view.camera.width, view.camera.height) / SIDE), (0, 0))
         with contextlib.suppress(KissgsError):
             photo = sampled.load_photo() / np.float32(255)
-            background = views.background if view.background is None else view.background
-            samples.append((replace(sampled, background=background), photo))
+            samples.append((replace(sampled, background=background_of(view, views.background)), photo))
     return samples
 
 
@@ -321,9 +320,8 @@ def _compare_views(
         other = render_clamped(candidate, view.camera, background, context)
         blank = blank and bool((image == np.clip(background, 0, 1)).all())
         comparison, changes = _compare(image, other, view.load_photo() if photographed else None, measure)
-        compared.append(
-            ViewComparison(view=view, comparison=comparison, patch_changes=changes, origin=reference.origin)
-        )
+        origin = reference.origin
+        compared.append(ViewComparison(view=view, comparison=comparison, patch_changes=changes, origin=origin))
     return Evaluation(
         against="photos" if photographed else "renderings",
         split=used,
@@ -349,10 +347,8 @@ def render_clamped(splats: Splats, camera: Camera, background: Float32[np.ndarra
 
 def _measure(flip: bool, lpips: bool, device: Device) -> Measure:
     perceptual: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {}
-    if flip:
-        perceptual["flip"] = Flip()
-    if lpips:
-        perceptual["lpips"] = Lpips(device)
+    perceptual |= {"flip": Flip()} if flip else {}
+    perceptual |= {"lpips": Lpips(device)} if lpips else {}
 
     def measure(image: np.ndarray, target: np.ndarray) -> tuple[ImageMetrics, Float64[np.ndarray, "h w"]]:
         mean, patches = ssim_with_patches(image, target)
@@ -383,12 +379,11 @@ def _compare(
     photo: Shaped[np.ndarray, "H W 3"] | None,
     measure: Measure,
 ) -> tuple[Comparison, PatchChanges]:
-    vs_reference, patches = measure(candidate, reference)
+    found, patches = measure(candidate, reference)
     if photo is None:
-        comparison = Comparison(reference=None, candidate=vs_reference, candidate_vs_reference=vs_reference)
-        return comparison, patches - 1
+        return Comparison(reference=None, candidate=found, candidate_vs_reference=found), patches - 1
     (before, patches_before), (after, patches_after) = measure(reference, photo), measure(candidate, photo)
-    comparison = Comparison(reference=before, candidate=after, candidate_vs_reference=vs_reference)
+    comparison = Comparison(reference=before, candidate=after, candidate_vs_reference=found)
     return comparison, patches_after - patches_before
 
 

@@ -96,7 +96,7 @@ def _cards(evaluation: Evaluation, before: int | None, after: int | None) -> Ite
     mean, to_reference = evaluation.mean, evaluation.mean.candidate_vs_reference.texts()
     if mean.reference is not None:
         of_reference, of_candidate = mean.reference.texts(), mean.candidate.texts()
-        change = f"{_change(mean)} dB: the reference has {of_reference.pop('PSNR')} dB"
+        change = f"{_signed(mean.change or 0.0, 2)} dB: the reference has {of_reference.pop('PSNR')} dB"
         yield "PSNR, candidate to photographs", f"{of_candidate.pop('PSNR')} dB", change
         for name, text in of_candidate.items():
             yield f"{name}, candidate to photographs", text, f"the reference has {of_reference[name]}"
@@ -128,12 +128,8 @@ def _worst_views(evaluation: Evaluation) -> str:
     return f"{text} Surroundings, {surroundings.views_used} ({surroundings.source}): {mean}; {surroundings.extremes}."
 
 
-def _change(comparison: Comparison) -> str:
-    return "" if comparison.change is None else _red_if_negative(format_metric(comparison.change, 2, signed=True))
-
-
-def _signed(change: float) -> str:
-    return _red_if_negative(format_metric(change, 4, signed=True))
+def _signed(change: float, digits: int = 4) -> str:
+    return _red_if_negative(format_metric(change, digits, signed=True))
 
 
 def _red_if_negative(text: str) -> str:
@@ -201,8 +197,8 @@ def html_report(
     patches = _worst_patches(evaluation, (reference, candidate), context)
     context.progress("html", 1.0)
     images = "Their images are" if len(shown) == len(evaluation.views) else f"Images of the worst {len(shown)} are"
-    summary = f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}. {images} below, the "
-    summary += "worst first."
+    used = f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}"
+    summary = f"{used}. {images} below, the worst first."
     if evaluation.note:
         summary += f" {evaluation.note[0].upper()}{evaluation.note[1:]}."
     return Template(files("kissgs.evaluation").joinpath("report.html").read_text(encoding="utf-8")).substitute(
@@ -306,7 +302,11 @@ def _section(
     layers = {"reference": to_bytes(reference), "candidate": to_bytes(candidate)}
     layers |= {} if photo is None else {"photograph": photo}
     layers["difference"] = heat_map(levels, full)
-    mark, sources = _mark(crop, levels.shape), {layer: _large(pixels) for layer, pixels in layers.items()}
+    mark, sources = _mark(crop, levels.shape), dict[str, str]()
+    for layer, pixels in layers.items():
+        image = Image.fromarray(pixels)
+        image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
+        sources[layer] = _data_uri(image, quality=QUALITY)
     figures = [_slider(name, sources["reference"], sources["candidate"], mark)]
     if photo is not None:
         figures.append(_figure(sources["photograph"], f"photograph {name}", "the photograph"))
@@ -329,7 +329,8 @@ def _numbers(comparison: Comparison) -> str:
     to_reference = f"candidate to reference {comparison.candidate_vs_reference.summary}"
     if comparison.reference is None:
         return to_reference
-    return f"candidate to photograph {comparison.candidate.summary}, change {_change(comparison)} dB · {to_reference}"
+    change = _signed(comparison.change or 0.0, 2)
+    return f"candidate to photograph {comparison.candidate.summary}, change {change} dB · {to_reference}"
 
 
 def _slider(name: str, reference: str, candidate: str, mark: str) -> str:
@@ -354,12 +355,6 @@ def _mark(crop: tuple[slice, slice], shape: tuple[int, ...]) -> str:
     edges = {"top": rows.start / shape[0], "left": columns.start / shape[1]}
     edges |= {"height": (rows.stop - rows.start) / shape[0], "width": (columns.stop - columns.start) / shape[1]}
     return f'<span class="mark" style="{"; ".join(f"{edge}: {100 * at:.2f}%" for edge, at in edges.items())}"></span>'
-
-
-def _large(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
-    image = Image.fromarray(pixels)
-    image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
-    return _data_uri(image, quality=QUALITY)
 
 
 def _lossless(pixels: UInt8[np.ndarray, "H W 3"]) -> str:

@@ -304,16 +304,11 @@ def _psnrs(evaluation: Evaluation) -> list[float]:
 
 def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:
     columns = {name: [getattr(value, name) for value in values] for name in ("ssim", "ms_ssim", "flip", "lpips")}
-    means: dict[str, Any] = {
-        name: None if None in column else sum(column) / len(column) for name, column in columns.items()
-    }
-    return ImageMetrics(psnr=_mean_decibels([value.psnr for value in values]), **means)
-
-
-def _mean_decibels(values: Sequence[float]) -> float:
-    if all(value == math.inf for value in values):
-        return math.inf
-    return sum(value if math.isnan(value) else min(value, MAX_VIEW_PSNR) for value in values) / len(values)
+    means: dict[str, Any] = {name: None if None in of else sum(of) / len(of) for name, of in columns.items()}
+    psnrs = [value.psnr for value in values]
+    bounded = [psnr if math.isnan(psnr) else min(psnr, MAX_VIEW_PSNR) for psnr in psnrs]
+    mean = math.inf if all(psnr == math.inf for psnr in psnrs) else sum(bounded) / len(bounded)
+    return ImageMetrics(psnr=mean, **means)
 
 
 def _point(point: Sequence[float]) -> str:
@@ -364,7 +359,7 @@ def psnr_of(evaluation: Evaluation) -> float:
     """
     evaluation = over_scene(evaluation)
     mean = evaluation.mean.candidate_vs_reference.psnr
-    worst = _mean_of_worst([squared_error(psnr) for psnr in _psnrs(evaluation)]) / MAX_ERROR_RATIO
+    worst = _worst([[squared_error(psnr) for psnr in _psnrs(evaluation)]]) / MAX_ERROR_RATIO
     return mean if math.isnan(mean) or worst <= 0 else min(mean, -10 * math.log10(worst))
 
 
@@ -428,16 +423,11 @@ def _errors_added(evaluation: Evaluation) -> list[float]:
 
 
 def _worst(groups: Sequence[Sequence[float]]) -> float:
-    """Return the largest :func:`_mean_of_worst` of groups of views; NaN if any error is."""
+    """Return the largest mean of the largest errors, :data:`WORST_SHARE` of a group of views; NaN if any error is."""
     if any(math.isnan(error) for errors in groups for error in errors):
         return math.nan
-    return max(_mean_of_worst(errors) for errors in groups)
-
-
-def _mean_of_worst(errors: Sequence[float]) -> float:
-    """Return the mean of the largest errors: :data:`WORST_SHARE` of them, at least one."""
-    count = math.ceil(WORST_SHARE * len(errors))
-    return sum(sorted(errors)[-count:]) / count
+    counts = [math.ceil(WORST_SHARE * len(errors)) for errors in groups]
+    return max(sum(sorted(errors)[-count:]) / count for errors, count in zip(groups, counts, strict=True))
 
 
 def squared_error(psnr: float) -> float:
