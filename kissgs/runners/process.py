@@ -83,9 +83,7 @@ def _opened(folder: Path) -> Iterator[int]:
 # Only a process of its own can be ended at any moment, be limited in its memory, and crash alone. Ray's worker
 # processes, below which it runs on a cluster, run many tasks and have no hard limit of memory.
 
-OUT_OF_MEMORY = re.compile(
-    "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.IGNORECASE
-)
+OUT_OF_MEMORY = re.compile("MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.I)
 """Messages of Python, C++, LLVM, OpenBLAS and the C library when an allocation fails; any of them may be the first."""
 
 NEAR_LIMIT = 0.8  # share of the memory limit above which a crash without such a message is attributed to the limit
@@ -139,20 +137,20 @@ class ItemProcess:
         threading.Thread(target=self._watch, args=(process.pid,), daemon=True).start()
         final: Outcome | None = None
         try:
-            for event in _events_of(process):
-                if isinstance(event, Outcome):
-                    final = event
+            assert process.stdout is not None  # noqa: S101
+            for event in json_lines(process.stdout):
+                if "outcome" in event:
+                    final = Outcome(**event["outcome"])
                 else:
-                    yield event
+                    yield event["stage"], event["fraction"], event["note"]
         finally:  # also if the caller asks for no more events
             status = self._finish(process, wait=final is not None)
         return status, final
 
     def _not_started(self, error: OSError) -> Outcome:
         reason, machine = (error.strerror or str(error)).lower(), socket.gethostname()
-        if self._item.folder is not None and isinstance(
-            error, (FileNotFoundError, NotADirectoryError, PermissionError)
-        ):
+        of_folder = isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError)
+        if self._item.folder is not None and of_folder:
             message = f"the machine {machine} cannot use the folder of the work: {reason}"
             return Outcome("error", code=NODE_UNUSABLE, message=message, log=str(self._item.folder))
         message = f"the machine {machine} could not start a process: {reason}"
@@ -172,15 +170,10 @@ class ItemProcess:
             self._process = process
             if self._killed:  # during the start
                 self._kill()
-        task = {
-            "parent": os.getpid(),
-            "function": self._item.function,
-            "arguments": self._item.arguments,
-            "memory_limit": self._item.memory_limit,
-        }
+        own = {name: getattr(self._item, name) for name in ("function", "arguments", "memory_limit")}
         assert process.stdin is not None  # noqa: S101
         with contextlib.suppress(BrokenPipeError):  # it has ended already, which the missing final event shows
-            process.stdin.write(json.dumps(task).encode() + b"\n")
+            process.stdin.write(json.dumps({"parent": os.getpid(), **own}).encode() + b"\n")
             process.stdin.flush()
         return process
 
@@ -232,12 +225,6 @@ class ItemProcess:
             return Outcome("crashed", code=CRASHED, message=f"the process was ended by {name}", log=text)
         message = "the work failed because of an error in kissgs; please report it"
         return Outcome("error", code=INTERNAL, message=message, log=text)
-
-
-def _events_of(process: subprocess.Popen[bytes]) -> Iterator[ProgressEvent | Outcome]:
-    assert process.stdout is not None  # noqa: S101
-    for event in json_lines(process.stdout):
-        yield Outcome(**event["outcome"]) if "outcome" in event else (event["stage"], event["fraction"], event["note"])
 
 
 def json_lines(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:

@@ -21,7 +21,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import ray
 from ray.exceptions import RayError, RayTaskError, TaskCancelledError
@@ -64,24 +64,18 @@ def main() -> None:
         send({"nodes": _nodes()})
         asyncio.run(Driver(send).run())
     except NoCluster:
+        # Replace this process by one that starts a cluster on this machine, with a token of its own: without one, Ray
+        # would let everyone in who reaches its ports, or write one to the home folder. It reads its environment when it
+        # is imported, so that this process cannot set one.
         os.dup2(out.fileno(), 1)
-        _begin_again()
+        protected = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        os.execve(sys.executable, [sys.executable, "-P", "-m", f"{__package__}.ray_driver", LOCAL], protected)
     except RunnerError as error:
         send({"failed": str(error)})
     finally:
         ray.shutdown()
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _begin_again() -> NoReturn:
-    """Replace this process by one that starts a cluster on this machine, with a token of its own.
-
-    Without a token, Ray would let everyone in who reaches its ports, or write one to the home folder. It reads its
-    environment when it is imported, so that this process cannot set one.
-    """
-    protected = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
-    os.execve(sys.executable, [sys.executable, "-P", "-m", f"{__package__}.ray_driver", LOCAL], protected)
 
 
 def _nodes() -> list[dict[str, Any]]:

@@ -119,13 +119,8 @@ def measure_file(
     if not seeing:
         return Sensitivity.none(len(splats), splats.sh_degree)
     uncertainty = VIEW_UNCERTAINTY[False] if settings.view_uncertainty is None else settings.view_uncertainty
-    found = measure_sensitivity(
-        concatenate([splats, others]),
-        WeightedCameras(seeing, [1.0] * len(seeing), black()),
-        view_uncertainty=uncertainty,
-        threads=threads,
-        progress=progress,
-    )
+    whole, weighted = concatenate([splats, others]), WeightedCameras(seeing, [1.0] * len(seeing), black())
+    found = measure_sensitivity(whole, weighted, view_uncertainty=uncertainty, threads=threads, progress=progress)
     own = _rows(found, slice(len(splats)))
     share = np.float32(len(seeing) / len(cameras))  # the mean is over the images of all cameras
     for values in (own.position_hessian, own.shape_hessian, own.color_weight, own.prior):
@@ -256,9 +251,8 @@ def make_levels(work: Path, layout: Layout, chunk: int, threads: int, progress: 
 
 def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: int) -> None:
     """Choose the cameras that sensitivity is measured with, and write them to a file."""
-    coarsest = concatenate(
-        [_read_level(work, layout, layout.levels - 1, layout.filled), read_environment(work, layout)]
-    )
+    level = _read_level(work, layout, layout.levels - 1, layout.filled)
+    coarsest = concatenate([level, read_environment(work, layout)])
     total = sum(layout.counts) + layout.environment
     least = min(MOST_VIEWS, VIEWS_PER_CHUNK * len(layout.filled))
     views = settings.sensitivity_views or max(default_view_count(total), least)
@@ -288,15 +282,9 @@ def make_file(
             sensitivity = measure_file(splats, others, cameras, file.level, settings, threads, progress)
             del others
         context = Context(threads, progress=progress)
-        plan = plan_encoding(
-            splats,
-            settings,
-            context,
-            sensitivity=sensitivity,
-            container=MODELS[layout.container],
-            groups=groups,
-            keep_costs=False,
-        )
+        model = MODELS[layout.container]
+        kept: dict[str, Any] = {"groups": groups, "keep_costs": False}
+        plan = plan_encoding(splats, settings, context, sensitivity=sensitivity, container=model, **kept)
         del sensitivity, splats
         encoded = write_files(layout.container, plan, settings, context)
         write_container(encoded.files, work / OUT / layout.path(file.name), overwrite=True)
@@ -322,10 +310,6 @@ def coarse_note(work: Path, layout: Layout) -> str:
     notes = (read_counts(work, file.name)["note"] for file in layout.files() if not file.level)
     note = next(filter(None, notes), "")
     return note.removesuffix(f": {STREAMED_REMEDY}") if layout.container == "sog" else note
-
-
-def environment_count(work: Path) -> int:
-    return sum(read_counts(work, ENVIRONMENT)["counts"])
 
 
 def read_environment(work: Path, layout: Layout) -> Splats:

@@ -35,6 +35,7 @@ from kissgs.streaming.layout import (
     Layout,
     keep_layout,
     leaves_file,
+    read_counts,
     read_layout,
     rows_file,
     work_folder,
@@ -338,9 +339,11 @@ def _partition(
     progress: Progress,
 ) -> Layout:
     """Partition the scene, unless that has been done."""
+    announced = "{} takes up to {} until the work is done"  # the size of the work folder
     if read_json(work / PARTITION) is not None:
         layout = read_layout(work)
-        _announce(work, needed_bytes(layout.source_count, layout.sh_degree), progress)
+        needed = needed_bytes(layout.source_count, layout.sh_degree)
+        progress("scratch", 1.0, announced.format(work, megabytes(needed)))
         return layout
     encode, before = settings.encode, _identity(source, settings, reading)
     try:
@@ -348,7 +351,7 @@ def _partition(
         blocks, count, sh_degree = _reader(source, reading, threads)
         needed = needed_bytes(count, sh_degree)
         check_space(work, needed)  # later, files are deleted as others are written, so that the folder hardly grows
-        _announce(work, needed, progress)
+        progress("scratch", 1.0, announced.format(work, megabytes(needed)))
         stages = with_time_left(progress, encode.rate_distortion)
         layout = build.partition(work, blocks, count, container, encode, stages)
         if not any(layout.counts):
@@ -362,11 +365,6 @@ def _partition(
     return layout
 
 
-def _announce(work: Path, needed: int, progress: Progress) -> None:
-    """Report the size of the work folder."""
-    progress("scratch", 1.0, f"{work} takes up to {megabytes(needed)} until the work is done")
-
-
 def _report(work: Path, layout: Layout) -> StreamedReport:
     out = work / OUT
     document = json.loads((out / layout.manifest).read_bytes())
@@ -376,9 +374,8 @@ def _report(work: Path, layout: Layout) -> StreamedReport:
         if path.exists():  # files without a visible Gaussian are not written
             sizes[file.level] += stored_bytes(path)
     environment = out / layout.path(ENVIRONMENT)
-    environment_count, environment_bytes = 0, 0
-    if environment.exists():
-        environment_count, environment_bytes = build.environment_count(work), stored_bytes(environment)
+    environment_count = sum(read_counts(work, ENVIRONMENT)["counts"]) if environment.exists() else 0
+    environment_bytes = stored_bytes(environment) if environment.exists() else 0
     pruned = sum(layout.counts) + layout.environment - document["counts"][0] - environment_count
     return StreamedReport(
         source_count=layout.source_count,

@@ -31,10 +31,8 @@ def row_bytes(sh_degree: int) -> int:
 
 def to_rows(splats: Splats) -> Float32[np.ndarray, "N F"]:
     """Return all numbers of each Gaussian in a row."""
-    rest = splats.shN.reshape(len(splats), 3 * splats.shN.shape[1])
-    return np.concatenate(
-        [splats.means, splats.quats, splats.scales, splats.opacities[:, None], splats.sh0, rest], axis=1
-    )
+    rest, logits = splats.shN.reshape(len(splats), 3 * splats.shN.shape[1]), splats.opacities[:, None]
+    return np.concatenate([splats.means, splats.quats, splats.scales, logits, splats.sh0, rest], axis=1)
 
 
 def from_rows(rows: Float32[np.ndarray, "N F"], *, antialiased: bool) -> Splats:
@@ -126,20 +124,16 @@ def level_errors(levels: Sequence[Splats]) -> list[float]:
 
 
 def _cameras(leaf: Splats) -> list[Camera]:
+    """Return cameras around the ball around the centre that holds most of the leaf, or its median Gaussian."""
     means = leaf.means.astype(np.float64)
     centre = np.median(means, axis=0)
-    radius = _radius(means - centre, leaf)
+    size = float(np.exp(np.median(leaf.scales.max(axis=1).astype(np.float64))))
+    radius = max(float(np.quantile(np.linalg.norm(means - centre, axis=1), INSIDE)), 2 * size)
     fov, up = 2 * np.arctan(1 / DISTANCE), np.array([0.1, 1.0, 0.2])
     return [
         look_at(centre + DISTANCE * radius * direction, centre, up, fov=fov, width=SIZE, height=SIZE)
         for direction in DIRECTIONS
     ]
-
-
-def _radius(offsets: Float64[np.ndarray, "N 3"], leaf: Splats) -> float:
-    """Return the radius of the ball around the centre that holds most of the leaf, or its median Gaussian."""
-    size = float(np.exp(np.median(leaf.scales.max(axis=1).astype(np.float64))))
-    return max(float(np.quantile(np.linalg.norm(offsets, axis=1), INSIDE)), 2 * size)
 
 
 # Levels of detail of one chunk: each leaf merged to half its Gaussians, again and again.
@@ -155,21 +149,19 @@ def chunk_levels(
     Returned are the levels, and the counts by level, the bounds and the errors of the leaves, as JSON.
     """
     order, edges = leaf_groups(chunk.means, leaf)
+
+    def leaf_levels(at: int) -> list[Splats]:
+        finest = chunk.select(order[edges[at] : edges[at + 1]])
+        counts = [max(1, -(-len(finest) >> level)) for level in range(1, levels)]
+        return [finest, *merged_levels(finest, counts, threads=1)]
+
     with Workers(threads) as pool:
-        leaves = pool.map(
-            lambda at: _leaf_levels(chunk.select(order[edges[at] : edges[at + 1]]), levels),
-            range(len(edges) - 1),
-            lambda fraction: progress("merge", MERGING * fraction),
-        )
+        numbers = range(len(edges) - 1)
+        leaves = pool.map(leaf_levels, numbers, lambda fraction: progress("merge", MERGING * fraction))
         errors = pool.map(level_errors, leaves, lambda fraction: progress("merge", MERGING + (1 - MERGING) * fraction))
     counts = [[len(own[level]) for own in leaves] for level in range(levels)]
     stated = {"counts": counts, "bounds": [bounds(concatenate(own)).tolist() for own in leaves], "errors": errors}
     return [concatenate([own[level] for own in leaves]) for level in range(levels)], stated
-
-
-def _leaf_levels(leaf: Splats, levels: int) -> list[Splats]:
-    counts = [max(1, -(-len(leaf) >> level)) for level in range(1, levels)]
-    return [leaf, *merged_levels(leaf, counts, threads=1)]
 
 
 def bounds(splats: Splats) -> Float64[np.ndarray, "2 3"]:
@@ -211,9 +203,8 @@ class Environment:
         if not len(positions):
             return none
         points = positions.astype(np.float64)
-        found = cls(
-            center := np.median(points, axis=0), FAR * float(np.median(np.linalg.norm(points - center, axis=1)))
-        )
+        center = np.median(points, axis=0)
+        found = cls(center, FAR * float(np.median(np.linalg.norm(points - center, axis=1))))
         far = points[found.contains(positions)] - center
         estimate = len(far) / len(points) * count
         if found.radius <= 0 or not FEWEST <= estimate <= min(MOST, LARGEST_SHARE * count):
