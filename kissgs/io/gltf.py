@@ -23,6 +23,7 @@ from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.positions import WORLD, from_world, origin_for
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
+from kissgs.io import spz as spz_format
 from kissgs.io.containers import is_file_name
 from kissgs.io.conventions import (
     Signs,
@@ -51,15 +52,6 @@ from kissgs.io.files import (
     whole_number,
 )
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
-from kissgs.io.spz import (
-    decode_positions,
-    encode_positions,
-    fractional_bits_for,
-    largest_spz,
-    read_spz,
-    read_spz_info,
-    write_spz,
-)
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
@@ -71,11 +63,8 @@ _OF_SURFACES = ("KHR_materials", "KHR_texture", "EXT_texture", "MSFT_texture", "
 """Beginnings of the names of extensions that say nothing about Gaussians."""
 
 _NEEDED = {
-    "EXT_mesh_gpu_instancing",
-    "KHR_node_visibility",
-    "EXT_meshopt_compression",
-    "KHR_meshopt_compression",
-    "KHR_draco_mesh_compression",
+    *("EXT_mesh_gpu_instancing", "KHR_node_visibility"),
+    *("EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_draco_mesh_compression"),
 }
 """Extensions that are not read, and without which the Gaussians are others, even in files that do not require them."""
 
@@ -363,7 +352,12 @@ def read_gltf(
             _apply(document, part.matrix, own)
             start += part.count
             progress("read", start / max(count, 1))
-    _turn_to_ply(splats)
+    mirror(splats, TO_PLY)
+    # Half a turn of each Gaussian about its own axis, which its ellipsoid does not show, so that a .ply written as floats
+    # gets back the same numbers.
+    w, x, y, z = (splats.quats[:, i].copy() for i in range(4))
+    for i, values in enumerate((z, -y, x, -w)):
+        splats.quats[:, i] = values
     whole = replace(splats, notes=tuple(notes))
     if (world := placed * TO_PLY).size and origin_for(world, whole.scales) != WORLD:
         whole = from_world(whole, world)
@@ -391,7 +385,10 @@ def _parts(document: _Document) -> tuple[list[_Part], list[str]]:
                 left_out["meshes without Gaussians"] = None
                 continue
             parts.append(part := _part(document, primitive, matrix))
-            left_out |= dict.fromkeys(_not_drawn(document, primitive))
+            splatting = document.value(document.extensions(primitive), EXTENSION, dict)
+            left_out |= dict.fromkeys(key for key in ("indices", "targets") if key in primitive)
+            orders = {key: splatting.get(key, usual) for key, usual in _USUAL.items()}
+            left_out |= {f"{key} {str(found)[:40]!r}": None for key, found in orders.items() if found != _USUAL[key]}
             if part.spz is None:
                 left_out |= dict.fromkeys(name for name in part.attributes if name not in _ATTRIBUTES)
     if not parts:
@@ -400,13 +397,6 @@ def _parts(document: _Document) -> tuple[list[_Part], list[str]]:
             "export it with a node for each mesh"
         )
     return parts, list(left_out)
-
-
-def _not_drawn(document: _Document, primitive: dict[str, Any]) -> list[str]:
-    """Return what a primitive with Gaussians says of drawing them that is not followed."""
-    splatting = document.value(document.extensions(primitive), EXTENSION, dict)
-    orders = [f"{key} {str(splatting[key])[:40]!r}" for key in _USUAL if splatting.get(key, _USUAL[key]) != _USUAL[key]]
-    return [*(key for key in ("indices", "targets") if key in primitive), *orders]
 
 
 def _part(document: _Document, primitive: dict[str, Any], matrix: Float64[np.ndarray, "4 4"]) -> _Part:
@@ -424,7 +414,7 @@ def _part(document: _Document, primitive: dict[str, Any], matrix: Float64[np.nda
         if name not in SPZ_EXTENSIONS:
             raise document.unread(name)
         view = document.value(document.value(compressions, name, dict), "bufferView", int)
-        header = read_spz_info(bytes(document.view(view, most=512)))
+        header = spz_format.read_spz_info(bytes(document.view(view, most=512)))
         if count not in (None, header.count):
             raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
         return _Part(attributes, matrix, header.count, header.sh_degree, view, header.antialiased)
@@ -463,7 +453,8 @@ def _read_attributes(document: _Document, part: _Part, out: Splats) -> None:
 
 def _read_spz(document: _Document, view: int, out: Splats) -> tuple[str, ...]:
     """Read a ``.spz`` inside the file into ``out``, in glTF's axes; return its notes."""
-    stored = read_spz(bytes(document.view(view, most=largest_spz(len(out)))), ReadOptions(max_gaussians=len(out)))
+    data = bytes(document.view(view, most=spz_format.largest_spz(len(out))))
+    stored = spz_format.read_spz(data, ReadOptions(max_gaussians=len(out)))
     mirror(stored, TO_PLY)
     for name in ATTRIBUTES:
         if name != "shN":
@@ -486,18 +477,6 @@ def _apply(document: _Document, matrix: Float64[np.ndarray, "4 4"], out: Splats)
             f"{document.name} has a node that mirrors or stretches its Gaussians; apply the transform before the export"
         )
     move(out, rotation, scale, matrix[:3, 3])
-
-
-def _turn_to_ply(splats: Splats) -> None:
-    """Turn a scene from glTF's axes to those of a ``.ply``, half a turn about z.
-
-    The rotation of each Gaussian follows by half a turn of its own about the same axis, which its ellipsoid does not
-    show, so that a ``.ply`` written as floats gets back the same numbers.
-    """
-    mirror(splats, TO_PLY)
-    w, x, y, z = (splats.quats[:, i].copy() for i in range(4))
-    for i, values in enumerate((z, -y, x, -w)):
-        splats.quats[:, i] = values
 
 
 # Writing of ``.glb``: one primitive, all attributes as floats or as ``.spz`` inside.
@@ -548,9 +527,9 @@ def write_spz_glb(
     """
     ends = _ends(splats)
     packed = io.BytesIO()  # its size stands before it
-    notes = write_spz(packed, splats, progress=progress)
-    bits = fractional_bits_for(float(np.abs(splats.means).max()))
-    decode_positions(encode_positions(ends, bits), bits, ends)  # as they are read: in steps
+    notes = spz_format.write_spz(packed, splats, progress=progress)
+    bits = spz_format.fractional_bits_for(float(np.abs(splats.means).max()))
+    spz_format.decode_positions(spz_format.encode_positions(ends, bits), bits, ends)  # as they are read: in steps
     columns = [column for column in _columns(splats) if column.name not in _NOT_IN_SPZ]
     body = packed.getbuffer()
     view = {"buffer": 0, "byteOffset": 0, "byteLength": len(body)}
