@@ -97,7 +97,9 @@ def _serve(scene: str, common: SceneOptions, port: int, browser: bool) -> None:
     with PageServer(_prepare(scene, common), port) as server, contextlib.suppress(Interrupted):
         sys.stdout.write(f"{server.url}  (Ctrl-C ends)\n")
         sys.stdout.flush()
-        if browser and _has_display():
+        # Whether a browser with windows can open; one in the terminal would cover the address.
+        windows = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        if browser and windows:
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
         server.serve_forever()
 
@@ -145,11 +147,6 @@ def _warn(scene: str, folder: StreamedFolder) -> None:
 def _listed(names: tuple[str, ...]) -> str:
     others = len(names) - 1
     return names[0] + (f" and {others} more file{'s' * (others > 1)}" if others else "")
-
-
-def _has_display() -> bool:
-    """Whether a browser with windows can open; one in the terminal would cover the address."""
-    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 # ``kissgs render``: render images and animations of a scene. Heavy imports are deferred until it runs.

@@ -106,14 +106,13 @@ class Parts:
                 frame = draw(scene, camera.at_most(THUMBNAIL), np.zeros(3, np.float32), single)
                 thumbnails.append((frame.image, frame.transmittance[:, :, None]))
         (image, transmittance), (other_image, other_transmittance) = thumbnails
-        return [
-            _psnr(np.clip(image + grey * transmittance, 0, 1), np.clip(other_image + grey * other_transmittance, 0, 1))
-            for grey in backgrounds
-        ]
-
-
-def _psnr(one: Float32[np.ndarray, "H W 3"], other: Float32[np.ndarray, "H W 3"]) -> float:
-    return -10 * float(np.log10(max(float(np.mean(np.square(one - other), dtype=np.float64)), 1e-12)))
+        psnrs = list[float]()
+        for grey in backgrounds:
+            with_it = np.clip(image + grey * transmittance, 0, 1)
+            without = np.clip(other_image + grey * other_transmittance, 0, 1)
+            error = float(np.mean(np.square(with_it - without), dtype=np.float64))
+            psnrs.append(-10 * float(np.log10(max(error, 1e-12))))
+        return psnrs
 
 
 # The encoder has cameras of its own (:mod:`kissgs.cameras.virtual`) and stores coarsely what these do not see;
@@ -169,15 +168,14 @@ def farther(views: Views, distance: float) -> Views:
     if distance == 1:
         return views
     source = f"{views.source}, at {distance:g} times the distance"
-    return replace(views, test=tuple(_farther(view, distance) for view in views.test), source=source)
-
-
-def _farther(view: View, distance: float) -> View:
-    assert view.target is not None  # noqa: S101  every drawn view has one
-    viewmat = view.camera.viewmat.copy()
-    # A point x has camera coordinates R x + t; the target's are in front of the camera, and scale with the distance.
-    viewmat[:3, 3] += (distance - 1) * (viewmat[:3, :3] @ view.target + viewmat[:3, 3])
-    return replace(view, camera=replace(view.camera, viewmat=viewmat))
+    moved = list[View]()
+    for view in views.test:
+        assert view.target is not None  # noqa: S101  every drawn view has one
+        viewmat = view.camera.viewmat.copy()
+        # A point x has camera coordinates R x + t; the target's are in front of the camera, and scale with distance.
+        viewmat[:3, 3] += (distance - 1) * (viewmat[:3, :3] @ view.target + viewmat[:3, 3])
+        moved.append(replace(view, camera=replace(view.camera, viewmat=viewmat)))
+    return replace(views, test=tuple(moved), source=source)
 
 
 def _draw_views(

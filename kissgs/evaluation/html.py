@@ -119,15 +119,6 @@ def _cards(evaluation: Evaluation, before: int | None, after: int | None) -> Ite
         yield "Gaussians", f"{evaluation.candidate_count:,}", counts
 
 
-def _worst_views(evaluation: Evaluation) -> str:
-    """Return the worst views, those of the surroundings included, as plain text to be escaped."""
-    text, surroundings = f"Candidate to reference: {evaluation.extremes}.", evaluation.surroundings
-    if surroundings is None:
-        return text
-    mean = surroundings.mean.candidate_vs_reference.summary
-    return f"{text} Surroundings, {surroundings.views_used} ({surroundings.source}): {mean}; {surroundings.extremes}."
-
-
 def _signed(change: float, digits: int = 4) -> str:
     return _red_if_negative(format_metric(change, digits, signed=True))
 
@@ -185,7 +176,10 @@ def html_report(
     """Return an evaluation as one HTML page with images of the worst views, then of the worst surroundings."""
     shown = _worst_first(evaluation)[:MAX_VIEWS]
     entries = [(f"view-{i}", evaluation, evaluation.views[i]) for i in shown]
+    beyond = ""
     if (around := evaluation.surroundings) is not None:
+        mean = around.mean.candidate_vs_reference.summary
+        beyond = f" Surroundings, {around.views_used} ({around.source}): {mean}; {around.extremes}."
         worst = _worst_first(around)[:MAX_SURROUNDINGS]
         entries += [(f"surroundings-{i}", around, around.views[i]) for i in worst]
     lowest = min((compared for _, _, compared in entries), key=lambda compared: compared.ranking_psnr)
@@ -211,7 +205,7 @@ def html_report(
             for name, value, remark in _cards(evaluation, reference.bytes, candidate.bytes)
         ),
         table=_views_table(evaluation, shown),
-        worst_views=escape(_worst_views(evaluation)),
+        worst_views=escape(f"Candidate to reference: {evaluation.extremes}.{beyond}"),
         sections="\n".join([patches, *sections]),
         colours=", ".join("#" + bytes(color).hex() for color in INFERNO),
         quality=QUALITY,

@@ -47,7 +47,14 @@ def parse_json(
         raise error(f"{name} has more than {most:,} values, which is the limit; export the scene again")
     try:
         document = json.loads(data.decode("utf-8-sig"), parse_int=parse_int, parse_constant=_refuse_constant)
-        _check_depth(document)
+        level = [document]
+        for _ in range(MAX_DEPTH + 1):
+            nested = [
+                each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)
+            ]
+            level = [value for values in nested for value in values]
+        if any(isinstance(each, dict | list) for each in level):
+            raise ValueError(f"nested more than {MAX_DEPTH} deep")
     except (ValueError, RecursionError) as problem:
         raise error(f"{name} is not readable JSON; export the scene again") from problem
     return document
@@ -63,15 +70,6 @@ def whole_number(value: object, least: int, most: int) -> int | None:
 def is_number(value: object, limit: float) -> bool:
     """Whether a value of JSON is a number, not true or false, that is nearer to zero than ``limit``."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < limit
-
-
-def _check_depth(document: object) -> None:
-    level = [document]
-    for _ in range(MAX_DEPTH + 1):
-        nested = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
-        level = [value for values in nested for value in values]
-    if any(isinstance(each, dict | list) for each in level):
-        raise ValueError(f"nested more than {MAX_DEPTH} deep")
 
 
 def _refuse_constant(name: str) -> NoReturn:

@@ -353,8 +353,8 @@ def read_gltf(
             start += part.count
             progress("read", start / max(count, 1))
     mirror(splats, TO_PLY)
-    # Half a turn of each Gaussian about its own axis, which its ellipsoid does not show, so that a .ply written as floats
-    # gets back the same numbers.
+    # Half a turn of each Gaussian about its own axis, which its ellipsoid does not show: a .ply written as floats gets
+    # back the same numbers.
     w, x, y, z = (splats.quats[:, i].copy() for i in range(4))
     for i, values in enumerate((z, -y, x, -w)):
         splats.quats[:, i] = values
@@ -453,7 +453,8 @@ def _read_attributes(document: _Document, part: _Part, out: Splats) -> None:
 
 def _read_spz(document: _Document, view: int, out: Splats) -> tuple[str, ...]:
     """Read a ``.spz`` inside the file into ``out``, in glTF's axes; return its notes."""
-    data = bytes(document.view(view, most=spz_format.largest_spz(len(out))))
+    most = 2 * spz_format.MAX_EXTENSION_BYTES + 2 * len(out) * spz_format.LARGEST_ROW  # which no such file exceeds
+    data = bytes(document.view(view, most=most))
     stored = spz_format.read_spz(data, ReadOptions(max_gaussians=len(out)))
     mirror(stored, TO_PLY)
     for name in ATTRIBUTES:

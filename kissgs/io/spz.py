@@ -224,7 +224,7 @@ rotations of its Gaussians in opposite directions, so that it is unknown how fil
 
 DEFAULT_FRAME, PLY_FRAME = "RUB", "RDF"
 
-_LARGEST_ROW = 20 + 3 * _COEFFICIENTS[-1]  # bytes of a Gaussian before compression, with all SH coefficients
+LARGEST_ROW = 20 + 3 * _COEFFICIENTS[-1]  # bytes of a Gaussian before compression, with all SH coefficients
 
 _MAX_FRACTIONAL_BITS = 31
 
@@ -282,11 +282,6 @@ def read_spz(
         if info.stored_degree > info.sh_degree:
             unread.insert(0, f"the SH coefficients of degree {info.stored_degree}")
         return replace(splats, notes=(f"left out: {listed(unread)}",)) if unread else splats
-
-
-def largest_spz(count: int) -> int:
-    """Return a size in bytes that no file of ``count`` Gaussians exceeds."""
-    return 2 * MAX_EXTENSION_BYTES + 2 * count * _LARGEST_ROW
 
 
 def _read_header(opened: SceneFile) -> SpzInfo:

@@ -370,7 +370,11 @@ def _load_yaml(data: bytes) -> Any:  # noqa: ANN401
         parent, items = waiting[-1]
         value: Any
         if isinstance(event, yaml.CollectionEndEvent):
-            value = _mapping(items) if isinstance(parent, yaml.MappingStartEvent) else items
+            value = items
+            if isinstance(parent, yaml.MappingStartEvent):
+                if not all(isinstance(key, str) and key != "<<" for key in items[::2]):
+                    raise yaml.YAMLError("a key is no text, or merges mappings")
+                value = dict(zip(items[::2], items[1::2], strict=True))
             event, items = waiting.pop()[0], waiting[-1][1]
         elif isinstance(event, yaml.AliasEvent):
             if event.anchor not in anchors:
@@ -387,13 +391,6 @@ def _load_yaml(data: bytes) -> Any:  # noqa: ANN401
     if len(documents) > 1:
         raise yaml.YAMLError("more than one document")
     return documents[0] if documents else None
-
-
-def _mapping(items: list[Any]) -> dict[str, Any]:
-    keys = items[::2]
-    if not all(isinstance(key, str) and key != "<<" for key in keys):
-        raise yaml.YAMLError("a key is no text, or merges mappings")
-    return dict(zip(keys, items[1::2], strict=True))
 
 
 def _value(text: str) -> bool | float | str | None:

@@ -95,7 +95,8 @@ class Admission:
                     raise self._full(size)
                 # Its upload, and its decoded scene, which can be decoded again.
                 self.store.monitor.check_files()
-                self.storage.reclaim(oldest.id)
+                for path in self.storage.reclaimable_files(oldest.id):
+                    self.storage.discard(path)
                 left = self.storage.job_bytes(oldest.id)
                 self.store.update(oldest.number, upload_kept=False, reclaimable_bytes=0, disk_bytes=left)
             self._reserved += size

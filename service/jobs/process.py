@@ -92,7 +92,8 @@ class JobRunners:
 
         It is not started again when its node is lost: the database counts the starts of jobs.
         """
-        requested = self.request(trains=_trains(task))
+        wanted = kissgs.Settings.model_validate(task.get("settings", {}))
+        requested = self.request(trains=wanted.compact.enabled or bool(wanted.finetune.enabled))
         threads = self.settings.job_threads if self.runner_of(task) is self.local else int(requested.cpus)
         return WorkItem(
             f"{__package__}.{task['function']}",
@@ -104,11 +105,6 @@ class JobRunners:
             files=tuple(task["files"]),
             retries=0,
         )
-
-
-def _trains(task: dict[str, Any]) -> bool:
-    settings = kissgs.Settings.model_validate(task.get("settings", {}))
-    return settings.compact.enabled or bool(settings.finetune.enabled)
 
 
 class JobProcess:

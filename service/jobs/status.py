@@ -97,13 +97,17 @@ _OF_RESULTS = ("source_format", "compacted", "finetuning", "invisible", "cleaned
 
 def job_status(job: Job, queue: Queue) -> JobStatus:
     waits, runs, result = job.state == State.QUEUED, job.state == State.RUNNING, job.result or {}
+    estimate = None
+    if waits or runs:
+        seconds = queue.seconds_left(job)
+        estimate = Estimate(seconds_left=round(seconds, 1), ready_at=as_datetime(queue.now + seconds))
     return JobStatus(
         id=job.id,
         name=job.name,
         state=State(job.state),
         position=queue.position(job) if waits else None,
         progress=Progress(stage=job.stage, fraction=job.fraction, note=job.note) if runs and job.stage else None,
-        estimate=_estimate(job, queue) if waits or runs else None,
+        estimate=estimate,
         options=JobOptions.stored(job.options),
         upload_bytes=job.upload_bytes,
         gaussians=job.gaussians,
@@ -126,11 +130,6 @@ def _kind_without_limit(job: Job) -> str:
         return job.preset
     open_to_tuning = job.options["finetune"]["enabled"] is None and can_train()
     return job.preset.removesuffix(TIMED) + (FINETUNED if open_to_tuning else "")
-
-
-def _estimate(job: Job, queue: Queue) -> Estimate:
-    seconds = queue.seconds_left(job)
-    return Estimate(seconds_left=round(seconds, 1), ready_at=as_datetime(queue.now + seconds))
 
 
 def _sizes(job: Job) -> Sizes | None:

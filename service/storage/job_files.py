@@ -137,10 +137,6 @@ class JobStorage:
     def reclaimable_bytes(self, job_id: str) -> int:
         return sum(path.stat().st_size for path in self.reclaimable_files(job_id))
 
-    def reclaim(self, job_id: str) -> None:
-        for path in self.reclaimable_files(job_id):
-            self.discard(path)
-
     def upload_name(self, job_id: str) -> str | None:
         path = self.upload(job_id)
         return path.name if path.is_file() else None

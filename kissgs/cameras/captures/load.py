@@ -67,7 +67,11 @@ def load_views(
             ratio than their cameras, or an argument is out of range.
         UnsupportedError: a camera has an unsupported model, such as a fisheye.
     """
-    _check_arguments(scale, resolution, hold_out)
+    for name, value, least in (("scale", scale, 1), ("resolution", resolution, 1), ("hold_out", hold_out, 0)):
+        if value is not None and value < least:
+            raise InvalidViewsError(f"{name} must be {least} or more, not {value}")
+    if hold_out == 1:
+        raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
     path = Path(path)
     try:
         capture = _read_capture(path)
@@ -92,14 +96,6 @@ def load_views(
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
     return Views(train, test, background, f"{capture.source}, no photographs", note, moves)
-
-
-def _check_arguments(scale: int | None, resolution: int | None, hold_out: int) -> None:
-    for name, value, least in (("scale", scale, 1), ("resolution", resolution, 1), ("hold_out", hold_out, 0)):
-        if value is not None and value < least:
-            raise InvalidViewsError(f"{name} must be {least} or more, not {value}")
-    if hold_out == 1:
-        raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
 
 
 def _read_capture(path: Path) -> Capture:
@@ -180,11 +176,8 @@ def _fits(size: tuple[int, int], nominal: tuple[int, int]) -> bool:
 
 
 def _reduced(size: tuple[int, int], resolution: int) -> tuple[int, int]:
-    longer = max(size)
-    if longer <= resolution:
-        return size
-    factor = longer / resolution
-    return max(1, int(size[0] / factor)), max(1, int(size[1] / factor))
+    factor = max(size) / resolution
+    return size if factor <= 1 else (max(1, int(size[0] / factor)), max(1, int(size[1] / factor)))
 
 
 def _folders(photos: Sequence[FoundPhoto]) -> str:

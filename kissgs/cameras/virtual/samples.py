@@ -188,7 +188,11 @@ def sensitivity_cameras(
     if views is None or not views.train:
         side = size * 4 // 5
         virtual = scene_views(splats, context, width=side, height=side, count=count)
-        cameras = [_widened(view.camera) if n % 2 else view.camera for n, view in enumerate(virtual.all)]
+        cameras = [view.camera for view in virtual.all]
+        for n in range(1, len(cameras), 2):  # a wider field of view
+            K = cameras[n].K.copy()
+            K[[0, 1], [0, 1]] *= WIDE_FOCAL_SCALE
+            cameras[n] = Camera(cameras[n].viewmat, K, cameras[n].width, cameras[n].height)
         return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
     captured = [view.camera for view in views.train]
     chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
@@ -199,13 +203,6 @@ def sensitivity_cameras(
     cameras = [*selected, *(view.camera for view in virtual.all)]
     weights = [1.0] * len(selected) + [weight] * len(virtual.all)
     return WeightedCameras(cameras, weights, views.background, captured=len(selected))
-
-
-def _widened(camera: Camera) -> Camera:
-    """Return the camera with a shorter focal length, that is, a wider field of view."""
-    K = camera.K.copy()
-    K[[0, 1], [0, 1]] *= WIDE_FOCAL_SCALE
-    return Camera(camera.viewmat, K, camera.width, camera.height)
 
 
 # Random poses, from where photographs might have been taken, to train or to measure losses with.

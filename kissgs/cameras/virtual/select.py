@@ -116,18 +116,14 @@ def score_candidates(splats: Splats, size: tuple[int, int], pool: Workers, progr
     inside, orbits = list(inside_cameras(bounds, thumbnail_size)), list(orbit_cameras(bounds, thumbnail_size))
     cameras = [*inside, *orbits]
     stats = scorer.measure(cameras)
-    if _is_enclosed(stats[: len(inside)]):
+    # Enclosed if images are full in all directions from three or more positions inside the scene.
+    clear = np.reshape([view.alpha - view.near for view in stats[: len(inside)]], (-1, INSIDE_DIRECTIONS)).mean(axis=1)
+    if (clear > FULL_ALPHA).sum() >= 3:
         return ScoredCandidates(scorer, "enclosed", cameras, stats, _outside_penalty(cameras, scorer))
     if _has_background(stats[len(inside) :], thumbnail_size, scorer):
         return ScoredCandidates(scorer, "background", cameras, stats, np.zeros(len(cameras)))
     cameras = list(object_cameras(proxy, bounds, thumbnail_size))
     return ScoredCandidates(scorer, "object", cameras, scorer.measure(cameras), np.zeros(len(cameras)))
-
-
-def _is_enclosed(inside: list[ViewStats]) -> bool:
-    """Whether images are full in all directions from three or more positions inside the scene."""
-    unobstructed = np.reshape([view.alpha - view.near for view in inside], (-1, INSIDE_DIRECTIONS)).mean(axis=1)
-    return bool((unobstructed > FULL_ALPHA).sum() >= 3)
 
 
 def _has_background(orbits: list[ViewStats], size: tuple[int, int], scorer: ViewScorer) -> bool:
