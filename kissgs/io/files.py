@@ -218,7 +218,9 @@ class BinaryWriter(Protocol):
 
 
 @contextlib.contextmanager
-def open_scene_file(source: Path | bytes, remedy: str = "name a scene file") -> Iterator[SceneFile]:
+def open_scene_file(
+    source: Path | bytes, remedy: str = "; name a scene file", error_class: type[KissgsError] = InvalidSceneError
+) -> Iterator[SceneFile]:
     """Open a file, or the bytes of one; ``remedy`` is what to do where there is no file, for messages."""
     if isinstance(source, bytes):
         yield SceneFile("the data", io.BytesIO(source), len(source))
@@ -226,11 +228,11 @@ def open_scene_file(source: Path | bytes, remedy: str = "name a scene file") -> 
     try:
         if not source.is_file():  # before opening, because opening a named pipe would wait for its writer
             reason = "it is a folder or a device" if source.exists() else "there is no such file"
-            raise InvalidSceneError(f"cannot read {source}: {reason}; {remedy}")
+            raise error_class(f"cannot read {source}: {reason}{remedy}")
         with source.open("rb") as file:
             yield SceneFile(source.name, file, os.fstat(file.fileno()).st_size)
     except OSError as error:
-        raise InvalidSceneError(f"cannot read {source}: {reason_of(error)}") from error
+        raise error_class(f"cannot read {source}: {reason_of(error)}") from error
 
 
 def listed(names: Sequence[str]) -> str:

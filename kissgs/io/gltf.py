@@ -261,7 +261,7 @@ class _Document:
             raise UnsupportedError(f"{self.name} names a buffer outside its folder; put the file beside it")
         if self._folder is None:
             raise UnsupportedError(f"{self.name} needs the file {path[:80]!r} beside it; give the path, or a .glb")
-        with open_scene_file(self._folder / path, "put the buffer there") as opened:
+        with open_scene_file(self._folder / path, "; put the buffer there") as opened:
             return opened.read(0, opened.size)
 
 

@@ -193,7 +193,7 @@ class _Reader:
     """Reader of values from a little-endian file; ``left`` is the number of bytes not yet read."""
 
     path: Path
-    file: io.BufferedReader
+    file: io.BufferedIOBase
     left: int
 
     def unpack(self, form: struct.Struct) -> tuple:

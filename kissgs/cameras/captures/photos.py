@@ -20,23 +20,16 @@ from pydantic import ValidationError
 from kissgs.cameras.photographs import EXTENSIONS, NO_DISTORTION, Distortion, Lens
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
+from kissgs.io.files import open_scene_file, reason_of
 
 MAX_JSON_BYTES = 1 << 28  # maximum bytes of a JSON file; ten thousand cameras take about 10 MB
 
 
 @contextlib.contextmanager
-def open_file(path: Path) -> Iterator[tuple[io.BufferedReader, int]]:
+def open_file(path: Path) -> Iterator[tuple[io.BufferedIOBase, int]]:
     """Open a regular file for reading; yield it and its size in bytes."""
-    try:
-        if not path.is_file():  # opening a named pipe would wait for its writer
-            reason = "it is a folder or a device" if path.exists() else "there is no such file"
-            raise InvalidViewsError(f"cannot read {path}: {reason}")
-        with path.open("rb") as file:
-            size = file.seek(0, io.SEEK_END)
-            file.seek(0)
-            yield file, size
-    except OSError as error:
-        raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
+    with open_scene_file(path, "", InvalidViewsError) as opened:
+        yield opened.file, opened.size
 
 
 def read_json(path: Path) -> bytes:
@@ -287,7 +280,7 @@ def _list(folder: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
     except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a name with a NUL character
         names = []
     except OSError as error:
-        raise InvalidViewsError(f"cannot read {folder}: {(error.strerror or str(error)).lower()}") from error
+        raise InvalidViewsError(f"cannot read {folder}: {reason_of(error)}") from error
     stems: dict[str, list[str]] = {}
     for file in names:
         if Path(file).suffix.lower() in EXTENSIONS:
