@@ -26,10 +26,7 @@ if TYPE_CHECKING:
 
 BLOCK_BYTES = 1 << 18  # size of the blocks in which files are uploaded and downloaded
 RETRY_SECONDS = 300.0  # time for which requests to an overloaded or restarting service are repeated
-
-FIRST_RETRY_SECONDS = 8.0
-"""Time for which requests to a service that has never answered are repeated: its address may be wrong."""
-
+FIRST_RETRY_SECONDS = 8.0  # the same for a service that has never answered: its address may be wrong
 WAIT = "wait for server"  # stage in which a request is repeated after a while
 
 T = TypeVar("T")

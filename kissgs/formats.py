@@ -24,8 +24,7 @@ class Format:
     """Format of scenes."""
 
     module: str  # module that has the Codec as FORMAT, of streamed scenes in STREAMED
-    endings: tuple[str, ...] = ()
-    """Endings of files that are read, the usual one first; they decide where the content is not recognised."""
+    endings: tuple[str, ...] = ()  # that are read, the usual one first; they decide where the content does not
     written: tuple[str, ...] = ()  # endings of files that are written, containers by compress and others by save
     is_container: bool = False  # whether the metadata describes a scene without decoding an image
     manifest: str | None = None  # name of the manifest of a scene in levels of detail
@@ -72,8 +71,7 @@ FOLDER_ENDING = ".container"  # ending of folders that the command line names af
 WRITTEN = tuple(ending for each in FORMATS.values() if not each.is_container for ending in each.written)
 """Endings that ``save`` and ``kissgs convert`` write."""
 
-OUTPUT_FORMATS = tuple(ending.removeprefix(".") for ending in WRITTEN)
-"""Names of the formats that these endings stand for."""
+OUTPUT_FORMATS = tuple(ending.removeprefix(".") for ending in WRITTEN)  # what these endings stand for
 
 UPLOADS = {name: each.endings[0] for name, each in FORMATS.items() if each.endings}
 """Formats of one file, which can be sent to a service, and their usual endings."""

@@ -38,8 +38,7 @@ from kissgs.sog.metadata import read_layout
 from kissgs.sogxt import decode as sogxt
 from kissgs.sogxt.container import zip_bytes
 
-PAGE_GAUSSIANS = 1_000_000
-"""Largest number of Gaussians of the level that a page of one file gets, so that phones open it."""
+PAGE_GAUSSIANS = 1_000_000  # largest number in the level that a page of one file gets, so that phones open it
 
 
 @dataclass(frozen=True)
@@ -233,8 +232,7 @@ def _stem(source: Path | bytes) -> str:
 # as text, in an order in which each comes after those that it imports; ``web_decoder/standalone.js`` makes a blob of
 # each, and their imports name the blobs' addresses.
 
-_COMMENT = re.compile(r"/\*\*.*?\*/", re.DOTALL)
-"""Comments with types and examples, whose imports are none; minified files have no others than licences."""
+_COMMENT = re.compile(r"/\*\*.*?\*/", re.DOTALL)  # with examples, whose imports are none; not of minified files
 
 _IMPORT = re.compile(r"""(\b(?:from|import)\s*\(?\s*)(["'])([^"'\n]+)\2""")
 _WORKER = re.compile(r"""new URL\("([^"]+)", import\.meta\.url\)""")

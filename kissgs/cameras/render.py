@@ -44,8 +44,7 @@ class Orbit:
     radius: float  # distance of the cameras from the target, world units; 0 to look around from the target itself
     elevation: float  # elevation of the cameras as seen from the target, radians
     up: Vec3
-    mid_azimuth: float = 0.0
-    """Azimuth of the middle of the arc; of a full circle, the azimuth with the best view; radians."""
+    mid_azimuth: float = 0.0  # of the middle of the arc; on a full circle, that of the best view; radians
     sweep: float = 2 * np.pi  # length of the arc, radians; 2 pi for a full circle
 
     @property
@@ -107,10 +106,7 @@ def _swing_phase(frame: int, frames: int) -> int:
 
 COARSE_STEPS = 24  # number of thumbnails along each circle
 FINE_STEPS = 72  # number of thumbnails along the circle that is selected
-
-FULL_CIRCLE_TOLERANCE = 0.15
-"""How much lower than on an arc the scores on a full circle may be: to pass a weak view is better than to turn back."""
-
+FULL_CIRCLE_TOLERANCE = 0.15  # of scores on a full circle: to pass a weak view is better than to turn back
 MIN_SWEEP = float(np.radians(30))  # shortest arc, radians; on a shorter one the motion would hardly be noticed
 RADII = (1.1, 1.5, 2.0, 2.6)  # radii of circles around the centre of a scene with a background, in radii of the scene
 ELEVATIONS = (5, 15, 28)  # elevations of circles as seen from the centre, degrees
@@ -235,8 +231,7 @@ HELD_OUT = " · held out"
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedImages:
     images: Sequence[UInt8[np.ndarray, "H W 3"]]  # one image or contact sheet, or the frames of an animation
-    views: Sequence[View]
-    """The views that were rendered, in the world's coordinates; for a contact sheet, those of all its cells."""
+    views: Sequence[View]  # in the world's coordinates; of a contact sheet, those of all its cells
     description: str  # description of the views, for people
 
 
@@ -245,8 +240,7 @@ class RenderJob:
     """Renderer of a scene with the choices of ``kissgs render``."""
 
     splats: Splats  # without non-finite values (clean)
-    size: tuple[int, int] | None = None
-    """(width, height) of each image, pixels; None for the camera's size, else for the default."""
+    size: tuple[int, int] | None = None  # of each image, pixels; None: the camera's size, else the default
     background: Colour | None = None  # RGB, 0 to 1; None for that of the capture, else black
     context: Context = DEFAULT_CONTEXT
 

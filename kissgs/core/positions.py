@@ -33,9 +33,7 @@ def signed_exp(y: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
 
 COARSE_ERROR = 0.25  # error of a position, in units of the Gaussian's size, above which it is coarse
 COARSE_SHARE = 0.01  # share of coarse positions above which a scene has lost something
-
-CONTAINER_LEVELS = (1 << 16) - 1
-"""Steps between the smallest and the largest signed logarithm of a container's positions."""
+CONTAINER_LEVELS = (1 << 16) - 1  # steps between the smallest and the largest signed logarithm of positions
 
 ORIGIN = '--origin auto (in Python origin="auto")'
 
@@ -129,8 +127,7 @@ class Cuts:
 
     depth: int
     axes: UInt8[np.ndarray, " nodes"]  # axis of each inner node; node n has the children 2 n and 2 n + 1, the root is 1
-    values: Float64[np.ndarray, " nodes"]
-    """Coordinate of each cut; positions at and above it belong to the second child."""
+    values: Float64[np.ndarray, " nodes"]  # of each cut; positions at and above it belong to the second child
 
     @classmethod
     def of(cls, positions: Float32[np.ndarray, "S 3"], depth: int) -> Cuts:

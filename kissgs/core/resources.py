@@ -30,9 +30,7 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """Options of glibc's ``mallopt``: free bytes at the end of the heap that it keeps, and size from which a block of
 memory comes from the system and returns there when it is freed."""
 
-USUAL_TRIM, USUAL_MMAP = 64 << 20, 32 << 20
-"""Bytes for these options to which glibc itself goes once arrays of 32 MB have been freed."""
-
+USUAL_TRIM, USUAL_MMAP = 64 << 20, 32 << 20  # to which glibc itself goes once arrays of 32 MB have been freed
 LARGEST_TRIM, LARGEST_MMAP = (1 << 31) - 1, 1 << 30  # bytes for these options with which arrays up to 1 GB are kept
 
 _lock = threading.Lock()

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 
 ATTEMPTS = 10  # default number of evaluations
 MAX_EXTRAPOLATION = 4.0  # largest distance of an evaluation from known points, except for one at a bound
-
-MIN_SLOPE_SHARE = 0.15
-"""Share of the expected slope below which, over half of :data:`MAX_EXTRAPOLATION`, the search jumps to the bound."""
+MIN_SLOPE_SHARE = 0.15  # of the expected slope; below, over half of MAX_EXTRAPOLATION, the bound is next
 
 
 @dataclass(frozen=True, slots=True)

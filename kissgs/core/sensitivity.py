@@ -17,10 +17,7 @@ FLOOR = 0.55
 quality is within a few decibels of its neighbours'."""
 
 SEEN_COVERAGE = 0.2  # coverage above which a Gaussian was seen well enough to scale the prior by
-
-LARGEST = 1e25
-"""Largest absolute Hessian entry: squares of enormous Gaussians overflow, and sums of costs would be infinite."""
-
+LARGEST = 1e25  # Hessian entry: squares of enormous Gaussians overflow, and sums of costs would be infinite
 HARMONICS_TOLERANCE = 1.001  # factor by which the squares of mean harmonics may exceed their largest sum by rounding
 OPACITY, SCALES, ROTATION = (0,), (4, 5, 6), (7, 8, 9)  # indices of the diagonal entries in shape_hessian
 POSITION = (0, 1, 2)  # indices of the diagonal entries in position_hessian

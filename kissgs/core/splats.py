@@ -11,17 +11,10 @@ import numpy as np
 from kissgs.core.array_types import Bool, Float, Float32, Float64, Int
 from kissgs.core.errors import InvalidSceneError
 
-MAX_GRID_SIDE = 13_376
-"""Largest side of the grid, pixels: Pillow refuses larger images as decompression bombs; WebP's limit is 16383."""
-
+MAX_GRID_SIDE = 13_376  # pixels: Pillow refuses larger images as decompression bombs; WebP's limit is 16383
 MAX_CODEBOOK_SIDE = 256  # largest side of the codebook's tiles, pixels: labels have two 8-bit coordinates
-
-MAX_GAUSSIANS = 20_000_000
-"""Default limit: 5 GB of arrays. A compressed file of some kilobytes can declare more than any memory holds."""
-
-SH_REST_COUNTS = (0, 3, 8, 15)
-"""Number of SH coefficients per colour channel beyond the constant one, for degree 0, 1, 2, 3."""
-
+MAX_GAUSSIANS = 20_000_000  # by default: 5 GB of arrays, which a file of some kilobytes can declare
+SH_REST_COUNTS = (0, 3, 8, 15)  # SH coefficients per channel beyond the constant one, for degree 0 to 3
 SH_C0 = 0.28209479177387814  # value of the constant real spherical harmonic: colour = 0.5 + SH_C0 * sh0
 
 OPACITY_LOGIT_MIN = float(np.float32(-13.815509796142578))

@@ -27,12 +27,8 @@ from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
 from kissgs.rendering.rasterizer import drawn_opacities
 
-BACKGROUNDS = (0.0, 0.5, 1.0)
-"""Grey levels of the views' backgrounds, in turn: on black, missing parts of a dark scene would not show."""
-
-FIELDS_OF_VIEW = np.radians((50.0, 90.0))
-"""Smallest and largest field of view along the longer side of the image, radians."""
-
+BACKGROUNDS = (0.0, 0.5, 1.0)  # grey levels, in turn: on black, missing parts of a dark scene would not show
+FIELDS_OF_VIEW = np.radians((50.0, 90.0))  # smallest and largest, along the longer side, radians
 MAX_DRAWS = 12  # largest number of cameras drawn for one view until one is accepted
 THUMBNAIL = 64  # longer side of the thumbnails that decide whether a camera is accepted, pixels
 
@@ -44,9 +40,7 @@ VISIBLE_PSNR = 18.0
 """Largest PSNR, decibels, between thumbnails with and without a part at which its loss counts as visible; between full
 images it is then at most about 20."""
 
-DISTANCES = (0.6, 1.6)
-"""Smallest and largest distance of a camera to its part, in units of the distance at which the part's sphere just fits
-into the image."""
+DISTANCES = (0.6, 1.6)  # of a camera to its part, in units of that at which the part's sphere just fits the image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,18 +120,12 @@ KINDS = ("far", "around", "close-up", "across")
 """Kinds of poses, in turn: outside of the scene; around a part of random size; close to a surface; from one part of the
 scene towards another."""
 
-EXTENT_SHARES = (1.0, 0.98, 0.9, 0.5)
-"""Shares of the Gaussians, along each axis, that a "far" view frames: below 1 because a few may lie far away."""
-
-CLOSE_UP_RANKS = (100, 1000)
-"""Smallest and largest number of Gaussians that are nearer to the target of a close-up than its camera is."""
-
+EXTENT_SHARES = (1.0, 0.98, 0.9, 0.5)  # of Gaussians that a "far" view frames: a few may lie far away
+CLOSE_UP_RANKS = (100, 1000)  # Gaussians that are nearer to the target of a close-up than its camera is
 MIN_SIGMAS = 5.0  # smallest distance of a camera to its target Gaussian, in the Gaussian's standard deviations
 MIN_MEAN_ALPHA = 0.02  # an image with a smaller mean alpha counts as empty
 INSIDE_SIGMAS = 3.0  # a camera within this Mahalanobis distance of a Gaussian's mean counts as inside it
-
-MAX_INSIDE_SHARE, MAX_SINGLE_SHARE = 0.5, 0.3
-"""Largest shares of an image that Gaussians around the camera, and that a single Gaussian, may cover."""
+MAX_INSIDE_SHARE, MAX_SINGLE_SHARE = 0.5, 0.3  # of an image, by Gaussians around the camera, by a single one
 
 
 def evaluation_views(splats: Splats, context: Context = DEFAULT_CONTEXT, *, seed: int = 0) -> Views:

@@ -31,14 +31,9 @@ LEAST_PSNR, USUAL_PSNR = 12.0, 18.0
 """Median PSNR, decibels, below which a capture is refused, and below which a note says so. Images of different scenes
 have about 8 to 12 dB; renderings of a trained scene have 20 to 35."""
 
-COMPARED, SIDE = 5, 160
-"""Number of photographs that are compared, and of pixels on the longer side of each, samples of the photograph."""
-
+COMPARED, SIDE = 5, 160  # photographs that are compared, and pixels on the longer side of each
 CAMERAS = 16  # number of cameras that tell, where there are no photographs, how much of the scene they show
-
-GAINS = 0.25, 4.0
-"""Limits of the factor by which a photograph may be darker or brighter than renderings of the same scene."""
-
+GAINS = 0.25, 4.0  # by which a photograph may be darker or brighter than renderings of the same scene
 MIN_ALPHA = 0.02  # smallest mean alpha of a rendering that is compared where the scene is opaque
 
 NOT_COMPARED = "no photograph of the capture can be compared with, so whether it belongs to this scene is not known"

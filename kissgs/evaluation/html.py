@@ -38,9 +38,7 @@ INFERNO = (
 )
 """Matplotlib's colour map "inferno" at ten points, RGB from 0 to 255: its lightness grows evenly."""
 
-FULL_SCALES = (1, 2, 3, 5, 10, 15, 20, 30, 50, 100, 255)
-"""Errors that the brightest colour may stand for, levels of an 8-bit image."""
-
+FULL_SCALES = (1, 2, 3, 5, 10, 15, 20, 30, 50, 100, 255)  # of 255 levels, for which the brightest colour may stand
 WINDOW = 32  # side of the square over which the largest error is searched, pixels
 
 
@@ -156,9 +154,7 @@ MAX_SURROUNDINGS = 4  # largest number of views of the surroundings shown with i
 MAX_PATCHES = 6  # largest number of patches shown, those that lose most SSIM
 MAX_SIDE = 1280  # longer side of the large images, pixels; larger ones are reduced
 QUALITY = 90  # WebP quality of the large images; lossless, they would be five times as large
-
-MAX_CROP, MIN_CROP = 160, 64
-"""Limits of the side of an enlarged crop, pixels; within them it is half of the image's shorter side."""
+MAX_CROP, MIN_CROP = 160, 64  # side of an enlarged crop, pixels; within these, half of the image's shorter side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

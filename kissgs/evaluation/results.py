@@ -324,8 +324,7 @@ def as_json(value: float) -> float | str | None:
 
 # PSNR of an evaluation, and its loss of PSNR and of SSIM, as goals define them.
 
-ASSUMED_PSNR = 30.0
-"""PSNR, decibels, that renderings are assumed to have to photographs if there are none: about that of good captures."""
+ASSUMED_PSNR = 30.0  # decibels to photographs, where there are none: about that of good captures
 
 ESTIMATED_DROP = f"without photographs, the drop of PSNR is estimated for a scene that has {ASSUMED_PSNR:g} dB to them"
 """Note for a drop that was not measured with photographs."""

@@ -18,9 +18,7 @@ from kissgs.rendering.rasterizer import drawn_opacities
 
 MORTON_BITS = 21  # bits per axis of a Morton code: as many as 64 bits hold
 NEIGHBOURS = 64  # number of Gaussians, consecutive in Morton order, that form a neighbourhood
-
-FAIRNESS = 0.25
-"""Exponent of prominence when octree cells share a probability: 1 is proportional, 0 gives all cells the same."""
+FAIRNESS = 0.25  # exponent of prominence where octree cells share a probability: 0 gives all the same
 
 
 def prominence(splats: Splats) -> Float64[np.ndarray, " N"]:
@@ -104,15 +102,9 @@ def morton_codes(means: Float64[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
 # Separate parts of a scene: each may be lost as a whole, and randomly drawn cameras may miss it.
 
 SAMPLE_SIZE = 2048  # largest number of Gaussians in the sample that is clustered
-
-MIN_SHARE = 0.004
-"""Smallest share of the scene's prominence that a part has: 0.5 %, less a margin for errors of sampling."""
-
+MIN_SHARE = 0.004  # of the scene's prominence that a part has: 0.5 %, less a margin for errors of sampling
 MIN_SAMPLES = 8  # smallest number of sampled Gaussians in a part
-
-MIN_GAP_RATIO = 3.0
-"""Smallest ratio of the gap around a part to the gaps inside it: lower ratios are common between any Gaussians."""
-
+MIN_GAP_RATIO = 3.0  # of the gap around a part to gaps inside it: lower ones are common between any Gaussians
 RADIUS_QUANTILE = 0.75  # share of a part's sampled Gaussians within its radius
 
 

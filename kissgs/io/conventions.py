@@ -66,8 +66,7 @@ def steps(count: int) -> list[slice]:
 
 # Stored (pre-activation) parameters of a scene -> values and codes of other formats.
 
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Indices of the three other components of a quaternion, by the index of the largest."""
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the other components of a quaternion, by the largest
 
 
 def opacities_of(logits: Float32[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
@@ -196,9 +195,7 @@ def _quaternion(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 4
 # Morton order: Gaussians that follow one another are close to one another.
 
 _BITS = 21  # bits per axis: three axes fill 63 of 64 bits
-
-_OUTSIDE = 1e-3
-"""Share of the Gaussians at either end of an axis that is not resolved, so that outliers do not coarsen the rest."""
+_OUTSIDE = 1e-3  # share of Gaussians at either end of an axis that is not resolved, so that outliers coarsen nothing
 
 _SPREAD = (
     (32, 0x001F00000000FFFF),

@@ -75,9 +75,7 @@ _USUAL = {"projection": "perspective", "sortingMethod": "cameraDistance"}
 """How they are drawn here, by key of the extension; other ways are left out, with a note."""
 
 TO_PLY: Signs = (-1, -1, 1)  # signs from glTF's axes to those of a .ply
-
-MAX_JSON_BYTES, MAX_GLTF_BYTES = 1 << 22, 1 << 30
-"""Largest size of the JSON in a GLB, some kilobytes for a scene; and of a ``.gltf``, whose buffers may be in it."""
+MAX_JSON_BYTES, MAX_GLTF_BYTES = 1 << 22, 1 << 30  # of the JSON in a GLB; of a .gltf, whose buffers may be in it
 
 MAX_SHOWN, MAX_ATTRIBUTES = 1000, 100
 """Largest number of nodes, and of primitives, each counted at every node that shows it; and of attributes of one, of

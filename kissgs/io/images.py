@@ -129,9 +129,7 @@ def probe_webp(data: bytes, name: str) -> tuple[int, int]:
 
 # Compression of all planes of a container, in parallel.
 
-HIGHEST_EFFORT, HIGH_EFFORT = (100, 6), (100, 5)
-"""Quality and method of libwebp for the codebook, and at least for small images that gain from more effort."""
-
+HIGHEST_EFFORT, HIGH_EFFORT = (100, 6), (100, 5)  # libwebp's quality and method for the codebook, and for small images
 NO_GAIN = ("mask", "means", "labels")  # parts of the names of images that no effort makes smaller
 USUAL_EFFORT = (75, 4)  # quality and method up to which large images take less effort
 LARGE = 500_000  # pixels from which an image is large: more effort than effort_of gives saves 0.1 % in twice the time

@@ -22,8 +22,7 @@ from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, Re
 
 MAIN_BYTES, SECTION_BYTES = 4096, 1024
 
-MAX_SECTIONS = 1 << 14
-"""Largest number of sections, whose headers are read at once; a scene has one for each level or part of it."""
+MAX_SECTIONS = 1 << 14  # sections, whose headers are read at once; a scene has one for each level or part of it
 
 _MAIN = struct.Struct("<BBxxIIIIHxx3f2f")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH")
@@ -31,8 +30,7 @@ _SECTION = struct.Struct("<IIIIfHxxIIIIH")
 _CENTRE_BYTES = 12
 _FLOATS = ("<f4", "<f2", "<f2")
 _POSITIONS = ("<f4", "<u2", "<u2")
-_SH = ("<f4", "<f2", "u1")
-"""NumPy's type of scales and rotations, of positions, and of SH coefficients, by compression level."""
+_SH = ("<f4", "<f2", "u1")  # NumPy's types of scales and rotations, positions, SH coefficients, by compression level
 
 _DEFAULT_RANGE = (1, 32767, 32767)
 _DEFAULT_SH_RANGE = (-1.5, 1.5)

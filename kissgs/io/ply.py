@@ -264,8 +264,7 @@ class PlyInfo:
     sh_degree: int  # SH degree, 0 to 3
     encoding: Encoding  # encoding of the body, as the header names it
     compressed: bool  # whether it is PlayCanvas' compressed .ply
-    antialiased: bool = False
-    """Whether a comment of Brush or Postshot says that the scene was trained with antialiasing."""
+    antialiased: bool = False  # whether a comment of Brush or Postshot says that it was trained with antialiasing
 
 
 def read_ply_info(source: Path | bytes, *, size: int | None = None) -> PlyInfo:

@@ -22,11 +22,8 @@ from kissgs.io.files import SceneFile, open_scene_file, refuse_degree
 
 Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 
-MAX_HEADER_BYTES = 1 << 20
-"""Largest header: one of degree 3 takes 1.5 kB; a megabyte leaves room for metadata in comments."""
-
-MAX_PROPERTIES = 4096
-"""Largest number of properties per element; a degree-3 scene has 62, one with feature vectors some hundred more."""
+MAX_HEADER_BYTES = 1 << 20  # one of degree 3 takes 1.5 kB; a megabyte leaves room for metadata in comments
+MAX_PROPERTIES = 4096  # per element; a degree-3 scene has 62, one with feature vectors some hundred more
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f2", "f4", "f8")
 _TYPES = dict(zip(("char", "uchar", "short", "ushort", "int", "uint", "half", "float", "double"), _CODES, strict=True))

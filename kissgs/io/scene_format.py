@@ -12,8 +12,7 @@ from kissgs.core.context import Progress
 from kissgs.core.splats import MAX_GAUSSIANS, Splats
 from kissgs.io.files import BinaryWriter
 
-SceneSource = Path | bytes | Mapping[str, bytes]
-"""A file or folder, the bytes of a file, or the files of a container in memory."""
+SceneSource = Path | bytes | Mapping[str, bytes]  # a file or folder, the bytes of a file, or a container's files
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,10 +72,8 @@ class Facts:
     count: int  # Gaussians; of a streamed scene, those of one level and the environment
     sh_degree: int
     details: dict[str, Any] = field(default_factory=dict)
-    parts: dict[str, int] = field(default_factory=dict)
-    """Bytes of each file of a container, or of each container of a streamed scene."""
-    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Values of the lowest and the highest level of each attribute of a container."""
+    parts: dict[str, int] = field(default_factory=dict)  # bytes of each file of a container, or of each container
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)  # values of the lowest and highest level
     changed: dict[str, int] = field(default_factory=dict)  # Gaussians that the encoder removed or corrected, by reason
     notes: tuple[str, ...] = ()  # phrases for what reading leaves out or changes
     lines: tuple[str, ...] = ()  # sentences about details, for the terminal
@@ -99,8 +96,7 @@ Write = Callable[[BinaryWriter, Splats, bool, Progress], tuple[str, ...]]
 class Codec:
     info: Callable[[Path | bytes, int], Facts]  # describe a file, or a level of detail of a streamed scene
     read: Read
-    sniff: Callable[[bytes, int], Match] = lambda head, size: Match.NO
-    """Recognise the format from the first bytes of a file and its size."""
+    sniff: Callable[[bytes, int], Match] = lambda head, size: Match.NO  # from a file's first bytes and its size
     write: Mapping[str, Write] = field(default_factory=dict)  # writers by ending; all but .ply get a clean scene
     records_origin: bool = False
     """Whether files of other endings than ``.ply`` record the origin of a scene, as the translation of a node."""

@@ -42,9 +42,7 @@ _GZIP = 16 + zlib.MAX_WBITS
 _BLOCK_BYTES = 1 << 20
 
 _MAX_RATIO = 1032  # largest ratio of deflate: 258 bytes of two bits
-
-_MIN_WINDOW_LOG = 27
-"""Windows of zstd up to 128 MiB are accepted in any case: its command line makes no larger ones unless asked to."""
+_MIN_WINDOW_LOG = 27  # windows of zstd up to 128 MiB are always accepted: its command line makes no larger ones
 
 
 def inflate_start(head: bytes) -> bytes:
@@ -109,10 +107,7 @@ def unpack_frame(frame: bytes, size: int, what: str) -> bytes:
 _BYTE = np.arange(256)
 
 SCALE_OF_BYTE = (_BYTE / 16 - 10).astype(np.float32)  # natural logarithm of a standard deviation, in steps of 1/16
-
-COLOR_OF_BYTE = ((_BYTE / 255 - 0.5) / 0.15).astype(np.float32)
-"""Constant SH coefficient; 0.15, not the harmonic's value, is the format's factor."""
-
+COLOR_OF_BYTE = ((_BYTE / 255 - 0.5) / 0.15).astype(np.float32)  # constant SH coefficient; 0.15 is the format's factor
 SH_OF_BYTE = ((_BYTE - 128) / 128).astype(np.float32)  # other SH coefficients
 
 SH_STEPS = (4, 8)

@@ -37,19 +37,16 @@ class Container:
     sh_degree: int
     antialiased: bool
     notes: tuple[str, ...] = ()  # phrases for what reading leaves out
-    ranges: Callable[[], dict[str, tuple[float, float]]]
-    """Returns the values of the lowest and the highest level of each attribute."""
+    ranges: Callable[[], dict[str, tuple[float, float]]]  # values of the lowest and the highest level, by attribute
     stored: Callable[[], tuple[str, int]]  # returns the name of the container and the bytes of all its files
-    decode: Callable[[Splats, Workers], None]
-    """Decodes all Gaussians into a scene, whose SH coefficients above the container's degree are zero."""
+    decode: Callable[[Splats, Workers], None]  # into a scene, whose SH coefficients above its own degree are zero
 
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
     levels: int
     filenames: tuple[str, ...]  # files of the containers: their metadata, or they themselves
-    rows: tuple[tuple[tuple[int, int, int], ...], ...]
-    """Row ranges of the leaves per level, ``(file, offset, count)``, by file and offset, without overlap."""
+    rows: tuple[tuple[tuple[int, int, int], ...], ...]  # by level: (file, offset, count), in order, without overlap
     environment: str | None  # file of the environment
     origin: Origin
 
@@ -90,8 +87,7 @@ class Part:
 class StreamedFormat:
     title: str
     manifest: str  # file name of the manifest
-    containers: str | None
-    """Value that the manifest's key "format" must have where it has one; None if any value is valid."""
+    containers: str | None  # value of the manifest's key "format", which it may lack; None: any value is valid
     opened: Callable[[Source, str], Container]  # reads and checks the metadata of the container of a file
 
     @property

@@ -45,8 +45,7 @@ class WorkItem:
     """``"module:name"`` of a function ``(arguments, progress) -> result``, which every node can import. It may run more
     than once, if a node is lost, and must therefore write its files atomically."""
 
-    arguments: dict[str, Any] = field(default_factory=dict)
-    """JSON. Files are named by paths that every node sees, or that are relative to ``folder``."""
+    arguments: dict[str, Any] = field(default_factory=dict)  # JSON; paths are seen by every node, or relative to folder
 
     resources: Resources = Resources()
 

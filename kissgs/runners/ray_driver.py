@@ -32,10 +32,7 @@ from kissgs.runners import ray_node
 from kissgs.runners.contract import INTERNAL, LOST, NODE_UNUSABLE, Outcome, WorkItem
 
 CONNECT_SECONDS = 5.0  # maximum seconds for a connection to the head's port
-
-OBJECT_STORE_BYTES = 80 << 20
-"""Size of the object store of a cluster that is started here: nearly the smallest; nothing is kept there."""
-
+OBJECT_STORE_BYTES = 80 << 20  # of a cluster that is started here: nearly the smallest; nothing is kept there
 NODES_SECONDS = 1.0  # seconds between two looks at the cluster's nodes
 RETRY_SECONDS = 1.0  # seconds before an item whose node was lost is started again: Ray may not know of the loss yet
 FORCE_SECONDS = 5.0  # seconds after which a cancelled task that has not ended is killed

@@ -23,8 +23,7 @@ from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptio
 from kissgs.io.streamed import Container, StreamedFormat
 from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, MAX_SH_ENTRIES, Rest, SogLayout, read_layout
 
-_FREE_PIXELS = 1 << 20
-"""Pixels that images may have beyond four per Gaussian: encoders may round sides up to powers of two."""
+_FREE_PIXELS = 1 << 20  # beyond four per Gaussian: encoders may round sides up to powers of two
 
 
 def describe(path: Path | bytes, level: int) -> Facts:

@@ -213,16 +213,10 @@ def scene_json(files: Mapping[str, bytes]) -> bytes:
 
 # Reading of a container's metadata: ``meta.json`` if it exists, else the YAML. Unknown keys are ignored.
 
-MAX_YAML_EVENTS = 20_000
-"""Largest number of values, and beginnings and ends of lists and mappings, of the YAML; kissgs writes about 500."""
-
+MAX_YAML_EVENTS = 20_000  # values, and beginnings and ends of lists and mappings; kissgs writes about 500
 MAX_YAML_DEPTH = 50  # largest nesting; kissgs writes 6 levels
-
-MAX_YAML_ALIASES = 20
-"""Largest number of aliases: dumpers write one if two fields share a list; thousands would take long to go through."""
-
-MAX_NUMBER_LENGTH = 100
-"""Largest number of characters of a number of the YAML; kissgs writes up to 25. Longer ones are text."""
+MAX_YAML_ALIASES = 20  # dumpers write one if two fields share a list; thousands would take long
+MAX_NUMBER_LENGTH = 100  # characters of a number of the YAML; kissgs writes up to 25; longer ones are text
 
 _CONSTANTS: dict[str, float | bool | None] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),

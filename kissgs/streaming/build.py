@@ -60,9 +60,7 @@ from kissgs.streaming.levels import (
 # Settings of the files of a level.
 
 COARSER_DB = 6.0  # decibels by which coarser levels are encoded less accurately, with rate-distortion planning
-
-COARSER_STEPS = 1.6
-"""Steps of coarser levels of SH degree 0 in units of the finest level's, without rate-distortion planning."""
+COARSER_STEPS = 1.6  # of levels of SH degree 0, in units of the finest level's, without rate-distortion planning
 
 
 def file_settings(settings: EncodeSettings, level: int, sh_degree: int) -> EncodeSettings:
@@ -154,9 +152,7 @@ LEAF, MOST_ENTRIES = 32_768, 4096
 bytes for each level of each leaf, before the first image: large scenes have larger leaves."""
 
 UNEVEN = 1.1  # ratio of the largest to the mean size of chunks: their cuts are medians of a sample
-
-COARSEST = 50_000
-"""Largest number of Gaussians in the coarsest level, which with the manifest makes a viewer's first image."""
+COARSEST = 50_000  # Gaussians at most in the coarsest level, which with the manifest makes the first image
 
 
 def partition(

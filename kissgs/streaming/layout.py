@@ -13,10 +13,7 @@ from kissgs.io.containers import META_NAME
 from kissgs.io.files import atomic_file
 
 CONTEXT = 280_000  # largest number of Gaussians of the level that stands for other chunks where sensitivity is measured
-
-PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"
-"""Names in the work folder: the marker of the partition, the cameras, and the folder of the result."""
-
+PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"  # the partition's marker; cameras; the result
 ENVIRONMENT = "environment"  # name of the environment's container
 
 

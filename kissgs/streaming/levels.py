@@ -179,14 +179,9 @@ def bounds(splats: Splats) -> Float64[np.ndarray, "2 3"]:
 # the boxes of the leaves that they are in.
 
 FAR = 8.0  # distance from which Gaussians belong to the environment, in units of their median distance from the centre
-
-FEWEST, MOST = 1_000, 65_536
-"""Least and largest number of Gaussians in an environment. Viewers draw it always and whole, so it must be small."""
-
+FEWEST, MOST = 1_000, 65_536  # Gaussians of an environment, which viewers draw always and whole
 LARGEST_SHARE = 0.3  # largest share of a scene in its environment
-
-ONE_SIDED = 0.7
-"""Length of the mean direction of Gaussians from which they do not surround the scene. Half a sphere has 0.5."""
+ONE_SIDED = 0.7  # length of the mean direction from which Gaussians do not surround the scene: half a sphere has 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

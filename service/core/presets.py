@@ -12,8 +12,7 @@ from .schemas import COMPACTED, FINETUNED, SEARCHED, PresetFacts, Presets
 MEASURED_ON = "fox, 79,451 Gaussians of SH degree 3, seven held-out photographs"
 MEASURED_BY = "kissgs compress fox.ply, kissgs evaluate fox.ply fox.zip --views fox"
 
-EVALUATION = 60.0
-"""Approximate CPU seconds per million Gaussians to decode, select 24 cameras, and render two small images from each."""
+EVALUATION = 60.0  # CPU seconds per million Gaussians, about: to decode, choose 24 cameras, render twice from each
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +85,7 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     return START_SECONDS + cpu * (SEARCH_FACTOR if searches else 1.0) / BUSY_CORES
 
 
-LONGEST_FINETUNING = 2.0
-"""Largest factor on the time of a job that fine-tunes with a time limit: up to twice the usual number of steps."""
+LONGEST_FINETUNING = 2.0  # factor on the time of a job that fine-tunes with a time limit: up to twice the steps
 
 
 def limited_seconds(kind: str, evaluate: bool, gaussians: int, unlimited: float, limit: float) -> float:

@@ -33,18 +33,14 @@ receive the response."""
 READ_SECONDS = 60.0  # timeout for a client to receive any bytes of a pending response
 MAX_HEADER_BYTES = 64 << 10  # maximum bytes of the headers of a request
 READ_BYTES = 32 << 10  # maximum bytes per read from a connection
-
-PARSE_SECONDS_PER_BYTE = 2e-7
-"""Allowed CPU seconds per received byte. A normal body needs a hundredth; one in chunks of single bytes, tenfold."""
-
+PARSE_SECONDS_PER_BYTE = 2e-7  # CPU time allowed; a normal body needs a hundredth, chunks of one byte tenfold
 MAX_PARSE_DEBT_SECONDS = 0.1  # CPU seconds beyond the allowance after which a connection is closed
 
 MAX_CONNECTIONS = 1000
 """Maximum number of connections. Beyond it, the address with the most loses one, so that no address, by event streams
 or slow requests, shuts out the others; a proxy, whose address is that of all clients, may still have all."""
 
-OTHER_DESCRIPTORS = 256
-"""File descriptors reserved for other uses than connections: uploads, downloads, the database, jobs."""
+OTHER_DESCRIPTORS = 256  # file descriptors reserved for uploads, downloads, the database, jobs
 
 
 class StrictConnection(h11.Connection):

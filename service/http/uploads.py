@@ -163,10 +163,7 @@ async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterato
 
 
 BLOCK_BYTES = 1 << 20  # bytes per write. Each write is one call to a thread; memory holds one or two blocks per upload.
-
-LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")
-"""Last line of a header, matched as a whole because a comment may end with ``end_header``."""
-
+LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")  # of a header; a comment may end with end_header, too
 HEAD_BYTES = 512  # bytes from which a format is recognised
 
 GAUSSIANS_PER_BYTE = 2
@@ -178,8 +175,7 @@ FREE_GAUSSIANS = 1 << 16  # number of Gaussians that an upload of any size may h
 
 CLOSE = {"Connection": "close"}
 
-STEP_BYTES = 16 << 20
-"""Disk space reserved per step as bytes arrive, so that a large Content-Length alone reserves nothing."""
+STEP_BYTES = 16 << 20  # reserved per step as bytes arrive: a large Content-Length alone reserves nothing
 
 
 @dataclass(frozen=True, slots=True)

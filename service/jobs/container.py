@@ -25,8 +25,7 @@ from .decoding import Decoder
 from .status import EventStream, QueueEstimator
 from .worker import Worker
 
-READY_SECONDS = 2.0
-"""Age up to which the result of a check is given again: each check writes to the disk, and anybody may ask for one."""
+READY_SECONDS = 2.0  # of a check's result: each check writes to the disk, and anybody may ask for one
 
 
 class Readiness:

@@ -36,12 +36,10 @@ UNUSABLE_NODES = "the machines that run jobs cannot work on this one; try again 
 UNUSABLE_MACHINE = "the job's files cannot be used on this machine; try again later"
 """Sentences for clients about nodes of a cluster, and about this machine, whose names and faults are in the log."""
 
-OnProgress = Callable[[str, float, str], Awaitable[None]]
-"""Callback with a stage, its completed fraction (0 to 1), and a note, which may be empty."""
+OnProgress = Callable[[str, float, str], Awaitable[None]]  # gets stage, fraction (0 to 1), and a note or ""
 
 
-POSTPONED = (UNREACHABLE, NOT_STARTED)
-"""Codes of "lost" outcomes of jobs that cannot run at the moment; the message, if any, is for the log."""
+POSTPONED = (UNREACHABLE, NOT_STARTED)  # codes of "lost" outcomes of jobs that cannot run at the moment
 
 
 def postponed(reason: str = "") -> Outcome:

@@ -173,9 +173,7 @@ def _links(job: Job) -> Links:
     )
 
 
-KEEPALIVE_SECONDS = 15.0
-"""Seconds without an event after which a comment is sent, so that the connection is not taken for dead."""
-
+KEEPALIVE_SECONDS = 15.0  # without an event; then a comment is sent, so that the connection is not taken for dead
 RETRY_MILLISECONDS = 1000  # delay after which a browser reconnects, milliseconds
 
 

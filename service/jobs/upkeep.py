@@ -56,11 +56,8 @@ def _recover_job(context: ServiceContainer, job: Job) -> None:
 
 # Expiry.
 
-HEARTBEAT_SECONDS = 5.0
-"""Seconds between records of the time, with the last of which the clock of the next start begins."""
-
-GRACE_SECONDS = 3600.0
-"""Seconds after the start in which nothing expires, in case the machine's clock was wrong at the start."""
+HEARTBEAT_SECONDS = 5.0  # between records of the time, with the last of which the next clock begins
+GRACE_SECONDS = 3600.0  # after the start in which nothing expires: the machine's clock may have been wrong
 
 
 @dataclass(frozen=True, slots=True)

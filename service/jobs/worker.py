@@ -198,9 +198,7 @@ LOST_SECONDS, MOST_LOST_SECONDS = 5.0, 60.0
 """Pause before a job is started again whose first start was lost, which doubles with every start; the longest one. On a
 bad node that is free, starts fail at once: without pauses, the job would soon have none left."""
 
-MOST_POSTPONED_SECONDS = 8.0
-"""Longest pause of a worker after jobs that could not be started; the first is IDLE_SECONDS."""
-
+MOST_POSTPONED_SECONDS = 8.0  # longest pause after jobs that could not be started; the first is IDLE_SECONDS
 REST_POLL_SECONDS = 0.1  # interval between looks whether a pause must end, seconds
 CHECKPOINT = "checkpoint.npz"  # name of a job's checkpoint; that of fine-tuning after compaction has the same beginning
 QUEUE = "queue"  # name that is notified when a job is added to the queue

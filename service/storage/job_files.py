@@ -40,15 +40,12 @@ ORPHANED = ".orphaned"  # name of the folder, within jobs, for folders that no j
 
 JOB = re.compile("[0-9a-f]{32}")
 
-RESERVE_BYTES = 1 << 20
-"""Bytes of the reserve: to open an SQLite database and change it takes 100 kB of journal, each change 20 to 40."""
+RESERVE_BYTES = 1 << 20  # to open an SQLite database and change it takes 100 kB of journal, each change 40
 
 _UPLOAD = re.compile(r"[0-9a-f]{16}\.part")
 
 RESULT = "result"  # name of the folder of a job's result
-
-UNFINISHED = ("work-*", ".*.part")
-"""Patterns of incomplete files in a job's folder: work folders, and checkpoints that are being written."""
+UNFINISHED = ("work-*", ".*.part")  # in a job's folder: work folders, and checkpoints being written
 
 JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", "checkpoint*.npz", "decoded.ply", "decoded.json")
 """Patterns of all files that the service creates in a job's folder."""

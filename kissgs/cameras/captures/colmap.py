@@ -28,9 +28,7 @@ from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
 MAX_NAME_BYTES = 4096  # maximum bytes of an image's name; no file system has longer paths
-
-MAX_LINE_BYTES = 1 << 26
-"""Maximum bytes of a line in a text file; the longest lines hold the points of an image, about 40 MB per million."""
+MAX_LINE_BYTES = 1 << 26  # of a text file; the points of an image take about 40 MB per million
 
 # Model number: name and number of parameters in a binary file.
 _MODELS = {
@@ -248,8 +246,7 @@ class _Reader:
 # down, z forward, the centre of the first pixel at (0.5, 0.5). World coordinates are those of the model, which INRIA's
 # trainer keeps too.
 
-MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")
-"""Folders of a capture that may hold the model, in the order in which they are searched."""
+MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")  # of a capture, in the order of the search
 
 _PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),

@@ -21,9 +21,7 @@ DEFAULT_RESOLUTION = 1600
 published results depend; INRIA's code limits only the width, so that portrait photographs stay larger."""
 
 HOLD_OUT = 8  # every eighth view, starting with the first, is held out: the protocol of 3DGS and Mip-NeRF 360
-
-MAX_ASPECT_ERROR = 0.01
-"""Maximum relative difference between the aspect ratios of a photograph and its camera; scaled copies round sides."""
+MAX_ASPECT_ERROR = 0.01  # relative difference of aspect ratios of photograph and camera; scaled copies round sides
 
 
 def load_views(

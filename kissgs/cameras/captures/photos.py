@@ -112,8 +112,7 @@ class Capture:
     root: Path  # folder that paths of photographs are relative to
     source: str  # description of the files that were read, for messages
     white: bool = False  # whether transparent pixels are composited over white
-    applied: Float64[np.ndarray, "4 4"] | None = None
-    """Rotation and translation from the coordinates of a former model to those of the poses, if there was one."""
+    applied: Float64[np.ndarray, "4 4"] | None = None  # rotation and translation from a former model to the poses
 
 
 def _focal(length: float | None, angle: float | None, side: int) -> float | None:
@@ -129,10 +128,7 @@ def _focal(length: float | None, angle: float | None, side: int) -> float | None
 # ``convert.py`` makes ``images``.
 
 MAX_FACTOR = 64  # maximum scale of a folder; a larger number after the underscore, such as a year, is part of the name
-
-IMAGES, INPUT = "images", "input"
-"""Usual folder of photographs, and the folder of originals that replaces it if it is missing."""
-
+IMAGES, INPUT = "images", "input"  # usual folder of photographs, and that of originals, which replaces it if missing
 MAX_LISTED_FOLDERS = 4  # maximum number of folders named in a message
 
 

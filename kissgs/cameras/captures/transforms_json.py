@@ -193,11 +193,8 @@ def _split(which: str) -> tuple[str, str] | None:
 # ``offset`` are not applied. Scenes may have others, which :func:`similarities` returns: those of the COLMAP model from
 # which nerfstudio converted the poses by ``applied_transform``, or those in which nerfstudio trained.
 
-MAX_SKEW = 0.01
-"""Maximum relative difference between the singular values of a rotation matrix, to accept rounded numbers."""
-
-DATAPARSER_TRANSFORMS = "dataparser_transforms.json"
-"""File of nerfstudio's trainer: from coordinates of the COLMAP model, else of ``transforms.json``, to the scene's."""
+MAX_SKEW = 0.01  # relative difference between the singular values of a rotation, to accept rounded numbers
+DATAPARSER_TRANSFORMS = "dataparser_transforms.json"  # of nerfstudio's trainer: to the coordinates of the scene
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 """Supported values of ``camera_model``; all given distortion coefficients apply, whatever the value."""

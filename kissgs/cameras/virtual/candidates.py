@@ -17,8 +17,7 @@ from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.constants import NEAR
 from kissgs.rendering.cpu.frame import draw
 
-UP_AXES = (UP, np.array([0.0, 0.0, 1.0]))
-"""Up directions of scene files: COLMAP's y points roughly down, nerfstudio's z up. The first is the default."""
+UP_AXES = (UP, np.array([0.0, 0.0, 1.0]))  # COLMAP's y points down, nerfstudio's z up; the first is the default
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,22 +121,15 @@ def _ground_normal(axis: Vec3, normals: Float64[np.ndarray, "N 3"], weights: Flo
 # View scores: how useful a camera is, from a thumbnail of what it sees.
 
 PROXY_GAUSSIANS = 30_000  # largest number of Gaussians in the proxy scene that thumbnails show
-
-OPAQUE = 0.01
-"""Transmittance at which the list of a thumbnail's pixel ends: what is behind does not change its statistics."""
-
+OPAQUE = 0.01  # transmittance at which the list of a thumbnail's pixel ends
 TOO_NEAR = 0.35  # depth in radii of the scene; anything nearer to the camera counts as an obstruction
-
-CENTRE_SCALE = 30.0
-"""Factor by which the mark of central Gaussians is scaled, so that it uses half the range of a colour channel."""
+CENTRE_SCALE = 30.0  # of the mark of central Gaussians, to use half the range of a colour channel
 
 
 @dataclass(frozen=True, slots=True)
 class ViewStats:
     alpha: float  # mean alpha, 0 to 1
-    log_size: float
-    """Median logarithm of the largest scale of the Gaussians, world units. Parts that no photograph shows have
-    large Gaussians."""
+    log_size: float  # median logarithm of the largest scale, world units; large where no photograph shows a part
     log_angle: float  # median logarithm of the angle that these scales subtend, radians
     near: float  # mean alpha of what is nearer than TOO_NEAR, 0 to 1
     centre: float  # mean alpha of the central Gaussians, those within two radii of the centre, 0 to 1

@@ -41,9 +41,7 @@ MIN_UNSEEN_GAUSSIANS = 8  # number of unseen Gaussians below which the search en
 CANDIDATES_PER_REGION = 40  # number of candidate cameras around each further region
 PROBE_CAMERAS = 6  # number of a region's cameras from which coverage is measured
 PROBE_SIZE = 160  # longer side of the images in which coverage is measured, pixels
-
-TYPICAL_SIZE = 384
-"""Longer side of the images that the selected cameras will have, pixels; what they resolve depends on it."""
+TYPICAL_SIZE = 384  # longer side of the images that cameras will have, pixels: what they resolve depends on it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,9 +163,7 @@ VIRTUAL_WEIGHT = 0.3
 """Weight of all virtual cameras together, relative to all cameras of a capture. Parts that no photograph shows must not
 fall apart, and the photographed parts lose almost nothing by it."""
 
-WIDE_FOCAL_SCALE = 0.6
-"""Focal length of every other virtual camera, relative to the others: parts just outside their images count too."""
-
+WIDE_FOCAL_SCALE = 0.6  # of every other virtual camera: parts just outside the images count too
 MAX_VIEWS, MIN_VIEWS = 48, 16  # largest and smallest number of cameras that are chosen by the size of the scene
 FEW_GAUSSIANS = 150_000  # number of Gaussians up to which there are MAX_VIEWS
 
@@ -210,18 +206,10 @@ def sensitivity_cameras(
 # A scene that is trained from a few cameras that are as good as possible falls apart between and beside them. Random
 # ones are near and far, high and low, around every region; only those with a low view score are left out.
 
-SCORE_MARGIN = 0.5
-"""How much lower than the best candidate a random camera may score; photographs of real captures stay within it."""
-
-FIELDS_OF_VIEW = np.radians((50, 90))
-"""Smallest and largest angle of view along the longer side, radians: from phone to wide-angle lens."""
-
-NEAREST_RADII, FARTHEST_RADII = 0.8, 2.6
-"""Distances from the centre, radii of the scene, in front of a scene with a background."""
-
-MIN_ELEVATION, MAX_ELEVATION = -np.pi / 6, np.pi / 3
-"""Elevations above the ground as seen from the centre, radians, where the scene does not enclose the cameras."""
-
+SCORE_MARGIN = 0.5  # below the best candidate; photographs of real captures stay within it
+FIELDS_OF_VIEW = np.radians((50, 90))  # along the longer side, radians: from phone to wide-angle lens
+NEAREST_RADII, FARTHEST_RADII = 0.8, 2.6  # distances from the centre, where a scene has a background
+MIN_ELEVATION, MAX_ELEVATION = -np.pi / 6, np.pi / 3  # radians, where the scene does not enclose the cameras
 TARGET_SPREAD = 0.35  # standard deviation of the look-at target around the centre along each axis, radii of the scene
 MAX_COUNT_FACTOR = 4.0  # largest number of views of a scene with several regions, relative to count
 MAX_ATTEMPTS = 8  # largest number of poses that are drawn for each camera
@@ -343,9 +331,7 @@ NEAREST, FARTHEST = 10.0, 3.0
 of the proxy scene but at most a radius of the scene, and the largest one, radii."""
 
 ACROSS = 3  # one in this many cameras stands beside another Gaussian, and looks across the scene
-
-MAX_BESIDE = 8.0
-"""Largest distance of such a camera from the Gaussian beside it, local scales; the smallest one is a local scale."""
+MAX_BESIDE = 8.0  # largest distance of such a camera from the Gaussian beside it, local scales; one is the smallest
 
 
 def scattered_cameras(splats: Splats, *, side: int, count: int, seed: int = 0, threads: int = 0) -> list[Camera]:

@@ -165,10 +165,7 @@ def pose_distances(
 # so the good ones lie on the side that was captured. Among these, cameras far from each other are chosen.
 
 HOLD_OUT = 8  # one in this many virtual views is held out, starting with the first
-
-OVERVIEW_BONUS = 0.5
-"""Score of being e times as far from the centre, where one view or one orbit stands for the whole scene."""
-
+OVERVIEW_BONUS = 0.5  # of being e times as far from the centre, where one view or orbit stands for the scene
 MIN_OVERVIEW_RADII = 0.5  # distance in radii of the scene below which the overview bonus does not fall further
 
 

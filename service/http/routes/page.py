@@ -24,8 +24,7 @@ READ = ["GET", "HEAD"]
 
 STATIC = Path(__file__).parents[2] / "static"
 
-REVALIDATE = {"Cache-Control": "no-cache"}
-"""Headers that make browsers revalidate a cached file, so that old and new files do not mix after an upgrade."""
+REVALIDATE = {"Cache-Control": "no-cache"}  # so that old and new files do not mix after an upgrade
 
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'{hashes}; worker-src 'self' blob:; style-src 'self'; "
