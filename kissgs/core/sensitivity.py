@@ -137,13 +137,8 @@ class Sensitivity:
         (Fitted to photographs of a scene, logarithms of sensitivity from virtual cameras have weight 0.72, the prior
         0.23.) The result is at least :data:`FLOOR` · ``view_uncertainty`` times the prior.
 
-        The arrays of this object become those of the result, so that large scenes need no second set of them.
-
-        Args:
-            splats: the scene.
-            close_up: ``(N,)`` see :attr:`kissgs.rendering.sensitivity.Coverage.close_up`.
-            coverage: ``(N,)`` from 0 to 1, see :class:`kissgs.rendering.sensitivity.Coverage`.
-            view_uncertainty: 0 to 1; at 0 the prior is not used.
+        The arrays of this object become those of the result, so that large scenes need no second set of them. The class
+        ``Coverage`` of :mod:`kissgs.rendering.sensitivity` explains ``close_up`` and ``coverage``.
         """
         coverage = coverage.astype(np.float32)
         known = (self.color_weight > 0) & (close_up > 0) & (coverage > SEEN_COVERAGE)

@@ -35,17 +35,11 @@ LARGE_LOSS = 0.05  # loss of SSIM beyond which a patch counts in share_below
 
 @dataclass(frozen=True, slots=True)
 class Detail:
-    """Changes of SSIM in patches, -2 to 2 and negative for a loss; all NaN if a rendering failed.
+    """Changes of SSIM in patches, -2 to 2 and negative for a loss; all NaN if a rendering failed."""
 
-    Attributes:
-        worst: change of the worst patch.
-        worst_percent: mean change of the worst 1 % of all patches, rounded up to whole patches.
-        share_below: share of patches, 0 to 1, that lose more than :data:`LARGE_LOSS`.
-    """
-
-    worst: float
-    worst_percent: float
-    share_below: float
+    worst: float  # of the worst patch
+    worst_percent: float  # mean of the worst 1 % of all patches, rounded up to whole patches
+    share_below: float  # of patches, 0 to 1, that lose more than LARGE_LOSS
 
     @classmethod
     def of(cls, views: Sequence[PatchChanges]) -> Detail:

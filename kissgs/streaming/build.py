@@ -66,10 +66,8 @@ COARSER_STEPS = 1.6  # of levels of SH degree 0, in units of the finest level's,
 def file_settings(settings: EncodeSettings, level: int, sh_degree: int) -> EncodeSettings:
     """Return the settings of the files of a level.
 
-    There is one class of steps: within each leaf, classes would have an order of their own, which costs 5 % of the
-    bytes. Coarser levels are encoded less accurately, because the error of merging is larger than that of the finest
-    level's encoding; where there is no codebook that could be smaller, the steps are larger. docs/method/streaming.md
-    has what it saves and costs.
+    Classes of steps would have an order of their own within each leaf, which costs 5 % of the bytes. Merging has a
+    larger error than the finest level's encoding, so coarser levels are less accurate (docs/method/streaming.md).
     """
     settings = settings.model_copy(update={"step_classes": 1})
     if level == 0:
