@@ -43,9 +43,9 @@ def find_root(
     is the point of smallest margin that meets the goal; None if none does.
 
     ``margin`` is at least 0 where the goal is met, infinite where the distance to it is unknown, and may be slightly
-    non-monotone, as results of rounding are; ``slope`` is its approximate slope, whose sign must be right. A margin from
-    0 to ``tolerance`` ends the search. Points are whole multiples of ``grain``, if that is not 0; those of ``before`` are
-    known, neither count nor are returned.
+    non-monotone, as results of rounding are; ``slope`` is its approximate slope, whose sign must be right. A margin
+    from 0 to ``tolerance`` ends the search. Points are whole multiples of ``grain``, if that is not 0. Those of
+    ``before`` are known, and neither count nor are returned.
     """
     known = dict(before or {})
     attempts = stop.attempts + len(known)
