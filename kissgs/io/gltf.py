@@ -51,7 +51,7 @@ from kissgs.io.files import (
     refuse_more_than,
     whole_number,
 )
-from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, Notes, ReadOptions, titled
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
@@ -499,9 +499,7 @@ class _Column:
     dtype: str = "<f4"
 
 
-def write_glb(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
+def write_glb(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     ends = _ends(splats)
     columns, views, start = list(_columns(splats)), list[dict[str, int]](), 0
     for column in columns:
@@ -516,9 +514,7 @@ def write_glb(
     return tuple(marks_left_out(splats))
 
 
-def write_spz_glb(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
+def write_spz_glb(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     """Write a scene as ``.spz`` inside ``.glb``.
 
     The ``.spz`` has its own axes (x right, y up, z back), as the extension wants it, whose text has the library of

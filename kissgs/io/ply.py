@@ -37,7 +37,7 @@ from kissgs.io.ply_rows import (
     rows,
     sh_degree,
 )
-from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, Notes, ReadOptions, titled
 
 # PlayCanvas' compressed ``.ply``: Gaussians quantised to 16 bytes within chunks of 256, SH coefficients to one byte.
 #
@@ -163,9 +163,7 @@ def _require(ply: PlyFile, element: Element, names: tuple[str, ...], code: str) 
             )
 
 
-def write_compressed(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
+def write_compressed(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     """Write a scene in Morton order, so that the 256 Gaussians of a chunk are close to one another."""
     n, k = len(splats), splats.shN.shape[1]
     order = morton_order(splats.means)
@@ -324,9 +322,7 @@ def read_ply_blocks(source: Path) -> Iterator[Splats]:
                 waiting = []
 
 
-def write_ply(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
+def write_ply(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
     Positions are those of the world: float64 (``property double``) where float32 cannot hold them. An antialiased scene

@@ -88,7 +88,8 @@ def titled(name: str, *special: str | None) -> str:
 Read = Callable[[Any, ReadOptions, int, Progress], Splats]
 """Read a :data:`SceneSource` without cleaning it, with a number of threads (0: one per processor)."""
 
-Write = Callable[[BinaryWriter, Splats, bool, Progress], tuple[str, ...]]
+Notes = tuple[str, ...]
+Write = Callable[[BinaryWriter, Splats, bool, Progress], Notes]
 """Write a scene, with the axes of a ``.ply`` if true; return a phrase for each loss beyond the format's steps."""
 
 

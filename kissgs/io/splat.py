@@ -26,7 +26,7 @@ from kissgs.io.conventions import (
     to_bytes,
 )
 from kissgs.io.files import BinaryWriter, SceneFile, open_scene_file, refuse_more_than
-from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Notes, ReadOptions
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])  # one Gaussian
 
@@ -45,9 +45,7 @@ def read_splat(
         return splats
 
 
-def write_splat(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
+def write_splat(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     """Write a scene, large and opaque Gaussians first, as viewers that draw while they load expect."""
     logits = splats.opacities.astype(np.float64)
     log_weight = splats.scales.sum(axis=1, dtype=np.float64) - np.logaddexp(0, -logits)

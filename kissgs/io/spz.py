@@ -33,7 +33,7 @@ from kissgs.io.conventions import (
     to_codes,
 )
 from kissgs.io.files import BinaryWriter, SceneFile, listed, open_scene_file, refuse_degree, refuse_more_than
-from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, Notes, ReadOptions, titled
 
 # Decompression: gzip and zstd, bounded by what the header needs.
 
@@ -388,9 +388,7 @@ def _read_extensions(extensions: bytes, name: str) -> tuple[str, list[str]]:
 # Writing: version 3, one gzip member without extension records, which the most readers take.
 
 
-def write_spz(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
+def write_spz(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     count = len(splats)
     refuse_empty(splats, ".spz")
     reach = float(np.abs(splats.means).max())
