@@ -16,6 +16,8 @@ from kissgs.core.splats import MEAN_LIMIT, Splats, sampled_rows
 
 # Signed logarithm, in which positions are stored, and its inverse.
 
+MAX_SIGNED_LOG = 88.7  # largest signed logarithm of a position: exp of more exceeds float32
+
 
 def signed_log(x: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
     """Return sign(x) ln(1 + |x|), in float64."""

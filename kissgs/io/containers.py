@@ -21,7 +21,6 @@ MAX_DIRECTORY_BYTES = 1 << 21  # largest list of entries in a zip, which is read
 META_NAME = "meta.json"
 
 MAX_METADATA_BYTES = 1 << 20  # largest metadata file, bytes; kissgs writes 4 kB for SOG-XT, 15 kB for SOG
-MAX_SIGNED_LOG = 88.7  # largest signed logarithm of a position: exp of more exceeds float32
 
 _END, _END64 = b"PK\x05\x06", b"PK\x06\x07"
 _END_SIZE, _MAX_COMMENT = 22, 0xFFFF

@@ -10,17 +10,9 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.positions import WORLD, Origin, read_origin, signed_exp
+from kissgs.core.positions import MAX_SIGNED_LOG, WORLD, Origin, read_origin, signed_exp
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.io.containers import (
-    MAX_METADATA_BYTES,
-    MAX_SIGNED_LOG,
-    META_NAME,
-    Source,
-    is_antialiased,
-    is_file_name,
-    stated_text,
-)
+from kissgs.io.containers import MAX_METADATA_BYTES, META_NAME, Source, is_antialiased, is_file_name, stated_text
 from kissgs.io.conventions import OPACITY_OF_BYTE
 from kissgs.io.files import is_number, listed, parse_json, whole_number
 

@@ -15,10 +15,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from pydantic_core import PydanticCustomError
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.positions import WORLD, Origin, read_origin, recorded, signed_exp
+from kissgs.core.positions import MAX_SIGNED_LOG, WORLD, Origin, read_origin, recorded, signed_exp
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE, SH_REST_COUNTS
 from kissgs.formats import LEVELS_NAME, LOD_NAME
-from kissgs.io.containers import MAX_METADATA_BYTES, MAX_SIGNED_LOG, Source, is_antialiased, stated_text
+from kissgs.io.containers import MAX_METADATA_BYTES, Source, is_antialiased, stated_text
 from kissgs.io.files import parse_json
 from kissgs.sogxt.container import CHECKSUM, FORMAT, JSON_NAME, YAML_NAME
 

@@ -26,6 +26,7 @@ from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_l
 from kissgs.runners import Resources, Runner, WorkItem, error_of
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.streaming import build
+from kissgs.streaming import work_folder as scratch
 from kissgs.streaming.build import Blocks
 from kissgs.streaming.layout import (
     CAMERAS,
@@ -42,16 +43,6 @@ from kissgs.streaming.layout import (
     write_json,
 )
 from kissgs.streaming.levels import row_bytes
-from kissgs.streaming.work_folder import (
-    check_destination,
-    check_space,
-    claimed,
-    finish,
-    megabytes,
-    needed_bytes,
-    read_json,
-    remove,
-)
 
 # ``with_time_left``: progress events of the work items of a streamed scene, with an estimate of the time left.
 
@@ -175,14 +166,14 @@ def compress_streamed(
         manifest = manifest.parent.resolve() / manifest.name
     container, work = MANIFESTS[manifest.name], work_folder(manifest)
     _check_settings(settings)
-    if read_json(work / REPORT) is None:
-        check_destination(manifest, source, overwrite=overwrite)
-    with claimed(work, {"container": container, **_identity(source, settings, reading)}):
-        if (found := read_json(work / REPORT)) is None:
+    if scratch.read_json(work / REPORT) is None:
+        scratch.check_destination(manifest, source, overwrite=overwrite)
+    with scratch.claimed(work, {"container": container, **_identity(source, settings, reading)}):
+        if (found := scratch.read_json(work / REPORT)) is None:
             layout = _partition(work, source, container, settings, reading, threads, progress)
             found = asdict(_make(work, layout, settings, runner, threads, progress))
             write_json(work / REPORT, found)
-        finish(work, manifest, source, overwrite=overwrite)
+        scratch.finish(work, manifest, source, overwrite=overwrite)
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
 
 
@@ -239,7 +230,7 @@ def run_item(item: dict[str, Any], progress: Progress) -> dict[str, Any]:
     A node that was given up may still be at work: what it completes meanwhile, it takes the input of.
     """
     work, threads = Path(item["work"]), item["threads"]
-    if read_json(work / PARTITION) is None:
+    if scratch.read_json(work / PARTITION) is None:
         raise UnsupportedError(
             f"the machine {socket.gethostname()} does not see {work}; "
             "--ray needs storage that all machines see at the same path"
@@ -340,18 +331,20 @@ def _partition(
 ) -> Layout:
     """Partition the scene, unless that has been done."""
     announced = "{} takes up to {} until the work is done"  # the size of the work folder
-    if read_json(work / PARTITION) is not None:
+    if scratch.read_json(work / PARTITION) is not None:
         layout = read_layout(work)
-        needed = needed_bytes(layout.source_count, layout.sh_degree)
-        progress("scratch", 1.0, announced.format(work, megabytes(needed)))
+        needed = scratch.needed_bytes(layout.source_count, layout.sh_degree)
+        progress("scratch", 1.0, announced.format(work, scratch.megabytes(needed)))
         return layout
     encode, before = settings.encode, _identity(source, settings, reading)
     try:
         (work / OUT).mkdir(exist_ok=True)
         blocks, count, sh_degree = _reader(source, reading, threads)
-        needed = needed_bytes(count, sh_degree)
-        check_space(work, needed)  # later, files are deleted as others are written, so that the folder hardly grows
-        progress("scratch", 1.0, announced.format(work, megabytes(needed)))
+        needed = scratch.needed_bytes(count, sh_degree)
+        scratch.check_space(
+            work, needed
+        )  # later, files are deleted as others are written, so that the folder hardly grows
+        progress("scratch", 1.0, announced.format(work, scratch.megabytes(needed)))
         stages = with_time_left(progress, encode.rate_distortion)
         layout = build.partition(work, blocks, count, container, encode, stages)
         if not any(layout.counts):
@@ -359,7 +352,7 @@ def _partition(
         if _identity(source, settings, reading) != before:
             raise InvalidSceneError(f"{source} was changed while it was read; run the same command again")
     except BaseException:
-        remove(work)  # a partition that is not complete is of no use
+        scratch.remove(work)  # a partition that is not complete is of no use
         raise
     keep_layout(work, layout)
     return layout

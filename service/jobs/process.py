@@ -11,19 +11,7 @@ from typing import Any
 
 import kissgs
 from kissgs import runners
-from kissgs.runners import (
-    INTERNAL,
-    MEMORY_LIMIT,
-    NODE_UNUSABLE,
-    NOT_STARTED,
-    TIME_LIMIT,
-    UNREACHABLE,
-    Outcome,
-    Resources,
-    RunHandle,
-    Runner,
-    WorkItem,
-)
+from kissgs.runners import Outcome, Resources, RunHandle, Runner, WorkItem
 
 from ..core.settings import ServiceSettings
 from .job_process import without_paths
@@ -39,12 +27,12 @@ UNUSABLE_MACHINE = "the job's files cannot be used on this machine; try again la
 OnProgress = Callable[[str, float, str], Awaitable[None]]  # gets stage, fraction (0 to 1), and a note or ""
 
 
-POSTPONED = (UNREACHABLE, NOT_STARTED)  # codes of "lost" outcomes of jobs that cannot run at the moment
+POSTPONED = (runners.UNREACHABLE, runners.NOT_STARTED)  # codes of "lost" outcomes of jobs that cannot run at the moment
 
 
 def postponed(reason: str = "") -> Outcome:
     """Return the outcome of a job that cannot run at the moment."""
-    return Outcome("lost", code=NOT_STARTED, message=reason)
+    return Outcome("lost", code=runners.NOT_STARTED, message=reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +152,7 @@ class JobProcess:
             log.error("a job's process failed: %s\n%s", outcome.message, outcome.log)
         if outcome.kind in ("done", "cancelled") or outcome.code in POSTPONED:
             return outcome
-        if outcome.code == NODE_UNUSABLE:
+        if outcome.code == runners.NODE_UNUSABLE:
             return self._unusable(outcome)
         if outcome.kind == "lost":
             log.warning("a job was lost: %s", outcome.message)
@@ -182,11 +170,11 @@ class JobProcess:
         return Outcome("lost", code="internal", message=UNUSABLE_NODES)
 
     def _detail(self, outcome: Outcome, task: dict[str, Any]) -> str:
-        if outcome.code == TIME_LIMIT:
+        if outcome.code == runners.TIME_LIMIT:
             seconds = self._runner.settings.job_seconds
             return f"the job took longer than {seconds:g} s; choose a faster preset or fewer Gaussians"
-        if outcome.code == MEMORY_LIMIT:
+        if outcome.code == runners.MEMORY_LIMIT:
             return "the job exceeded its memory limit; submit a scene with fewer Gaussians"
-        if outcome.code == INTERNAL:
+        if outcome.code == runners.INTERNAL:
             return "the job failed because of an error in kissgs; please report it with the scene"
         return without_paths(outcome.message, task)
