@@ -20,13 +20,15 @@ class _Facts:
     """Texts and figures of a preset, and approximate CPU seconds: a fixed part, and a part per million Gaussians."""
 
     title: str
-    text: str
+    description: str
     bytes_per_gaussian: float
     psnr_change: float
-    encoding: float  # per million Gaussians
+    cpu_seconds_per_million: float  # of encoding
     training: tuple[float, float]  # of a compaction to one fifth
     tuning: tuple[float, float]  # of all Gaussians
 
+
+_STATED = ("title", "description", "bytes_per_gaussian", "psnr_change", "cpu_seconds_per_million")
 
 _FACTS: dict[kissgs.Preset, _Facts] = {
     kissgs.Preset.FAST: _Facts(
@@ -51,12 +53,8 @@ def presets() -> Presets:
         presets=[
             PresetFacts(
                 name=name,
-                title=facts.title,
-                description=facts.text,
                 settings=kissgs.Settings(preset=name).model_dump(mode="json"),
-                bytes_per_gaussian=facts.bytes_per_gaussian,
-                psnr_change=facts.psnr_change,
-                cpu_seconds_per_million=facts.encoding,
+                **{each: getattr(facts, each) for each in _STATED},
             )
             for name, facts in _FACTS.items()
         ],
@@ -76,7 +74,7 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     """
     name, *stages = kind.split("+")
     facts, millions = _FACTS[kissgs.Preset(name)], gaussians / 1e6
-    encoding = (facts.encoding + evaluate * EVALUATION) * millions
+    encoding = (facts.cpu_seconds_per_million + evaluate * EVALUATION) * millions
     compacts, tunes, searches = (suffix.removeprefix("+") in stages for suffix in (COMPACTED, FINETUNED, SEARCHED))
     training, tuning = (fixed + per_million * millions for fixed, per_million in (facts.training, facts.tuning))
     if compacts and tunes and searches:

@@ -91,8 +91,9 @@ class Queue:
         return min(300.0, max(1.0, min(map(self._remaining, self._running), default=1.0) / self._workers))
 
 
+_OF_JOBS = ("id", "name", "upload_bytes", "gaussians", "sh_degree", "starts", "problem")
 _OF_RESULTS = ("source_format", "compacted", "finetuning", "invisible", "cleaned", "evaluation")
-"""Entries of a result's summary that the status has under the same names."""
+"""Columns of a job, and entries of a result's summary, that the status has under the same names."""
 
 
 def job_status(job: Job, queue: Queue) -> JobStatus:
@@ -102,24 +103,18 @@ def job_status(job: Job, queue: Queue) -> JobStatus:
         seconds = queue.seconds_left(job)
         estimate = Estimate(seconds_left=round(seconds, 1), ready_at=as_datetime(queue.now + seconds))
     return JobStatus(
-        id=job.id,
-        name=job.name,
         state=State(job.state),
         position=queue.position(job) if waits else None,
         progress=Progress(stage=job.stage, fraction=job.fraction, note=job.note) if runs and job.stage else None,
         estimate=estimate,
         options=JobOptions.stored(job.options),
-        upload_bytes=job.upload_bytes,
-        gaussians=job.gaussians,
-        sh_degree=job.sh_degree,
         kept=result.get("count"),
         note=result.get("note") or None,
         sizes=_sizes(job),
         timings=_timings(job, queue.now),
-        starts=job.starts,
-        problem=job.problem,
         links=_links(job),
         expires_at=as_datetime(job.expires_at) if job.expires_at is not None else None,
+        **{name: getattr(job, name) for name in _OF_JOBS},
         **{name: result.get(name) for name in _OF_RESULTS},
     )
 
