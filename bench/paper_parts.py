@@ -16,7 +16,7 @@ from kissgs.core.array_types import Float32, UInt8
 from kissgs.core.context import Context
 from kissgs.core.resources import blas_workers
 from kissgs.core.splats import Splats
-from kissgs.io.planes import compress_images
+from kissgs.io.images import compress_images
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.planner import plan_encoding
 from kissgs.planning.quantize import MEANS_TOP, quantize

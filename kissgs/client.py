@@ -18,23 +18,16 @@ from urllib.parse import urlsplit
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import Cancelled, InvalidSceneError, KissgsError, RemoteError, UnsupportedError
 from kissgs.formats import ContainerName, named_container
-from kissgs.io.files import atomic_file, reason_of, refuse_existing
+from kissgs.io.files import atomic_file, open_scene_file, reason_of, refuse_existing
 from kissgs.settings import GROUPS, Settings
 
 if TYPE_CHECKING:
     import httpx
 
-BLOCK_BYTES = 1 << 18
-"""Size of the blocks in which files are uploaded and downloaded."""
-
-RETRY_SECONDS = 300.0
-"""Time for which requests to an overloaded or restarting service are repeated."""
-
-FIRST_RETRY_SECONDS = 8.0
-"""Time for which requests to a service that has never answered are repeated: its address may be wrong."""
-
-WAIT = "wait for server"
-"""Stage in which a request is repeated after a while."""
+BLOCK_BYTES = 1 << 18  # size of the blocks in which files are uploaded and downloaded
+RETRY_SECONDS = 300.0  # time for which requests to an overloaded or restarting service are repeated
+FIRST_RETRY_SECONDS = 8.0  # the same for a service that has never answered: its address may be wrong
+WAIT = "wait for server"  # stage in which a request is repeated after a while
 
 T = TypeVar("T")
 
@@ -157,7 +150,8 @@ class Remote:
         path = Path(source)
         options = {**_given(settings or Settings()), "format": container, "evaluate": evaluate}
         options |= {} if origin is None else {"origin": origin}
-        params, size = {"options": json.dumps(options), "name": path.name}, _size(path)
+        with open_scene_file(path) as opened:
+            params, size = {"options": json.dumps(options), "name": path.name}, opened.size
         headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
         headers["Idempotency-Key"] = uuid.uuid4().hex
 
@@ -283,7 +277,10 @@ class Remote:
                     raise
                 time_limit = f"{limit:.0f} seconds" if limit < 60 else f"{limit / 60:.0f} minutes"
                 reason = str(error).replace(str(self._http.base_url), "it")  # the command prints the address before it
-                _sleep(delay, progress, f"not ready ({reason}); trying again for {time_limit}")
+                end = time.monotonic() + delay
+                while time.monotonic() < end:  # in short steps: progress may raise
+                    progress(WAIT, 0.0, f"not ready ({reason}); trying again for {time_limit}")
+                    time.sleep(min(0.5, delay))
 
 
 def _is_address(server: str) -> bool:
@@ -296,14 +293,6 @@ def _is_address(server: str) -> bool:
         return False
 
 
-def _sleep(seconds: float, progress: Progress, why: str) -> None:
-    """Sleep in short steps that call ``progress``, which may raise."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        progress(WAIT, 0.0, why)
-        time.sleep(min(0.5, seconds))
-
-
 def _given(settings: Settings) -> dict[str, Any]:
     """Return the settings as JSON without what belongs to the preset, which the server's version decides."""
     values = settings.model_dump(mode="json", exclude_unset=True)
@@ -311,16 +300,6 @@ def _given(settings: Settings) -> dict[str, Any]:
         for name, group in GROUPS.items():
             values[name] = {key: value for key, value in values.get(name, {}).items() if key in group.public()}
     return values
-
-
-def _size(path: Path) -> int:
-    try:
-        if not path.is_file():
-            reason = "it is a folder or a device" if path.exists() else "there is no such file"
-            raise InvalidSceneError(f"cannot read {path}: {reason}; name a scene file")
-        return path.stat().st_size
-    except OSError as error:
-        raise InvalidSceneError(f"cannot read {path}: {reason_of(error)}") from error
 
 
 def _blocks(path: Path, size: int, progress: Progress) -> Iterator[bytes]:

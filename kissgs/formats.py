@@ -23,18 +23,12 @@ if TYPE_CHECKING:
 class Format:
     """Format of scenes."""
 
-    module: str
-    """Module that has the :class:`~kissgs.io.scene_format.Codec` as ``FORMAT``, of streamed scenes in ``STREAMED``."""
-    endings: tuple[str, ...] = ()
-    """Endings of files that are read, the usual one first; they decide where the content is not recognised."""
-    written: tuple[str, ...] = ()
-    """Endings of files that are written, containers by ``compress`` and others by ``save``."""
-    is_container: bool = False
-    """Whether the metadata describes a scene without decoding an image."""
-    manifest: str | None = None
-    """Name of the manifest of a scene in levels of detail."""
-    by_ending: bool = False
-    """Whether the ending decides before the content, which has no mark."""
+    module: str  # module that has the Codec as FORMAT, of streamed scenes in STREAMED
+    endings: tuple[str, ...] = ()  # that are read, the usual one first; they decide where the content does not
+    written: tuple[str, ...] = ()  # endings of files that are written, containers by compress and others by save
+    is_container: bool = False  # whether the metadata describes a scene without decoding an image
+    manifest: str | None = None  # name of the manifest of a scene in levels of detail
+    by_ending: bool = False  # whether the ending decides before the content, which has no mark
 
     @property
     def codec(self) -> Codec:
@@ -58,8 +52,7 @@ FORMATS = {
 }
 """All formats by name. "ply" stands for unknown content too, about which its reader has the best messages."""
 
-ContainerName = Literal["sogxt", "sog"]
-"""SOG-XT, the default, or SOG of version 2, which other viewers open."""
+ContainerName = Literal["sogxt", "sog"]  # SOG-XT, the default, or SOG of version 2, which other viewers open
 
 CONTAINERS: tuple[ContainerName, ...] = get_args(ContainerName)
 
@@ -72,17 +65,13 @@ SCENE_ENDINGS = tuple(ending for each in FORMATS.values() if not each.is_contain
 MANIFESTS: dict[str, ContainerName] = {LOD_NAME: "sog", LEVELS_NAME: "sogxt"}
 """Containers of a streamed scene by the name of its manifest; the first one decides which is read."""
 
-LEVELS_ENDING = ".sogxt"
-"""Ending of a folder for ``levels.json``."""
-
-FOLDER_ENDING = ".container"
-"""Ending of folders that the command line names after their scenes."""
+LEVELS_ENDING = ".sogxt"  # ending of a folder for levels.json
+FOLDER_ENDING = ".container"  # ending of folders that the command line names after their scenes
 
 WRITTEN = tuple(ending for each in FORMATS.values() if not each.is_container for ending in each.written)
 """Endings that ``save`` and ``kissgs convert`` write."""
 
-OUTPUT_FORMATS = tuple(ending.removeprefix(".") for ending in WRITTEN)
-"""Names of the formats that these endings stand for."""
+OUTPUT_FORMATS = tuple(ending.removeprefix(".") for ending in WRITTEN)  # what these endings stand for
 
 UPLOADS = {name: each.endings[0] for name, each in FORMATS.items() if each.endings}
 """Formats of one file, which can be sent to a service, and their usual endings."""

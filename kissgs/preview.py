@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import gzip
 import hashlib
 import html
@@ -37,8 +38,7 @@ from kissgs.sog.metadata import read_layout
 from kissgs.sogxt import decode as sogxt
 from kissgs.sogxt.container import zip_bytes
 
-PAGE_GAUSSIANS = 1_000_000
-"""Largest number of Gaussians of the level that a page of one file gets, so that phones open it."""
+PAGE_GAUSSIANS = 1_000_000  # largest number in the level that a page of one file gets, so that phones open it
 
 
 @dataclass(frozen=True)
@@ -71,20 +71,16 @@ def streamed_folder(source: Path) -> StreamedFolder:
         for name in (*tree.filenames, *([tree.environment] if tree.environment else [])):
             names += _container_files(opened, name)
     root = folder.resolve()
-    inside = {name: path for name in names if (path := _file_inside(root, name)) is not None}
+    inside = dict[str, Path]()
+    for name in names:
+        with contextlib.suppress(OSError, RuntimeError):  # a closed folder; a link to itself
+            path = (root / name).resolve()
+            if path.is_relative_to(root) and path.is_file():
+                inside[name] = path
     others = [name for name in names if name not in inside]
     unusable = tuple(name for name in others if os.path.lexists(root / name))
     missing = tuple(name for name in others if name not in unusable)
     return StreamedFolder(_stem(root), kind.manifest, inside, missing, unusable)
-
-
-def _file_inside(root: Path, name: str) -> Path | None:
-    """Return a file of a folder without links; None if it is missing, out of the folder, or out of reach."""
-    try:
-        path = (root / name).resolve()
-        return path if path.is_relative_to(root) and path.is_file() else None
-    except (OSError, RuntimeError):  # a closed folder; a link to itself
-        return None
 
 
 def _format(source: Path | bytes) -> StreamedFormat:
@@ -236,8 +232,7 @@ def _stem(source: Path | bytes) -> str:
 # as text, in an order in which each comes after those that it imports; ``web_decoder/standalone.js`` makes a blob of
 # each, and their imports name the blobs' addresses.
 
-_COMMENT = re.compile(r"/\*\*.*?\*/", re.DOTALL)
-"""Comments with types and examples, whose imports are none; minified files have no others than licences."""
+_COMMENT = re.compile(r"/\*\*.*?\*/", re.DOTALL)  # with examples, whose imports are none; not of minified files
 
 _IMPORT = re.compile(r"""(\b(?:from|import)\s*\(?\s*)(["'])([^"'\n]+)\2""")
 _WORKER = re.compile(r"""new URL\("([^"]+)", import\.meta\.url\)""")
@@ -262,11 +257,15 @@ def standalone_page(scene: PageScene) -> bytes:
         f'<script type="text/plain" id="modules">{_base64(packed)}</script>\n'
         f'<script type="text/plain" id="embedded-scene" data-name="{title}">{_base64(scene.data)}</script>\n'
     )
+    texts = (
+        f"{name.split('/')[1]}: {_text(path).strip()}" for name, path in files.items() if name.endswith("/LICENSE")
+    )
+    licences = "\n\n".join(texts).replace("--", "- -")  # of the libraries inside, which ask for that
     for pattern, text in (
         (r'<meta charset="utf-8" />\n\s*', lambda found: found + meta),
         (r"<title>.*?</title>", lambda _: f"<title>{title} · kissgs</title>"),
         (r'<link rel="stylesheet"[^>]*>', lambda _: f"<style>{style}</style>"),
-        (r'<script type="importmap">.*?</script>', lambda _: _licences(files)),
+        (r'<script type="importmap">.*?</script>', lambda _: f"<!--\n{licences}\n-->"),
         (r'<script type="module" src=[^>]*></script>\n', lambda _: ""),
         (r"</body>", lambda found: f'{blocks}<script type="module">{start}</script>\n{found}'),
     ):
@@ -317,19 +316,10 @@ def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode()
 
 
-def _licences(files: dict[str, Path]) -> str:
-    """Return a comment with the licences of the libraries inside, which ask for that."""
-    texts = [
-        f"{name.split('/')[1]}: {_text(path).strip()}" for name, path in files.items() if name.endswith("/LICENSE")
-    ]
-    return "<!--\n" + "\n\n".join(texts).replace("--", "- -") + "\n-->"
-
-
 # A server of the preview page and one scene.
 
 HOST = "127.0.0.1"
-SLOWEST_SECONDS = 60
-"""A client that sends or takes nothing for this long is disconnected."""
+SLOWEST_SECONDS = 60  # a client that sends or takes nothing for this long is disconnected
 
 _TYPES = {
     ".html": "text/html; charset=utf-8",

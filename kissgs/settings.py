@@ -8,17 +8,8 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ByteSize,
-    ConfigDict,
-    Field,
-    GetJsonSchemaHandler,
-    TypeAdapter,
-    ValidationError,
-    model_validator,
-)
+import pydantic
+from pydantic import BaseModel, BeforeValidator, ByteSize, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from kissgs.core.errors import UnsupportedError
@@ -58,7 +49,9 @@ class StageSettings(BaseModel):
         return [name for name, field in cls.model_fields.items() if field.json_schema_extra != _OF_PRESET]
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: pydantic.GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         """Leave out what belongs to the preset; answers of the service contain it, so that other names are open."""
         reference = handler(core_schema)
         schema, names = handler.resolve_ref_schema(reference), cls.public()
@@ -648,7 +641,7 @@ def _shared_by_trainings(encode: Any) -> dict[str, Any]:  # noqa: ANN401
     shared = dict[str, Any]()
     if isinstance(encode, dict):
         with contextlib.suppress(ValidationError):  # reported once, for the encoder
-            shared["seed"] = TypeAdapter(Seed).validate_python(encode.get("seed", 0))
+            shared["seed"] = pydantic.TypeAdapter(Seed).validate_python(encode.get("seed", 0))
         if encode.get("max_ssim_drop") is not None or encode.get("quality") is not None:
             shared["ssim_weight"] = SSIM_GOAL_WEIGHT
     return shared

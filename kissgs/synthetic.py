@@ -29,8 +29,7 @@ from kissgs.core.splats import (
 UV = Float32[np.ndarray, "M 2"]
 Rows = Float32[np.ndarray, "M 3"]
 Column = Float32[np.ndarray, " M"]
-Patch = tuple[Rows, Rows, Column]
-"""Points, unit normals, and the area of the surface per unit of the square."""
+Patch = tuple[Rows, Rows, Column]  # points, unit normals, and the area of the surface per unit of the square
 
 
 def f32(values: Sequence[Any] | np.ndarray) -> Float32[np.ndarray, "..."]:

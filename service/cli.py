@@ -31,9 +31,8 @@ class _Parser(argparse.ArgumentParser):
 
 def run() -> None:
     """Do what the command line asks for. What is wrong with the settings ends in one message and exit code 2."""
-    parser = _Parser(
-        "kissgs-serve", description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = _Parser("kissgs-serve", description=__doc__, epilog=EPILOG, formatter_class=raw)
     parser.add_argument("--version", action="version", version=f"kissgs {kissgs.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.add_parser("run", help="serve (what happens without a command, too)")
@@ -51,7 +50,9 @@ def run() -> None:
         case "key":
             _make_key(given.owner)
         case "settings":
-            _list_settings()
+            for name, field in ServiceSettings.model_fields.items():
+                default = field.default if field.default not in (None, ()) else "not set"
+                sys.stdout.write(f"KISSGS_{name.upper()}\n    {field.description} Default: {default}\n")
         case _:
             _run()
 
@@ -111,12 +112,6 @@ def _make_key(owner: str) -> None:
         f"give the owner, who sends it as 'Authorization: Bearer …', and keep no copy:\n  {key}\n"
         f"add to KISSGS_KEYS, which may have several of one owner while keys are exchanged:\n  {owner}:{digest}\n"
     )
-
-
-def _list_settings() -> None:
-    for name, field in ServiceSettings.model_fields.items():
-        default = field.default if field.default not in (None, ()) else "not set"
-        sys.stdout.write(f"KISSGS_{name.upper()}\n    {field.description} Default: {default}\n")
 
 
 def _fail(error: Exception) -> NoReturn:

@@ -20,17 +20,11 @@ from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
 # EXIF orientation is ignored, as by COLMAP and 3DGS trainers: cameras refer to the pixels as stored.
 
-FORMATS = tuple(
-    plugin.format
-    for plugin in (
-        JpegImagePlugin.JpegImageFile,
-        PngImagePlugin.PngImageFile,
-        WebPImagePlugin.WebPImageFile,
-        TiffImagePlugin.TiffImageFile,
-        BmpImagePlugin.BmpImageFile,
-    )
+_PLUGINS = (
+    *(JpegImagePlugin.JpegImageFile, PngImagePlugin.PngImageFile, WebPImagePlugin.WebPImageFile),
+    *(TiffImagePlugin.TiffImageFile, BmpImagePlugin.BmpImageFile),
 )
-"""Formats that are read; Pillow's rarely used readers are kept away from untrusted files."""
+FORMATS = tuple(plugin.format for plugin in _PLUGINS)  # Pillow's other readers get no untrusted files
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 """Extensions of photographs, in lower case; any other suffix is part of the name."""
@@ -43,11 +37,8 @@ DRAFT_PIXELS = 89_478_485
 """A JPEG with more pixels is decoded at a half, a quarter or an eighth of its size where the requested one is smaller;
 others are decoded whole. Pillow warns above this number."""
 
-BAND_PIXELS = 1 << 22
-"""Number of pixels that are converted to RGB at a time where that needs numbers larger than a byte."""
-
-QUARTER_TURNS = (5, 6, 7, 8)
-"""Values of EXIF's orientation that exchange width and height."""
+BAND_PIXELS = 1 << 22  # converted to RGB at a time where that needs numbers larger than a byte
+QUARTER_TURNS = (5, 6, 7, 8)  # values of EXIF's orientation that exchange width and height
 
 _ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
 
@@ -169,14 +160,9 @@ def _band_to_rgb(band: Image.Image, background: Float32[np.ndarray, "3"]) -> UIn
 # The distortion model is Brown's with OpenCV's coefficients, which COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and
 # FULL_OPENCV and nerfstudio share. Fisheye lenses have other models, which the readers of camera files reject.
 
-MIN_AREA = 0.1
-"""Minimum share of the photograph's area that must remain; real lenses keep more than half."""
-
-_BLOCK_PIXELS = 1 << 14
-"""Number of pixels undistorted at a time, so that temporaries of about 2 MB stay in the processor's cache."""
-
-_GRID = 33
-"""Points per side at which the interior of a window is checked; its border is checked at every pixel."""
+MIN_AREA = 0.1  # minimum share of the photograph's area that must remain; real lenses keep more than half
+_BLOCK_PIXELS = 1 << 14  # undistorted at a time: temporaries of about 2 MB stay in the processor's cache
+_GRID = 33  # points per side at which the interior of a window is checked; its border is checked at every pixel
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +179,6 @@ class Distortion:
     k6: float = 0.0
 
     def __bool__(self) -> bool:
-        """Whether the lens distorts at all."""
         return any(astuple(self))
 
     def apply(

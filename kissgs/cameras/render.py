@@ -36,25 +36,19 @@ from kissgs.rendering.images import Label, contact_sheet, reframed, render_all
 from kissgs.rendering.rasterizer import BLACK, Colour
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Orbit:
     """A horizontal circle around a look-at target, and the arc of it from which the scene looks good."""
 
-    target: Vec3
-    """Point that all cameras look at, world units."""
-    radius: float
-    """Distance of the cameras from the target, world units; 0 to look around from the target itself."""
-    elevation: float
-    """Elevation of the cameras as seen from the target, radians."""
+    target: Vec3  # point that all cameras look at, world units
+    radius: float  # distance of the cameras from the target, world units; 0 to look around from the target itself
+    elevation: float  # elevation of the cameras as seen from the target, radians
     up: Vec3
-    mid_azimuth: float = 0.0
-    """Azimuth of the middle of the arc; of a full circle, the azimuth with the best view; radians."""
-    sweep: float = 2 * np.pi
-    """Length of the arc, radians; 2 pi for a full circle."""
+    mid_azimuth: float = 0.0  # of the middle of the arc; on a full circle, that of the best view; radians
+    sweep: float = 2 * np.pi  # length of the arc, radians; 2 pi for a full circle
 
     @property
     def full(self) -> bool:
-        """Whether the path is a full circle."""
         return self.sweep >= 2 * np.pi
 
     @property
@@ -79,12 +73,8 @@ class Orbit:
             azimuths = self.mid_azimuth + np.arange(frames) * (2 * np.pi / frames)
             return [self.camera(float(azimuth), width, height) for azimuth in azimuths]
         phases = [_swing_phase(frame, frames) for frame in range(frames)]
-        by_phase = {
-            phase: self.camera(
-                self.mid_azimuth + 0.5 * self.sweep * float(np.sin(np.pi * phase / frames)), width, height
-            )
-            for phase in sorted(set(phases))
-        }
+        swings = {phase: 0.5 * self.sweep * float(np.sin(np.pi * phase / frames)) for phase in sorted(set(phases))}
+        by_phase = {phase: self.camera(self.mid_azimuth + swing, width, height) for phase, swing in swings.items()}
         return [by_phase[phase] for phase in phases]
 
     def sheet_cameras(self, frames: int, width: int, height: int) -> list[Camera]:
@@ -114,29 +104,14 @@ def _swing_phase(frame: int, frames: int) -> int:
 # Horizontal circles of several radii and elevations are scored by thumbnails all along them, like virtual cameras. A
 # scene that was captured from one side dissolves towards the ends of the arc, where the path turns back.
 
-COARSE_STEPS = 24
-"""Number of thumbnails along each circle."""
-
-FINE_STEPS = 72
-"""Number of thumbnails along the circle that is selected."""
-
-FULL_CIRCLE_TOLERANCE = 0.15
-"""How much lower than on an arc the scores on a full circle may be: to pass a weak view is better than to turn back."""
-
-MIN_SWEEP = float(np.radians(30))
-"""Shortest arc, radians; on a shorter one the motion would hardly be noticed."""
-
-RADII = (1.1, 1.5, 2.0, 2.6)
-"""Radii of circles around the centre of a scene with a background, in radii of the scene."""
-
-ELEVATIONS = (5, 15, 28)
-"""Elevations of circles as seen from the centre, degrees."""
-
-OBJECT_MARGIN = 1.1
-"""Size of the frame around an object that stands alone, relative to the object."""
-
-LOOK_AROUND_PITCH = 6
-"""Downward pitch of cameras that look around from one position, degrees."""
+COARSE_STEPS = 24  # number of thumbnails along each circle
+FINE_STEPS = 72  # number of thumbnails along the circle that is selected
+FULL_CIRCLE_TOLERANCE = 0.15  # of scores on a full circle: to pass a weak view is better than to turn back
+MIN_SWEEP = float(np.radians(30))  # shortest arc, radians; on a shorter one the motion would hardly be noticed
+RADII = (1.1, 1.5, 2.0, 2.6)  # radii of circles around the centre of a scene with a background, in radii of the scene
+ELEVATIONS = (5, 15, 28)  # elevations of circles as seen from the centre, degrees
+OBJECT_MARGIN = 1.1  # size of the frame around an object that stands alone, relative to the object
+LOOK_AROUND_PITCH = 6  # downward pitch of cameras that look around from one position, degrees
 
 
 def find_orbit(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: int = 640, height: int = 480) -> Orbit:
@@ -151,8 +126,7 @@ def find_orbit(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: int
             circles = list(_circles_in_scene(bounds, enclosed=candidates.kind == "enclosed"))
         scores = _scores(circles, COARSE_STEPS, candidates)
         ranks = [
-            _rank(score - min_score, circle.radius / bounds.radius)
-            for circle, score in zip(circles, scores, strict=True)
+            _rank(score - min_score, each.radius / bounds.radius) for each, score in zip(circles, scores, strict=True)
         ]
         best = circles[max(range(len(circles)), key=lambda n: ranks[n])]
         fine_scores = _scores([best], FINE_STEPS, candidates)[0]
@@ -171,16 +145,11 @@ def _circles_in_scene(bounds: SceneBounds, *, enclosed: bool) -> Iterator[Orbit]
     """Yield circles around the centre; if the scene encloses the cameras, also orbits of radius 0 that look around."""
     for radius in RADII:
         for elevation in ELEVATIONS:
-            yield Orbit(
-                target=bounds.centre,
-                radius=radius * bounds.radius,
-                elevation=float(np.radians(elevation)),
-                up=bounds.up,
-            )
+            yield Orbit(bounds.centre, radius * bounds.radius, float(np.radians(elevation)), bounds.up)
     if enclosed:
         for rise in (0.0, 0.4):
             position = bounds.centre + rise * bounds.radius * bounds.up
-            yield Orbit(target=position, radius=0.0, elevation=float(np.radians(LOOK_AROUND_PITCH)), up=bounds.up)
+            yield Orbit(position, 0.0, float(np.radians(LOOK_AROUND_PITCH)), bounds.up)
 
 
 def _circles_around_object(splats: Splats, bounds: SceneBounds, aspect: float) -> Iterator[Orbit]:
@@ -200,7 +169,7 @@ def _circles_around_object(splats: Splats, bounds: SceneBounds, aspect: float) -
         half_extent_up = half_height * np.cos(elevation) + radius * np.sin(elevation)
         half_depth = radius * np.cos(elevation) + half_height * np.sin(elevation)
         distance = max(OBJECT_MARGIN * max(radius / slopes[0], half_extent_up / slopes[1]), 2 * NEAR) + half_depth
-        yield Orbit(target=target, radius=float(distance), elevation=float(elevation), up=bounds.up)
+        yield Orbit(target, float(distance), float(elevation), bounds.up)
 
 
 def _rank(surplus: Float64[np.ndarray, " steps"], radii: float) -> tuple[bool, float]:
@@ -254,34 +223,25 @@ def _with_arc(circle: Orbit, scores: Float64[np.ndarray, " steps"], min_score: f
 IMAGE_SIZE, FRAME_SIZE, CELL_SIZE = (1280, 960), (640, 480), (320, 240)
 """Default (width, height), pixels: of a single image, of an animation's frames, of the images on a contact sheet."""
 
-ANIMATION_FRAMES, SHEET_FRAMES = 48, 24
-"""Default number of images of an orbit, in an animation and on a contact sheet."""
+ANIMATION_FRAMES, SHEET_FRAMES = 48, 24  # default number of images of an orbit, in an animation and on a contact sheet
 
 HELD_OUT = " · held out"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedImages:
-    """Result of a render job."""
-
-    images: Sequence[UInt8[np.ndarray, "H W 3"]]
-    """One image or contact sheet, or the frames of an animation."""
-    views: Sequence[View]
-    """The views that were rendered, in the world's coordinates; for a contact sheet, those of all its cells."""
-    description: str
-    """Description of the views, for people."""
+    images: Sequence[UInt8[np.ndarray, "H W 3"]]  # one image or contact sheet, or the frames of an animation
+    views: Sequence[View]  # in the world's coordinates; of a contact sheet, those of all its cells
+    description: str  # description of the views, for people
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RenderJob:
     """Renderer of a scene with the choices of ``kissgs render``."""
 
-    splats: Splats
-    """Without non-finite values (:func:`kissgs.clean`)."""
-    size: tuple[int, int] | None = None
-    """(width, height) of each image, pixels; None for the camera's size, else for the default."""
-    background: Colour | None = None
-    """RGB, 0 to 1; None for that of the capture, else black."""
+    splats: Splats  # without non-finite values (clean)
+    size: tuple[int, int] | None = None  # of each image, pixels; None: the camera's size, else the default
+    background: Colour | None = None  # RGB, 0 to 1; None for that of the capture, else black
     context: Context = DEFAULT_CONTEXT
 
     def single(self, capture: Views | None, which: str | None) -> RenderedImages:

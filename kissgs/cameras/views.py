@@ -16,26 +16,21 @@ from kissgs.rendering.constants import NEAR
 
 # Geometry of cameras that are drawn at random, of the encoder's and of the evaluation's.
 
-Vec3 = Float64[np.ndarray, "3"]
-"""``(3,)`` float64, a point or a direction in world space."""
-
-UP = np.array([0.0, -1.0, 0.0])
-"""Up direction in the images of cameras whose roll does not matter."""
+Vec3 = Float64[np.ndarray, "3"]  # (3,) float64, a point or a direction in world space
+UP = np.array([0.0, -1.0, 0.0])  # up direction in the images of cameras whose roll does not matter
 
 MIN_DISTANCE = 5 * NEAR
 """Smallest distance of a camera to its target, world units. Nearer, the near plane would cut the target off; such a
 camera stands at this distance with a longer lens, which shows the same part of the scene."""
 
-MIN_FIELD_OF_VIEW = 1e-9
-"""Smallest angle of view of such a lens, radians."""
+MIN_FIELD_OF_VIEW = 1e-9  # smallest angle of view of such a lens, radians
 
 
 def check_images(count: int, width: int, height: int) -> None:
     """Check the number of images to be rendered, and their size in pixels."""
     if min(count, width, height) < 1:
-        raise InvalidViewsError(
-            f"there must be at least 1 image of at least 1x1 pixels, not {count} of {width}x{height}"
-        )
+        found = f"{count} of {width}x{height}"
+        raise InvalidViewsError(f"there must be at least 1 image of at least 1x1 pixels, not {found}")
 
 
 def random_direction(rng: np.random.Generator) -> Vec3:
@@ -148,9 +143,8 @@ class View:
             UnsupportedError: it has 32 bits per channel.
         """
         if self.photo is None:
-            raise InvalidViewsError(
-                f"view {self.name} has no photograph, only a camera; add the photographs of the capture"
-            )
+            remedy = "add the photographs of the capture"
+            raise InvalidViewsError(f"view {self.name} has no photograph, only a camera; {remedy}")
         background = black() if self.background is None else self.background
         sampling = self._sampling
         stride, (column, row) = sampling.stride, sampling.first

@@ -10,6 +10,7 @@ import sys
 from typing import Annotated, NoReturn
 
 import typer
+from typer import Option
 
 from kissgs._version import __version__
 from kissgs.cli.bench import bench, warmup
@@ -36,7 +37,6 @@ app = typer.Typer(
 
 
 def run() -> None:
-    """Run the command line."""
     if logging.lastResort is not None:  # prints the warnings of the library
         logging.lastResort.setFormatter(logging.Formatter("kissgs: %(message)s"))
     unwinding(_run)
@@ -64,7 +64,7 @@ app.add_typer(remote)
 
 
 @app.callback(invoke_without_command=True)
-def _version(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+def _version(version: Annotated[bool, Option("--version", help="Print the version and exit.")] = False) -> None:
     if version:
         typer.echo(f"kissgs {__version__}")
         raise typer.Exit

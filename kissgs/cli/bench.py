@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
+from typer import Argument, Option
 
 from kissgs.cli.files import progress_bar, show, write_output
 from kissgs.cli.options import ForceOption, ViewsOption, chosen, open_views, output_option
@@ -39,8 +40,7 @@ if TYPE_CHECKING:
 
 # ``kissgs warmup``: compile all kernels in advance, and measure the speed of the machine.
 
-SAMPLE_COUNT = 20_000
-"""Gaussians of the synthetic scene that is encoded to measure the speed."""
+SAMPLE_COUNT = 20_000  # Gaussians of the synthetic scene that is encoded to measure the speed
 
 
 def warmup() -> None:
@@ -85,11 +85,8 @@ def _measure_speed() -> None:
 
 Measured = TypeVar("Measured")
 
-Row = dict[str, Any]
-"""A line of the CSV file: bytes, seconds and decibels by name."""
-
-TIMES = ("5s", "30s", "2min")
-"""Default time limits."""
+Row = dict[str, Any]  # a line of the CSV file: bytes, seconds and decibels by name
+TIMES = ("5s", "30s", "2min")  # default time limits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,14 +101,13 @@ class Measurement:
 
 
 def bench(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene of any format that kissgs reads.")],
+    scene: Annotated[Path, Argument(metavar="SCENE", help="Scene of any format that kissgs reads.")],
     presets: Annotated[
-        list[str] | None,
-        typer.Option("--preset", "-p", help="Preset to measure; repeatable. Default, without --time: all."),
+        list[str] | None, Option("--preset", "-p", help="Preset to measure; repeatable. Default, without --time: all.")
     ] = None,
     times: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--time",
             metavar="TIME",
             help="Time limit to measure; repeatable. Default, without --preset: 5s, 30s and 2min.",
@@ -119,8 +115,7 @@ def bench(
     ] = None,
     views: ViewsOption = None,
     output: Annotated[
-        Path | None,
-        output_option("Write the table as CSV, and beside it a plot as PNG.", metavar="FILE.csv"),
+        Path | None, output_option("Write the table as CSV, and beside it a plot as PNG.", metavar="FILE.csv")
     ] = None,
     force: ForceOption = False,
 ) -> None:

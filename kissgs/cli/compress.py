@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 from kissgs.cli.files import CHECKPOINT, Result, Work, for_each_input, progress_bar, say_notes, sibling, source, stdout
 from kissgs.cli.options import (
@@ -40,31 +40,29 @@ class CompactionOptions:
 
     count: Annotated[
         int | None,
-        typer.Option(
+        Option(
             "--count", "-n", metavar="N", parser=count_of, help="Number of Gaussians to keep, such as 200k or 1.5M."
         ),
     ] = None
     ratio: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", parser=share_of, help="Share of the Gaussians to keep, such as 0.2 or 20%."),
+        Option(metavar="SHARE", parser=share_of, help="Share of the Gaussians to keep, such as 0.2 or 20%."),
     ] = None
     max_psnr_drop: Annotated[
-        float | None,
-        typer.Option(metavar="DB", help="Keep as few Gaussians as lose at most this PSNR. Takes several runs."),
+        float | None, Option(metavar="DB", help="Keep as few Gaussians as lose at most this PSNR. Takes several runs.")
     ] = None
     method: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="METHOD",
             help="prune: remove what images miss least, and train the rest. merge: replace neighbours by one Gaussian; "
             "takes seconds, needs neither views nor torch. Default: prune.",
         ),
     ] = None
     preset: PresetOption = "balanced"
-    changes: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", hidden=True)] = None
+    changes: Annotated[list[str] | None, Option("--set", metavar="NAME=VALUE", hidden=True)] = None
 
     def settings(self) -> Settings:
-        """Return the settings that these options stand for."""
         given = {name: getattr(self, name) for name in ("method", "count", "ratio", "max_psnr_drop")}
         settings = chosen(self.preset, self.changes, group="compact", compact=given)
         if not settings.compact.enabled:
@@ -78,13 +76,12 @@ class CompactionOptions:
 def compact(
     scenes: ScenesArgument,
     output: Annotated[
-        str | None,
-        output_option("Output NAME.ply, a folder, or '-' for standard output. Required."),
+        str | None, output_option("Output NAME.ply, a folder, or '-' for standard output. Required.")
     ] = None,
     *,
     compaction: CompactionOptions,
     evaluate: Annotated[
-        bool, typer.Option("--evaluate", help="Measure PSNR, SSIM, MS-SSIM and compressed size after every step.")
+        bool, Option("--evaluate", help="Measure PSNR, SSIM, MS-SSIM and compressed size after every step.")
     ] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -151,24 +148,22 @@ def compress(
     encoding: EncodingOptions,
     time: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--time",
             metavar="TIME",
             help="Time for each scene, such as 30s, 2min or 1h: the best that is found in it. With a goal, which comes "
             "first, it bounds the search. --evaluate takes longer.",
         ),
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="Seed of all random choices; same seed, same result. Default: 0.")
-    ] = None,
-    unpacked: Annotated[bool, typer.Option("--unpacked", help="Write a folder instead of a zip.")] = False,
+    seed: Annotated[int | None, Option(help="Seed of all random choices; same seed, same result. Default: 0.")] = None,
+    unpacked: Annotated[bool, Option("--unpacked", help="Write a folder instead of a zip.")] = False,
     training: TrainingOptions,
     cache: Annotated[
-        bool, typer.Option("--cache", help="Cache the sensitivity next to the scene as NAME.sensitivity.npz.")
+        bool, Option("--cache", help="Cache the sensitivity next to the scene as NAME.sensitivity.npz.")
     ] = False,
     ray: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--ray",
             metavar="[HOST:PORT]",
             help="Compress the scenes on the nodes of a Ray cluster: all machines must see scenes, outputs and --views "

@@ -85,7 +85,6 @@ class SceneCompression(BaseModel):
 
 
 def compress_here(options: SceneCompression, capture: Views | None, scene: str, target: Path) -> Result:
-    """Compress a scene."""
     piped = str(target) == "-"
     searches = resolved(options.settings, capture).searches
     with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:
@@ -151,8 +150,7 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
 
 # ``kissgs compress --ray``: scenes as work items on the nodes of a Ray cluster.
 
-PROCESS_BYTES = 500_000_000
-"""Memory that a scene of any size needs, bytes: mostly the libraries."""
+PROCESS_BYTES = 500_000_000  # memory that a scene of any size needs, bytes: mostly the libraries
 
 MEMORY_RATIO, TRAINING_RATIO, PACKED_RATIO = 4, 12, 10
 """Memory that a scene needs for each byte of its ``.ply``: without and with training; and by how much the files of

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from kissgs.cli.files import Result, for_each_input, gaussians, progress_bar, say_notes, source, stdout
 from kissgs.cli.options import (
@@ -93,15 +93,14 @@ def decompress(
 def convert(
     files: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             metavar="IN… OUT",
             help=f"Scenes ('-' reads standard input), then the output: NAME{alternatives(WRITTEN)}; with --to also a "
             "folder, or '-' for standard output.",
         ),
     ],
     to: Annotated[
-        str | None,
-        typer.Option("--to", help=f"Format where OUT has no ending: {alternatives(OUTPUT_FORMATS)}."),
+        str | None, Option("--to", help=f"Format where OUT has no ending: {alternatives(OUTPUT_FORMATS)}.")
     ] = None,
     origin: OriginOption = None,
     force: ForceOption = False,
@@ -162,9 +161,9 @@ def _output_format(output: str, to: str | None) -> str:
 
 
 def sample(
-    output: Annotated[Path, typer.Argument(help="Output NAME.ply; other formats as for convert.")],
-    gaussians: Annotated[int, typer.Option(min=0, help="Number of Gaussians.")] = 60_000,
-    degree: Annotated[int, typer.Option(min=0, max=3, help="Degree of the spherical harmonics.")] = 3,
+    output: Annotated[Path, Argument(help="Output NAME.ply; other formats as for convert.")],
+    gaussians: Annotated[int, Option(min=0, help="Number of Gaussians.")] = 60_000,
+    degree: Annotated[int, Option(min=0, max=3, help="Degree of the spherical harmonics.")] = 3,
     force: ForceOption = False,
 ) -> None:
     """Write a synthetic sample scene: shiny, textured objects on a table."""

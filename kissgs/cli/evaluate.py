@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from kissgs.cli.files import print_json, progress_bar, say_notes, show
 from kissgs.cli.options import CaptureOptions, ForceOption, SceneOptions, one_of, with_option_groups
@@ -22,37 +22,31 @@ Split = Literal["test", "train", "all"]
 
 @with_option_groups
 def evaluate(
-    reference: Annotated[
-        Path, typer.Argument(metavar="REFERENCE", help="Original scene, of any format that kissgs reads.")
-    ],
+    reference: Annotated[Path, Argument(metavar="REFERENCE", help="Original scene, of any format that kissgs reads.")],
     candidate: Annotated[
-        Path, typer.Argument(metavar="CANDIDATE", help="Scene to evaluate, of any format that kissgs reads.")
+        Path, Argument(metavar="CANDIDATE", help="Scene to evaluate, of any format that kissgs reads.")
     ],
     *,
     capture: CaptureOptions,
     split: Annotated[
         Split,
-        typer.Option(
+        Option(
             metavar="NAME",
             parser=one_of("--split", "test", "train", "all"),
             help="Views of --views to use: test (held-out), train or all.",
         ),
     ] = "test",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual cameras.")] = 0,
+    seed: Annotated[int, Option(min=0, help="Seed of the virtual cameras.")] = 0,
     distance: Annotated[
-        float,
-        typer.Option(metavar="FACTOR", help="Move the virtual cameras to this many times their distance, such as 4."),
+        float, Option(metavar="FACTOR", help="Move the virtual cameras to this many times their distance, such as 4.")
     ] = 1.0,
-    flip: Annotated[bool, typer.Option("--flip", help="Also measure FLIP; needs the extra kissgs\\[flip].")] = False,
-    lpips: Annotated[
-        bool, typer.Option("--lpips", help="Also measure LPIPS; needs the extra kissgs\\[lpips].")
-    ] = False,
+    flip: Annotated[bool, Option("--flip", help="Also measure FLIP; needs the extra kissgs\\[flip].")] = False,
+    lpips: Annotated[bool, Option("--lpips", help="Also measure LPIPS; needs the extra kissgs\\[lpips].")] = False,
     html: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write an HTML report with renderings of both scenes and error maps."),
+        Path | None, Option(metavar="FILE", help="Write an HTML report with renderings of both scenes and error maps.")
     ] = None,
     force: ForceOption = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON report.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print a JSON report.")] = False,
     common: SceneOptions,
 ) -> None:
     """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""

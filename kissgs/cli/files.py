@@ -99,8 +99,7 @@ class Result:
     shown: RenderableType
 
 
-Work = Callable[[str, Path], Result]
-"""Gets an input and the path of its output, "-" for standard output."""
+Work = Callable[[str, Path], Result]  # gets an input and the path of its output, "-" for standard output
 
 Pairs = list[tuple[str, Path]]
 
@@ -230,8 +229,7 @@ def source(name: str) -> Path | bytes:
     return sys.stdin.buffer.read()
 
 
-CHECKPOINT = ".checkpoint.npz"
-"""Ending of checkpoints beside scenes."""
+CHECKPOINT = ".checkpoint.npz"  # ending of checkpoints beside scenes
 
 
 def sibling(name: str, suffix: str) -> Path:
@@ -302,7 +300,6 @@ def discard_stdout() -> None:
 
 
 def write_stdout(data: bytes) -> None:
-    """Write bytes to standard output."""
     with stdout():
         sys.stdout.buffer.write(data)
 
@@ -331,5 +328,4 @@ def show(what: RenderableType) -> None:
 
 
 def print_json(report: object) -> None:
-    """Print indented JSON."""
     write_stdout((json.dumps(report, indent=2) + "\n").encode())

@@ -24,8 +24,12 @@ def exit_on_signal() -> None:
 
 def unwind_on_signal() -> None:
     """Raise :class:`Interrupted` on SIGINT and SIGTERM."""
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        raise Interrupted(number)
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _interrupt)
+        signal.signal(number, interrupt)
 
 
 def signal_behind(error: BaseException | None) -> int | None:
@@ -54,7 +58,3 @@ def exit_by_signal(number: int) -> NoReturn:
         os.write(2, f"kissgs: interrupted; {left}\n".encode())  # sys.stderr may hold an incomplete line
     finally:
         os._exit(128 + number)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    raise Interrupted(number)

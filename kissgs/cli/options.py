@@ -12,7 +12,7 @@ from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
-import typer
+from typer import Argument, Option
 
 from kissgs.core.context import Device
 from kissgs.core.errors import UnsupportedError
@@ -62,7 +62,6 @@ def count_of(text: str) -> int:
 
 
 def share_of(text: str) -> float:
-    """Parse a share: 0.2 or 20%."""
     word = text.strip()
     try:
         return float(word.removesuffix("%")) * (0.01 if word.endswith("%") else 1.0)
@@ -91,23 +90,21 @@ def budget_of(text: str) -> Values:
 
 def output_option(help: str, *, metavar: str = "PATH") -> Any:  # noqa: ANN401  as typer.Option
     """Declare ``--output``, of which each command says something else."""
-    return typer.Option("--output", "-o", metavar=metavar, help=help)
+    return Option("--output", "-o", metavar=metavar, help=help)
 
 
 ScenesArgument = Annotated[
-    list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
+    list[str], Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
 ]
-FilesArgument = Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns.")]
+FilesArgument = Annotated[list[str], Argument(metavar="FILE…", help="Files or glob patterns.")]
 PresetOption = Annotated[
-    str, typer.Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced, small or paper.")
+    str, Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced, small or paper.")
 ]
-ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print a JSON report: an object for one file, a list for several.")
-]
+ForceOption = Annotated[bool, Option("--force", "-f", help="Overwrite existing output files.")]
+JsonOption = Annotated[bool, Option("--json", help="Print a JSON report: an object for one file, a list for several.")]
 OriginOption = Annotated[
     Literal["auto"] | None,
-    typer.Option(
+    Option(
         metavar="auto",
         parser=one_of("--origin", "auto"),
         help="auto: make positions relative to the middle of the scene, where they have fine steps, and record it: for "
@@ -116,7 +113,7 @@ OriginOption = Annotated[
 ]
 ViewsOption = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         "--views",
         metavar="DATA",
         help="Capture to work and evaluate with, cameras and optionally photographs: a folder with a COLMAP model or a "
@@ -156,15 +153,14 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
 class SceneOptions:
     """Options of every command that reads scenes; ``kissgs --help`` explains them."""
 
-    level: Annotated[int | None, typer.Option(min=0, hidden=True)] = None
-    max_gaussians: Annotated[int | None, typer.Option(min=0, hidden=True)] = None
-    raw_axes: Annotated[bool, typer.Option("--raw-axes", hidden=True)] = False
-    antialiased: Annotated[bool | None, typer.Option("--antialiased/--classic", hidden=True)] = None
-    threads: Annotated[int, typer.Option(min=0, hidden=True)] = 0
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", hidden=True)] = False
+    level: Annotated[int | None, Option(min=0, hidden=True)] = None
+    max_gaussians: Annotated[int | None, Option(min=0, hidden=True)] = None
+    raw_axes: Annotated[bool, Option("--raw-axes", hidden=True)] = False
+    antialiased: Annotated[bool | None, Option("--antialiased/--classic", hidden=True)] = None
+    threads: Annotated[int, Option(min=0, hidden=True)] = 0
+    quiet: Annotated[bool, Option("--quiet", "-q", hidden=True)] = False
 
     def reading(self, origin: Literal["auto"] | None = None) -> ReadOptions:
-        """Return the options of reading scenes."""
         from kissgs.io.scene_format import ReadOptions
 
         return ReadOptions(
@@ -205,7 +201,7 @@ class EncodingOptions:
 
     container: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="NAME",
             help="Container: sogxt, or sog for other viewers. Default: sog if --output ends in .sog, else sogxt.",
         ),
@@ -213,27 +209,24 @@ class EncodingOptions:
     preset: PresetOption = "balanced"
     changes: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--set", metavar="NAME=VALUE", help="Change another setting; repeatable. List: docs/reference/settings.md."
         ),
     ] = None
     psnr: Annotated[
         float | None,
-        typer.Option(
-            metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."
-        ),
+        Option(metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."),
     ] = None
     target_size: Annotated[
-        str | None,
-        typer.Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB."),
+        str | None, Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB.")
     ] = None
     max_psnr_drop: Annotated[
         float | None,
-        typer.Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
+        Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
     ] = None
     quality: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="NAME",
             parser=one_of("--quality", "same", "high", "good"),
             help="Find the smallest container that looks the same as the scene, or has high or good quality: limits on "
@@ -242,7 +235,7 @@ class EncodingOptions:
     ] = None
     compact: Annotated[
         Values | None,
-        typer.Option(
+        Option(
             metavar="BUDGET",
             parser=budget_of,
             help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
@@ -252,7 +245,7 @@ class EncodingOptions:
     ] = None
     finetune: Annotated[
         Values | None,
-        typer.Option(
+        Option(
             metavar="[STEPS]",
             parser=steps_of,
             help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
@@ -261,12 +254,11 @@ class EncodingOptions:
         ),
     ] = None
     evaluate: Annotated[
-        bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
+        bool, Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
     ] = False
     origin: OriginOption = None
 
     def settings(self, *, time: str | None = None, seed: int | None = None) -> Settings:
-        """Return the settings that these options stand for."""
         return chosen(
             self.preset,
             self.changes,
@@ -280,18 +272,16 @@ class EncodingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
-    """Options of the commands that train."""
-
     views: ViewsOption = None
     force_views: Annotated[
-        bool, typer.Option("--force-views", help="Accept --views whose photographs do not show the scene.")
+        bool, Option("--force-views", help="Accept --views whose photographs do not show the scene.")
     ] = False
     checkpoint: Annotated[
-        bool, typer.Option("--checkpoint", help="Save the state of training next to the scene, and resume from it.")
+        bool, Option("--checkpoint", help="Save the state of training next to the scene, and resume from it.")
     ] = False
     device: Annotated[
         Device,
-        typer.Option(
+        Option(
             metavar="NAME",
             parser=one_of("--device", "cpu", "cuda"),
             help="Device of training: cpu (reproducible) or cuda (results vary slightly).",
@@ -319,17 +309,14 @@ class CaptureOptions:
 
     views: ViewsOption = None
     scale: Annotated[
-        int | None,
-        typer.Option(min=1, help="Downscaling factor of the photographs of --views: 4 reads the folder images_4."),
+        int | None, Option(min=1, help="Downscaling factor of the photographs of --views: 4 reads the folder images_4.")
     ] = None
     images: Annotated[
-        Path | None, typer.Option(help="Folder of the photographs of --views, if it is not the capture's own.")
+        Path | None, Option(help="Folder of the photographs of --views, if it is not the capture's own.")
     ] = None
     device: Annotated[
         Device,
-        typer.Option(
-            metavar="NAME", parser=one_of("--device", "cpu", "cuda"), help="Device of the rasteriser: cpu or cuda."
-        ),
+        Option(metavar="NAME", parser=one_of("--device", "cpu", "cuda"), help="Device of the rasteriser: cpu or cuda."),
     ] = "cpu"
 
     def open(self) -> Views | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from kissgs.cli.files import Result, for_each_input, print_json, progress_bar, show
 from kissgs.cli.options import EncodingOptions, FilesArgument, ForceOption, output_option, with_option_groups
@@ -18,11 +19,9 @@ if TYPE_CHECKING:
     from kissgs.client import Remote
     from kissgs.core.context import Progress
 
-ServerOption = Annotated[
-    str, typer.Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="URL of the service.")
-]
-ServiceJsonOption = Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")]
-JobArgument = Annotated[str, typer.Argument(help="Id of the job, see 'kissgs remote list'.")]
+ServerOption = Annotated[str, Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="URL of the service.")]
+ServiceJsonOption = Annotated[bool, Option("--json", help="Print the response of the service as JSON.")]
+JobArgument = Annotated[str, Argument(help="Id of the job, see 'kissgs remote list'.")]
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 
 app = typer.Typer(
@@ -37,15 +36,14 @@ app = typer.Typer(
 def compress(
     scenes: FilesArgument,
     output: Annotated[
-        str | None,
-        output_option("Output NAME.zip, NAME.sog or a folder. Default: next to the scene."),
+        str | None, output_option("Output NAME.zip, NAME.sog or a folder. Default: next to the scene.")
     ] = None,
     server: ServerOption = DEFAULT_SERVER,
     *,
     encoding: EncodingOptions,
     force: ForceOption = False,
     as_json: ServiceJsonOption = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
+    quiet: Annotated[bool, Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job."""
     from kissgs.cli.tables import status_table

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from kissgs.cli.files import Result, check_input, for_each_input, progress_bar, say_notes, show, source, write_output
 from kissgs.cli.interrupts import Interrupted
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @with_option_groups
 def view(
     scene: Annotated[
-        str, typer.Argument(metavar="FILE", help="Scene of any format, or a container; '-' reads standard input.")
+        str, Argument(metavar="FILE", help="Scene of any format, or a container; '-' reads standard input.")
     ],
     output: Annotated[
         Path | None,
@@ -39,12 +39,12 @@ def view(
             metavar="PAGE.html",
         ),
     ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the server; 0 for a free one.")] = 0,
+    port: Annotated[int, Option(min=0, max=65535, help="TCP port of the server; 0 for a free one.")] = 0,
     browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Whether to open the browser, or to print the address only.")
+        bool, Option("--browser/--no-browser", help="Whether to open the browser, or to print the address only.")
     ] = True,
     fetch: Annotated[
-        bool, typer.Option("--fetch-viewer", help="Download Spark and three.js first, if they are not installed.")
+        bool, Option("--fetch-viewer", help="Download Spark and three.js first, if they are not installed.")
     ] = False,
     force: ForceOption = False,
     *,
@@ -97,7 +97,9 @@ def _serve(scene: str, common: SceneOptions, port: int, browser: bool) -> None:
     with PageServer(_prepare(scene, common), port) as server, contextlib.suppress(Interrupted):
         sys.stdout.write(f"{server.url}  (Ctrl-C ends)\n")
         sys.stdout.flush()
-        if browser and _has_display():
+        # Whether a browser with windows can open; one in the terminal would cover the address.
+        windows = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        if browser and windows:
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
         server.serve_forever()
 
@@ -147,11 +149,6 @@ def _listed(names: tuple[str, ...]) -> str:
     return names[0] + (f" and {others} more file{'s' * (others > 1)}" if others else "")
 
 
-def _has_display() -> bool:
-    """Whether a browser with windows can open; one in the terminal would cover the address."""
-    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
 # ``kissgs render``: render images and animations of a scene. Heavy imports are deferred until it runs.
 
 FPS, QUALITY = 12, 85
@@ -164,7 +161,7 @@ class ImageOptions:
 
     view: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--view",
             metavar="N|NAME|FILE.json",
             help="Camera: a view of --views, or else a virtual view, by name or by its number from 0 in order of "
@@ -174,19 +171,18 @@ class ImageOptions:
     ] = None
     orbit: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--orbit",
             help="Render an orbit around the scene, or an arc forth and back if only one side was captured: an "
             "animation as .webp, a contact sheet as .png.",
         ),
     ] = False
     sheet: Annotated[
-        bool,
-        typer.Option("--sheet", help="Render a contact sheet of all views of --views, or else of the virtual views."),
+        bool, Option("--sheet", help="Render a contact sheet of all views of --views, or else of the virtual views.")
     ] = False
     size: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="WxH",
             help="Size of each image, pixels. Default: that of the camera, or else 1280x960; 640x480 in an animation, "
             "320x240 on a contact sheet.",
@@ -194,18 +190,18 @@ class ImageOptions:
     ] = None
     background: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="COLOUR",
             help="Background colour: black, white or #rrggbb. Default: that of --views, or else black.",
         ),
     ] = None
     frames: Annotated[
         int | None,
-        typer.Option(min=3, max=3600, help="Images of an --orbit. Default: 48 in an animation, 24 on a contact sheet."),
+        Option(min=3, max=3600, help="Images of an --orbit. Default: 48 in an animation, 24 on a contact sheet."),
     ] = None
     save_camera: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.json", help="Write the camera of the image as JSON, for --view and other programs."),
+        Option(metavar="FILE.json", help="Write the camera of the image as JSON, for --view and other programs."),
     ] = None
 
     def refuse_contradictions(self, views: Path | None) -> None:
@@ -251,7 +247,7 @@ def _refuse(options: dict[str, object], *, why: str, most: int = 0) -> None:
 
 @with_option_groups
 def render(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="Scene to render, of any format that kissgs reads.")],
+    file: Annotated[str, Argument(metavar="FILE", help="Scene to render, of any format that kissgs reads.")],
     output: Annotated[
         str | None,
         output_option(
@@ -263,9 +259,7 @@ def render(
     image: ImageOptions,
     capture: CaptureOptions,
     force: ForceOption = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print a JSON report: the output file and the cameras.")
-    ] = False,
+    as_json: Annotated[bool, Option("--json", help="Print a JSON report: the output file and the cameras.")] = False,
     common: SceneOptions,
 ) -> None:
     """Render an image of a scene, an orbit around it (animation or contact sheet), or all its views."""

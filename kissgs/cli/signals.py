@@ -10,15 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from kissgs.cli.interrupts import (
-    NOTHING_LEFT,
-    Interrupted,
-    exit_by_signal,
-    exit_on_signal,
-    say_when_interrupted,
-    signal_behind,
-    unwind_on_signal,
-)
+from kissgs.cli import interrupts
 from kissgs.core.errors import StopSearch
 
 if TYPE_CHECKING:
@@ -36,20 +28,20 @@ def unwinding(work: Callable[[], None]) -> None:
     """Run ``work`` so that a signal unwinds the stack before the process exits; before and after, it exits at once."""
     sys.unraisablehook = _raise_again
     try:
-        unwind_on_signal()
+        interrupts.unwind_on_signal()
         try:
             work()
         finally:
-            exit_on_signal()
+            interrupts.exit_on_signal()
     except BaseException as error:
-        if (number := signal_behind(error)) is not None:
-            exit_by_signal(number)
+        if (number := interrupts.signal_behind(error)) is not None:
+            interrupts.exit_by_signal(number)
         raise
 
 
 def _raise_again(lost: sys.UnraisableHookArgs) -> None:
     """Send a signal again that arrived inside a finalizer, where Python prints and discards exceptions."""
-    if isinstance(lost.exc_value, Interrupted):
+    if isinstance(lost.exc_value, interrupts.Interrupted):
         threading.Timer(0.01, os.kill, (os.getpid(), lost.exc_value.args[0])).start()
     else:
         sys.__unraisablehook__(lost)
@@ -79,7 +71,7 @@ def stoppable(progress: Progress, searches: bool) -> Iterator[Progress]:
     try:
         yield receive
     except StopSearch as error:
-        say_when_interrupted(lambda: f"nothing met the goal yet, and {NOTHING_LEFT}")
-        raise Interrupted(signal.SIGINT) from error
+        interrupts.say_when_interrupted(lambda: f"nothing met the goal yet, and {interrupts.NOTHING_LEFT}")
+        raise interrupts.Interrupted(signal.SIGINT) from error
     finally:
         signal.signal(signal.SIGINT, before)

@@ -12,8 +12,7 @@ from rich.text import Text
 from kissgs.cli.files import gaussians
 from kissgs.core.positions import relative_to
 from kissgs.core.splats import CLEANED_TEXTS
-from kissgs.evaluation.detail import Detail
-from kissgs.evaluation.results import Evaluation, ImageMetrics, detail_text, format_metric
+from kissgs.evaluation.results import Detail, Evaluation, ImageMetrics, detail_text, format_metric
 from kissgs.formats import FORMATS
 
 if TYPE_CHECKING:
@@ -62,15 +61,8 @@ def _changes(changed: Mapping[str, int]) -> list[Text]:
 
 
 def report_table(report: Report, target: str) -> RenderableType:
-    """Format the report of one compression."""
-    head = _result(
-        target,
-        bytes_of=(report.source_bytes, report.container_bytes),
-        counts=(report.source_count, report.count),
-        sh_degree=report.sh_degree,
-        seconds=sum(report.seconds.values()),
-        cpu_seconds=report.cpu_seconds,
-    )
+    sizes, counts = (report.source_bytes, report.container_bytes), (report.source_count, report.count)
+    head = _result(target, sizes, counts, report.sh_degree, sum(report.seconds.values()), report.cpu_seconds)
     head.append(f", peak memory {size(report.peak_memory)}")
     details: list[RenderableType] = []
     if report.compaction is not None:
@@ -90,14 +82,9 @@ def report_table(report: Report, target: str) -> RenderableType:
 def status_table(status: Mapping[str, Any], target: str) -> RenderableType:
     """Format the status of a job of a service that has succeeded, as :func:`report_table` does it for a report."""
     timings, sizes, evaluation = status["timings"], status["sizes"], status.get("evaluation")
-    head = _result(
-        target,
-        bytes_of=(status["upload_bytes"], sizes["container"]),
-        counts=(status["gaussians"], status["kept"]),
-        sh_degree=status["sh_degree"],
-        seconds=sum(timings["stages"].values()),
-        cpu_seconds=timings["cpu_seconds"],
-    )
+    counts, seconds = (status["gaussians"], status["kept"]), sum(timings["stages"].values())
+    bytes_of = status["upload_bytes"], sizes["container"]
+    head = _result(target, bytes_of, counts, status["sh_degree"], seconds, timings["cpu_seconds"])
     details = _noted(status.get("note") or "")
     if evaluation is not None:
         psnr = evaluation.get("psnr")  # null: infinite
@@ -113,7 +100,6 @@ def status_table(status: Mapping[str, Any], target: str) -> RenderableType:
 
 def _result(
     target: str,
-    *,
     bytes_of: tuple[int, int],
     counts: tuple[int, int],
     sh_degree: int,
@@ -132,7 +118,6 @@ def _result(
 
 
 def compaction_table(report: CompactionReport, target: str) -> RenderableType:
-    """Format the report of one compaction."""
     head = Text.assemble(
         (target, "bold"),
         f"  {report.source_count:,} -> ",
@@ -143,7 +128,6 @@ def compaction_table(report: CompactionReport, target: str) -> RenderableType:
 
 
 def streamed_table(report: StreamedReport, target: str) -> RenderableType:
-    """Format the report of a streamed compression."""
     stored = report.counts[0] + report.environment_count
     head = Text.assemble(
         (target, "bold"),

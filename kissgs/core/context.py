@@ -53,20 +53,16 @@ class SearchNote:
     note: str = ""  # the state, changed by the search
 
     def __call__(self, stage: str, fraction: float, note: str = "") -> None:
-        """See :class:`Progress`."""
         self.progress(stage, fraction, "; ".join(filter(None, [self.note, note])))
 
 
 # ``Deadline``: the time until which work shall be finished, and ``Pace``: the steps that fit in until then.
 
-SETTLING_STEPS = 3
-"""Steps that :class:`Pace` leaves out of its mean: they load or compile what all others share."""
+SETTLING_STEPS = 3  # steps that Pace leaves out of its mean: they load or compile what all others share
 
 
 @dataclass(frozen=True, slots=True)
 class Deadline:
-    """Time until which work shall be finished."""
-
     end: float  # on the clock of :func:`time.perf_counter`, seconds
 
     @classmethod
@@ -80,7 +76,6 @@ class Deadline:
         return self.end - time.perf_counter()
 
     def earlier(self, seconds: float) -> Deadline:
-        """Return the deadline that is ``seconds`` before this one."""
         return Deadline(self.end - seconds)
 
 
@@ -110,8 +105,7 @@ class Pace:
 
 # ``Context``: what all functions of long work receive.
 
-Device = Literal["cpu", "cuda"]
-"""Device of training and of the rasteriser for images."""
+Device = Literal["cpu", "cuda"]  # device of training and of the rasteriser for images
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,15 +18,13 @@ from numba.core.typing.templates import Signature
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
-kernels: list[Any] = []
-"""All kernels of the modules that are imported; the method ``load`` of each compiles it without a call."""
+kernels: list[Any] = []  # of all modules that are imported; the method load compiles one without a call
 
 UNREADABLE = (ImportError, AttributeError, EOFError, LookupError, TypeError, ValueError, pickle.UnpicklingError)
 """Errors of reading a cache that is damaged, or that another version left and that names modules which are gone."""
 
 _compiling = threading.RLock()
-_uncached: list[str] = []
-"""Names of kernels for which numba found no folder to cache them in."""
+_uncached: list[str] = []  # names of kernels for which numba found no folder to cache them in
 
 
 def compiled(signature: str | Signature, **options: Any) -> Callable[[Kernel], Kernel]:  # noqa: ANN401

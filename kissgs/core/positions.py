@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from kissgs.core.errors import InvalidContainerError
 from kissgs.core.splats import MEAN_LIMIT, Splats, sampled_rows
 
 # Signed logarithm, in which positions are stored, and its inverse.
+
+MAX_SIGNED_LOG = 88.7  # largest signed logarithm of a position: exp of more exceeds float32
 
 
 def signed_log(x: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
@@ -30,14 +33,9 @@ def signed_exp(y: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
 
 # Coarse positions: those that a container would move by more than can be seen, and cuts of space that mend it.
 
-COARSE_ERROR = 0.25
-"""Error of a position, in units of the Gaussian's size, above which it is coarse."""
-
-COARSE_SHARE = 0.01
-"""Share of coarse positions above which a scene has lost something."""
-
-CONTAINER_LEVELS = (1 << 16) - 1
-"""Steps between the smallest and the largest signed logarithm of a container's positions."""
+COARSE_ERROR = 0.25  # error of a position, in units of the Gaussian's size, above which it is coarse
+COARSE_SHARE = 0.01  # share of coarse positions above which a scene has lost something
+CONTAINER_LEVELS = (1 << 16) - 1  # steps between the smallest and the largest signed logarithm of positions
 
 ORIGIN = '--origin auto (in Python origin="auto")'
 
@@ -47,8 +45,7 @@ STREAMED_REMEDY = "no origin helps here, but compressing into FOLDER/lod-meta.js
 LEAST, MOST_CUTS = 32, 12
 """Number of Gaussians in a chunk, and of cuts one after another, up to which chunks are cut for finer positions."""
 
-TRIED = 1 << 16
-"""Largest number of Gaussians with which cuts are tried before they are named as a remedy."""
+TRIED = 1 << 16  # largest number of Gaussians with which cuts are tried before they are named as a remedy
 
 
 def coarse_share(errors: Float[np.ndarray, " N"], scales: Float32[np.ndarray, "N 3"]) -> float:
@@ -84,13 +81,14 @@ def coarse_note(
         rows = np.column_stack([positions, sizes]).astype(np.float32)[:: 1 + len(sizes) // TRIED]
         return coarse_in_chunks(rows, cuts_without_coarse(rows, Cuts.of(rows[:, :3], 0), count))
 
+    def coarse_nearby() -> float:
+        return float(coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean())
+
     remedies: dict[str, Callable[[], float]] = {
-        f"{ORIGIN} moves the scene there": lambda: float(
-            coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean()
-        ),
+        f"{ORIGIN} moves the scene there": coarse_nearby,
         STREAMED_REMEDY: lambda: coarse_in_parts(wide),
-        f"compressing into FOLDER/lod-meta.json with {ORIGIN} gives its parts fine steps": lambda: coarse_in_parts(
-            near
+        f"compressing into FOLDER/lod-meta.json with {ORIGIN} gives its parts fine steps": partial(
+            coarse_in_parts, near
         ),
     }
     helpful = (name for name, coarse in remedies.items() if coarse() <= COARSE_SHARE)
@@ -109,8 +107,7 @@ def coarse_chances(
     Positions and :func:`visible_sizes` are in world units, extents in signed logarithms.
     """
     half_steps = np.maximum(container_steps(positions, extents) / 2, 1e-300)
-    chances: Float64[np.ndarray, " N"] = 1 - np.minimum(COARSE_ERROR * sizes[:, None] / half_steps, 1).prod(axis=1)
-    return chances
+    return np.asarray(1 - np.minimum(COARSE_ERROR * sizes[:, None] / half_steps, 1).prod(axis=1))
 
 
 def container_steps(
@@ -118,14 +115,12 @@ def container_steps(
 ) -> Float64[np.ndarray, "N 3"]:
     """Return a container's finest steps at positions, world units, with the rounding of the range's ends to float32."""
     rounded = np.spacing(np.abs(signed_log(positions)).astype(np.float32))
-    steps: Float64[np.ndarray, "N 3"] = (1 + np.abs(positions)) * (extents / CONTAINER_LEVELS + rounded)
-    return steps
+    return np.asarray((1 + np.abs(positions)) * (extents / CONTAINER_LEVELS + rounded))
 
 
 def visible_sizes(scales: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
     """Return the second of the three standard deviations: the smaller one that a flat Gaussian shows from its front."""
-    sizes: Float64[np.ndarray, " N"] = np.exp(np.sort(scales, axis=1)[:, 1].astype(np.float64))
-    return sizes
+    return np.asarray(np.exp(np.sort(scales, axis=1)[:, 1].astype(np.float64)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,10 +128,8 @@ class Cuts:
     """Axis-parallel cuts of space: a complete binary tree, whose leaves are the chunks."""
 
     depth: int
-    axes: UInt8[np.ndarray, " nodes"]
-    """Axis of each inner node; node n has the children 2 n and 2 n + 1, the root is 1."""
-    values: Float64[np.ndarray, " nodes"]
-    """Coordinate of each cut; positions at and above it belong to the second child."""
+    axes: UInt8[np.ndarray, " nodes"]  # axis of each inner node; node n has the children 2 n and 2 n + 1, the root is 1
+    values: Float64[np.ndarray, " nodes"]  # of each cut; positions at and above it belong to the second child
 
     @classmethod
     def of(cls, positions: Float32[np.ndarray, "S 3"], depth: int) -> Cuts:
@@ -154,11 +147,9 @@ class Cuts:
 
     @property
     def chunks(self) -> int:
-        """Number of chunks."""
         return 1 << self.depth
 
     def chunk_of(self, means: Float32[np.ndarray, "n 3"]) -> UInt16[np.ndarray, " n"]:
-        """Return the chunk of each position."""
         node, rows = np.ones(len(means), np.int64), np.arange(len(means))
         for _ in range(self.depth):
             node = 2 * node + (means[rows, self.axes[node]] >= self.values[node])
@@ -199,12 +190,10 @@ def cuts_without_coarse(sample: Float32[np.ndarray, "S 4"], cuts: Cuts, count: i
 
 Origin = tuple[float, float, float]
 
-WORLD: Origin = (0.0, 0.0, 0.0)
-"""Origin of a scene whose positions are those of the world."""
+WORLD: Origin = (0.0, 0.0, 0.0)  # origin of a scene whose positions are those of the world
 
 
 def world_positions(splats: Splats) -> Float64[np.ndarray, "N 3"]:
-    """Return the positions in the world, float64 ``(N, 3)``."""
     return splats.means.astype(np.float64) + np.array(splats.origin)
 
 

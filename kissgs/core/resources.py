@@ -30,15 +30,11 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """Options of glibc's ``mallopt``: free bytes at the end of the heap that it keeps, and size from which a block of
 memory comes from the system and returns there when it is freed."""
 
-USUAL_TRIM, USUAL_MMAP = 64 << 20, 32 << 20
-"""Bytes for these options to which glibc itself goes once arrays of 32 MB have been freed."""
-
-LARGEST_TRIM, LARGEST_MMAP = (1 << 31) - 1, 1 << 30
-"""Bytes for these options with which arrays up to 1 GB are kept."""
+USUAL_TRIM, USUAL_MMAP = 64 << 20, 32 << 20  # to which glibc itself goes once arrays of 32 MB have been freed
+LARGEST_TRIM, LARGEST_MMAP = (1 << 31) - 1, 1 << 30  # bytes for these options with which arrays up to 1 GB are kept
 
 _lock = threading.Lock()
-_keeping = 0
-"""Number of ``with`` blocks of :func:`keep_free_memory` that are running."""
+_keeping = 0  # number of with blocks of keep_free_memory that are running
 
 
 def return_free_memory() -> None:
@@ -104,8 +100,7 @@ class StageTimer:
 
     receiver: Progress
     seconds: dict[str, float] = field(default_factory=dict)
-    cpu_seconds: float = 0.0
-    """Processor time of this process up to the last :meth:`stop`."""
+    cpu_seconds: float = 0.0  # processor time of this process up to the last stop
     _stage: str | None = None
     _since: float = 0.0
     _cpu_since: float = field(default_factory=time.process_time)
@@ -121,7 +116,6 @@ class StageTimer:
             self.receiver(stage, fraction)
 
     def stop(self) -> None:
-        """End the current stage."""
         if self._stage is not None:
             spent = time.perf_counter() - self._since
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + spent

@@ -6,35 +6,23 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-ATTEMPTS = 10
-"""Default number of evaluations."""
-
-MAX_EXTRAPOLATION = 4.0
-"""Largest distance of an evaluation from known points, except for one at a bound."""
-
-MIN_SLOPE_SHARE = 0.15
-"""Share of the expected slope below which, over half of :data:`MAX_EXTRAPOLATION`, the search jumps to the bound."""
+ATTEMPTS = 10  # default number of evaluations
+MAX_EXTRAPOLATION = 4.0  # largest distance of an evaluation from known points, except for one at a bound
+MIN_SLOPE_SHARE = 0.15  # of the expected slope; below, over half of MAX_EXTRAPOLATION, the bound is next
 
 
 @dataclass(frozen=True, slots=True)
 class StopRule:
-    """How far :func:`find_root` goes, and when it ends without a margin within the tolerance.
+    """How far :func:`find_root` goes, and when it ends without a margin within the tolerance."""
 
-    Attributes:
-        attempts: largest number of evaluations.
-        tries_bound: whether the bound is tried where long steps make no progress, and if no point met the goal.
-        settled: whether the search between a point that meets the goal and the next one that does not can end.
-        most_step: largest distance of an evaluation from known points, except for one at a bound.
-        flattest: share of the expected slope below which a measured one is not believed: a loss grows ever faster.
-        caution: share of the distance to the nearest point that meets the goal by which the last point is nearer, and
-            the largest such step; share by which the last step is longer where no point meets the goal.
-    """
-
-    attempts: int = ATTEMPTS
-    tries_bound: bool = True
+    attempts: int = ATTEMPTS  # largest number of evaluations
+    tries_bound: bool = True  # where long steps make no progress, and if no point met the goal
+    # Whether the search between a point that meets the goal and the next one that does not can end.
     settled: Callable[[float, float], bool] = lambda inside, outside: False
-    most_step: float = MAX_EXTRAPOLATION
-    flattest: float = 0.1
+    most_step: float = MAX_EXTRAPOLATION  # largest distance of an evaluation from known points, except for a bound
+    flattest: float = 0.1  # share of the expected slope below which none is believed: a loss grows ever faster
+    # Share of the distance to the nearest point that meets the goal by which the last point is nearer, and the largest
+    # such step; share by which the last step is longer where no point meets the goal.
     caution: tuple[float, float] = (0.0, 0.0)
 
 
@@ -51,22 +39,13 @@ def find_root(
     """Find where a monotone function is slightly above zero.
 
     False position between points that meet the goal and points that do not; before both exist, Newton steps of at most
-    ``most_step``, and the bound once these make no progress, so that a goal that is met at the bound is
-    found.
+    ``most_step``, and the bound once these make no progress, so that a goal that is met at the bound is found. Returned
+    is the point of smallest margin that meets the goal; None if none does.
 
-    Args:
-        margin: function that is at least 0 where the goal is met, and infinite where the distance to it is unknown; it
-            may be slightly non-monotone and non-smooth, as results of rounding are.
-        start: first point.
-        slope: approximate slope of ``margin``; its sign must be right.
-        tolerance: a margin from 0 to this ends the search; a function of an evaluated point if it differs between them.
-        bounds: smallest and largest point.
-        grain: points are whole multiples of this; 0 for any number.
-        stop: limits of the search.
-        before: known points and margins; they neither count as evaluations nor are returned.
-
-    Returns:
-        The point of smallest margin that meets the goal; None if none does.
+    ``margin`` is at least 0 where the goal is met, infinite where the distance to it is unknown, and may be slightly
+    non-monotone, as results of rounding are; ``slope`` is its approximate slope, whose sign must be right. A margin
+    from 0 to ``tolerance`` ends the search. Points are whole multiples of ``grain``, if that is not 0. Those of
+    ``before`` are known, and neither count nor are returned.
     """
     known = dict(before or {})
     attempts = stop.attempts + len(known)
@@ -75,9 +54,8 @@ def find_root(
     while len(known) < attempts and x not in known:
         known[x] = margin(x)
         inside, outside = _bracket(known, slope)
-        if 0 <= known[x] <= tolerance_at(x) or (
-            inside is not None and outside is not None and stop.settled(inside, outside)
-        ):
+        settled = inside is not None and outside is not None and stop.settled(inside, outside)
+        if 0 <= known[x] <= tolerance_at(x) or settled:
             break
         if stop.tries_bound and (inside is None or outside is None) and _no_progress(known, slope):
             x = bounds[(inside is None) == (slope > 0)]

@@ -10,33 +10,19 @@ from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 
-UNSEEN = 1e-3
-"""Smallest colour sensitivity, in units of the prior, which ignores occlusion."""
+UNSEEN = 1e-3  # smallest colour sensitivity, in units of the prior, which ignores occlusion
 
 FLOOR = 0.55
 """Smallest sensitivity, in units of the prior times the view uncertainty, so that for a camera nearby the Gaussian's
 quality is within a few decibels of its neighbours'."""
 
-SEEN_COVERAGE = 0.2
-"""Coverage above which a Gaussian was seen well enough to scale the prior by."""
-
-LARGEST = 1e25
-"""Largest absolute Hessian entry: squares of enormous Gaussians overflow, and sums of costs would be infinite."""
-
-HARMONICS_TOLERANCE = 1.001
-"""Factor by which the squares of mean harmonics may exceed their largest sum by rounding."""
-
-OPACITY, SCALES, ROTATION = (0,), (4, 5, 6), (7, 8, 9)
-"""Indices of the diagonal entries in ``shape_hessian``."""
-
-POSITION = (0, 1, 2)
-"""Indices of the diagonal entries in ``position_hessian``."""
-
-RATIO_SAMPLE = 1 << 18
-"""Largest number of Gaussians from which ratios of sensitivities are estimated."""
-
-BLOCK = 1 << 16
-"""Gaussians per step of array arithmetic, so that temporary arrays stay small."""
+SEEN_COVERAGE = 0.2  # coverage above which a Gaussian was seen well enough to scale the prior by
+LARGEST = 1e25  # Hessian entry: squares of enormous Gaussians overflow, and sums of costs would be infinite
+HARMONICS_TOLERANCE = 1.001  # factor by which the squares of mean harmonics may exceed their largest sum by rounding
+OPACITY, SCALES, ROTATION = (0,), (4, 5, 6), (7, 8, 9)  # indices of the diagonal entries in shape_hessian
+POSITION = (0, 1, 2)  # indices of the diagonal entries in position_hessian
+RATIO_SAMPLE = 1 << 18  # largest number of Gaussians from which ratios of sensitivities are estimated
+BLOCK = 1 << 16  # Gaussians per step of array arithmetic, so that temporary arrays stay small
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,13 +137,8 @@ class Sensitivity:
         (Fitted to photographs of a scene, logarithms of sensitivity from virtual cameras have weight 0.72, the prior
         0.23.) The result is at least :data:`FLOOR` · ``view_uncertainty`` times the prior.
 
-        The arrays of this object become those of the result, so that large scenes need no second set of them.
-
-        Args:
-            splats: the scene.
-            close_up: ``(N,)`` see :attr:`kissgs.rendering.sensitivity.Coverage.close_up`.
-            coverage: ``(N,)`` from 0 to 1, see :class:`kissgs.rendering.sensitivity.Coverage`.
-            view_uncertainty: 0 to 1; at 0 the prior is not used.
+        The arrays of this object become those of the result, so that large scenes need no second set of them. The class
+        ``Coverage`` of :mod:`kissgs.rendering.sensitivity` explains ``close_up`` and ``coverage``.
         """
         coverage = coverage.astype(np.float32)
         known = (self.color_weight > 0) & (close_up > 0) & (coverage > SEEN_COVERAGE)

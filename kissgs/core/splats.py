@@ -11,20 +11,11 @@ import numpy as np
 from kissgs.core.array_types import Bool, Float, Float32, Float64, Int
 from kissgs.core.errors import InvalidSceneError
 
-MAX_GRID_SIDE = 13_376
-"""Largest side of the grid, pixels: Pillow refuses larger images as decompression bombs; WebP's limit is 16383."""
-
-MAX_CODEBOOK_SIDE = 256
-"""Largest side of the codebook's tiles, pixels: labels have two 8-bit coordinates."""
-
-MAX_GAUSSIANS = 20_000_000
-"""Default limit: 5 GB of arrays. A compressed file of some kilobytes can declare more than any memory holds."""
-
-SH_REST_COUNTS = (0, 3, 8, 15)
-"""Number of SH coefficients per colour channel beyond the constant one, for degree 0, 1, 2, 3."""
-
-SH_C0 = 0.28209479177387814
-"""Value of the constant real spherical harmonic: colour = 0.5 + SH_C0 * sh0."""
+MAX_GRID_SIDE = 13_376  # pixels: Pillow refuses larger images as decompression bombs; WebP's limit is 16383
+MAX_CODEBOOK_SIDE = 256  # largest side of the codebook's tiles, pixels: labels have two 8-bit coordinates
+MAX_GAUSSIANS = 20_000_000  # by default: 5 GB of arrays, which a file of some kilobytes can declare
+SH_REST_COUNTS = (0, 3, 8, 15)  # SH coefficients per channel beyond the constant one, for degree 0 to 3
+SH_C0 = 0.28209479177387814  # value of the constant real spherical harmonic: colour = 0.5 + SH_C0 * sh0
 
 OPACITY_LOGIT_MIN = float(np.float32(-13.815509796142578))
 OPACITY_LOGIT_MAX = float(np.float32(13.80231761932373))
@@ -32,17 +23,13 @@ OPACITY_LOGIT_MAX = float(np.float32(13.80231761932373))
 
 LOG_SCALE_LIMIT = 30.0
 MEAN_LIMIT = 1e15
-SH_LIMIT = 1e6
-"""Bounds of absolute values that cleaning leaves unchanged; beyond, renderers' float32 squares overflow."""
+SH_LIMIT = 1e6  # bounds of absolute values that cleaning leaves unchanged; beyond, renderers' float32 squares overflow
 
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
-BLOCK = 1 << 16
-"""Gaussians that are checked at a time."""
-
-SAMPLED = 1 << 20
-"""Largest number of rows of :func:`sampled_rows`."""
+BLOCK = 1 << 16  # Gaussians that are checked at a time
+SAMPLED = 1 << 20  # largest number of rows of sampled_rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,16 +67,14 @@ class Splats:
         n = len(self.means) if self.means.ndim else -1
         k = self.shN.shape[1] if self.shN.ndim == 3 else -1
         if k not in SH_REST_COUNTS:
-            raise InvalidSceneError(
-                f"shN has shape {self.shN.shape}; it must be (N, K, 3) with K one of {SH_REST_COUNTS}"
-            )
+            shape = self.shN.shape
+            raise InvalidSceneError(f"shN has shape {shape}; it must be (N, K, 3) with K one of {SH_REST_COUNTS}")
         shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 3), (n, k, 3))
         for name, shape in zip(ATTRIBUTES, shapes, strict=True):
             array = getattr(self, name)
             if array.shape != shape or array.dtype != np.float32:
-                raise InvalidSceneError(
-                    f"{name} is {array.dtype} of shape {array.shape}; it must be float32 of shape {shape}"
-                )
+                found = f"{array.dtype} of shape {array.shape}"
+                raise InvalidSceneError(f"{name} is {found}; it must be float32 of shape {shape}")
 
     def __len__(self) -> int:
         return len(self.means)

@@ -27,30 +27,20 @@ from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
 from kissgs.rendering.rasterizer import drawn_opacities
 
-BACKGROUNDS = (0.0, 0.5, 1.0)
-"""Grey levels of the views' backgrounds, in turn: on black, missing parts of a dark scene would not show."""
-
-FIELDS_OF_VIEW = np.radians((50.0, 90.0))
-"""Smallest and largest field of view along the longer side of the image, radians."""
-
-MAX_DRAWS = 12
-"""Largest number of cameras drawn for one view until one is accepted."""
-
-THUMBNAIL = 64
-"""Longer side of the thumbnails that decide whether a camera is accepted, pixels."""
+BACKGROUNDS = (0.0, 0.5, 1.0)  # grey levels, in turn: on black, missing parts of a dark scene would not show
+FIELDS_OF_VIEW = np.radians((50.0, 90.0))  # smallest and largest, along the longer side, radians
+MAX_DRAWS = 12  # largest number of cameras drawn for one view until one is accepted
+THUMBNAIL = 64  # longer side of the thumbnails that decide whether a camera is accepted, pixels
 
 # Cameras for overlooked parts of a scene: parts whose loss would hardly change any image of the drawn cameras.
 
-MAX_ADDED = 72
-"""Largest number of added cameras."""
+MAX_ADDED = 72  # largest number of added cameras
 
 VISIBLE_PSNR = 18.0
 """Largest PSNR, decibels, between thumbnails with and without a part at which its loss counts as visible; between full
 images it is then at most about 20."""
 
-DISTANCES = (0.6, 1.6)
-"""Smallest and largest distance of a camera to its part, in units of the distance at which the part's sphere just fits
-into the image."""
+DISTANCES = (0.6, 1.6)  # of a camera to its part, in units of that at which the part's sphere just fits the image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,9 +72,8 @@ class Parts:
         remaining = list(parts)
         for _ in range(MAX_DRAWS):
             drawn = [(part, self._draw_camera(self.parts[part], rng)) for part in remaining]
-            for part, found in zip(
-                remaining, pool.map(lambda each: self._over_best_background(*each), drawn), strict=True
-            ):
+            found_views = pool.map(lambda each: self._over_best_background(*each), drawn)
+            for part, found in zip(remaining, found_views, strict=True):
                 if part not in best or found[0] < best[part][0]:
                     best[part] = found
             remaining = [part for part in remaining if best[part][0] > VISIBLE_PSNR]
@@ -111,47 +100,32 @@ class Parts:
                 frame = draw(scene, camera.at_most(THUMBNAIL), np.zeros(3, np.float32), single)
                 thumbnails.append((frame.image, frame.transmittance[:, :, None]))
         (image, transmittance), (other_image, other_transmittance) = thumbnails
-        return [
-            _psnr(np.clip(image + grey * transmittance, 0, 1), np.clip(other_image + grey * other_transmittance, 0, 1))
-            for grey in backgrounds
-        ]
-
-
-def _psnr(one: Float32[np.ndarray, "H W 3"], other: Float32[np.ndarray, "H W 3"]) -> float:
-    return -10 * float(np.log10(max(float(np.mean(np.square(one - other), dtype=np.float64)), 1e-12)))
+        psnrs = list[float]()
+        for grey in backgrounds:
+            with_it = np.clip(image + grey * transmittance, 0, 1)
+            without = np.clip(other_image + grey * other_transmittance, 0, 1)
+            error = float(np.mean(np.square(with_it - without), dtype=np.float64))
+            psnrs.append(-10 * float(np.log10(max(error, 1e-12))))
+        return psnrs
 
 
 # The encoder has cameras of its own (:mod:`kissgs.cameras.virtual`) and stores coarsely what these do not see;
 # evaluated with the same cameras, these errors would not show. So evaluation chooses its own: cameras are
 # drawn at random instead of optimised, and every Gaussian that can be visible may become a target.
 
-COUNT = 24
-"""Number of evaluation views, without those added for overlooked parts."""
-
-WIDTH, HEIGHT = 320, 240
-"""Size of the images, pixels."""
+COUNT = 24  # number of evaluation views, without those added for overlooked parts
+WIDTH, HEIGHT = 320, 240  # size of the images, pixels
 
 KINDS = ("far", "around", "close-up", "across")
 """Kinds of poses, in turn: outside of the scene; around a part of random size; close to a surface; from one part of the
 scene towards another."""
 
-EXTENT_SHARES = (1.0, 0.98, 0.9, 0.5)
-"""Shares of the Gaussians, along each axis, that a "far" view frames: below 1 because a few may lie far away."""
-
-CLOSE_UP_RANKS = (100, 1000)
-"""Smallest and largest number of Gaussians that are nearer to the target of a close-up than its camera is."""
-
-MIN_SIGMAS = 5.0
-"""Smallest distance of a camera to its target Gaussian, in the Gaussian's standard deviations."""
-
-MIN_MEAN_ALPHA = 0.02
-"""An image with a smaller mean alpha counts as empty."""
-
-INSIDE_SIGMAS = 3.0
-"""A camera within this Mahalanobis distance of a Gaussian's mean counts as inside it."""
-
-MAX_INSIDE_SHARE, MAX_SINGLE_SHARE = 0.5, 0.3
-"""Largest shares of an image that Gaussians around the camera, and that a single Gaussian, may cover."""
+EXTENT_SHARES = (1.0, 0.98, 0.9, 0.5)  # of Gaussians that a "far" view frames: a few may lie far away
+CLOSE_UP_RANKS = (100, 1000)  # Gaussians that are nearer to the target of a close-up than its camera is
+MIN_SIGMAS = 5.0  # smallest distance of a camera to its target Gaussian, in the Gaussian's standard deviations
+MIN_MEAN_ALPHA = 0.02  # an image with a smaller mean alpha counts as empty
+INSIDE_SIGMAS = 3.0  # a camera within this Mahalanobis distance of a Gaussian's mean counts as inside it
+MAX_INSIDE_SHARE, MAX_SINGLE_SHARE = 0.5, 0.3  # of an image, by Gaussians around the camera, by a single one
 
 
 def evaluation_views(splats: Splats, context: Context = DEFAULT_CONTEXT, *, seed: int = 0) -> Views:
@@ -182,15 +156,14 @@ def farther(views: Views, distance: float) -> Views:
     if distance == 1:
         return views
     source = f"{views.source}, at {distance:g} times the distance"
-    return replace(views, test=tuple(_farther(view, distance) for view in views.test), source=source)
-
-
-def _farther(view: View, distance: float) -> View:
-    assert view.target is not None  # noqa: S101  every drawn view has one
-    viewmat = view.camera.viewmat.copy()
-    # A point x has camera coordinates R x + t; the target's are in front of the camera, and scale with the distance.
-    viewmat[:3, 3] += (distance - 1) * (viewmat[:3, :3] @ view.target + viewmat[:3, 3])
-    return replace(view, camera=replace(view.camera, viewmat=viewmat))
+    moved = list[View]()
+    for view in views.test:
+        assert view.target is not None  # noqa: S101  every drawn view has one
+        viewmat = view.camera.viewmat.copy()
+        # A point x has camera coordinates R x + t; the target's are in front of the camera, and scale with distance.
+        viewmat[:3, 3] += (distance - 1) * (viewmat[:3, :3] @ view.target + viewmat[:3, 3])
+        moved.append(replace(view, camera=replace(view.camera, viewmat=viewmat)))
+    return replace(views, test=tuple(moved), source=source)
 
 
 def _draw_views(
@@ -231,12 +204,9 @@ def _grey(level: float) -> Float32[np.ndarray, "3"]:
 class _PoseSampler:
     """Draws poses relative to the visible Gaussians of a scene."""
 
-    any_visible: bool
-    """Whether there are any; if not, one at the origin stands in, so that there are cameras."""
-    columns: Float32[np.ndarray, "3 n"]
-    """Positions, as stored."""
-    sizes: Float64[np.ndarray, " n"]
-    """Standard deviations along the middle axis."""
+    any_visible: bool  # whether there are any; if not, one at the origin stands in, so that there are cameras
+    columns: Float32[np.ndarray, "3 n"]  # positions, as stored
+    sizes: Float64[np.ndarray, " n"]  # standard deviations along the middle axis
     gaussians: GaussianSampler
 
     @classmethod

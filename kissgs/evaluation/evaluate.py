@@ -18,8 +18,7 @@ from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 from kissgs.core.positions import Origin, with_origin
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
-from kissgs.evaluation.detail import PatchChanges
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, PatchChanges, Split, ViewComparison
 from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.metrics import Flip, Lpips, ms_ssim, psnr, ssim_with_patches
@@ -32,17 +31,10 @@ LEAST_PSNR, USUAL_PSNR = 12.0, 18.0
 """Median PSNR, decibels, below which a capture is refused, and below which a note says so. Images of different scenes
 have about 8 to 12 dB; renderings of a trained scene have 20 to 35."""
 
-COMPARED, SIDE = 5, 160
-"""Number of photographs that are compared, and of pixels on the longer side of each, samples of the photograph."""
-
-CAMERAS = 16
-"""Number of cameras that tell, where there are no photographs, how much of the scene they show."""
-
-GAINS = 0.25, 4.0
-"""Limits of the factor by which a photograph may be darker or brighter than renderings of the same scene."""
-
-MIN_ALPHA = 0.02
-"""Smallest mean alpha of a rendering that is compared where the scene is opaque."""
+COMPARED, SIDE = 5, 160  # photographs that are compared, and pixels on the longer side of each
+CAMERAS = 16  # number of cameras that tell, where there are no photographs, how much of the scene they show
+GAINS = 0.25, 4.0  # by which a photograph may be darker or brighter than renderings of the same scene
+MIN_ALPHA = 0.02  # smallest mean alpha of a rendering that is compared where the scene is opaque
 
 NOT_COMPARED = "no photograph of the capture can be compared with, so whether it belongs to this scene is not known"
 """Note on a capture whose cameras see the scene, but that has no photographs."""
@@ -192,8 +184,7 @@ def _samples(views: Views) -> list[_Sample]:
         sampled = view.sampled(math.ceil(max(view.camera.width, view.camera.height) / SIDE), (0, 0))
         with contextlib.suppress(KissgsError):
             photo = sampled.load_photo() / np.float32(255)
-            background = views.background if view.background is None else view.background
-            samples.append((replace(sampled, background=background), photo))
+            samples.append((replace(sampled, background=background_of(view, views.background)), photo))
     return samples
 
 
@@ -324,9 +315,8 @@ def _compare_views(
         other = render_clamped(candidate, view.camera, background, context)
         blank = blank and bool((image == np.clip(background, 0, 1)).all())
         comparison, changes = _compare(image, other, view.load_photo() if photographed else None, measure)
-        compared.append(
-            ViewComparison(view=view, comparison=comparison, patch_changes=changes, origin=reference.origin)
-        )
+        origin = reference.origin
+        compared.append(ViewComparison(view=view, comparison=comparison, patch_changes=changes, origin=origin))
     return Evaluation(
         against="photos" if photographed else "renderings",
         split=used,
@@ -345,7 +335,6 @@ def background_of(view: View, default: Float32[np.ndarray, "3"]) -> Float32[np.n
 
 
 def render_clamped(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], context: Context) -> Rendering:
-    """Return a rendering with its values clamped to [0, 1]."""
     colour = background.tolist()
     image, _ = render(splats, camera, background=colour, threads=context.threads, device=context.device)
     return np.clip(image, 0, 1)
@@ -353,10 +342,8 @@ def render_clamped(splats: Splats, camera: Camera, background: Float32[np.ndarra
 
 def _measure(flip: bool, lpips: bool, device: Device) -> Measure:
     perceptual: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {}
-    if flip:
-        perceptual["flip"] = Flip()
-    if lpips:
-        perceptual["lpips"] = Lpips(device)
+    perceptual |= {"flip": Flip()} if flip else {}
+    perceptual |= {"lpips": Lpips(device)} if lpips else {}
 
     def measure(image: np.ndarray, target: np.ndarray) -> tuple[ImageMetrics, Float64[np.ndarray, "h w"]]:
         mean, patches = ssim_with_patches(image, target)
@@ -387,12 +374,11 @@ def _compare(
     photo: Shaped[np.ndarray, "H W 3"] | None,
     measure: Measure,
 ) -> tuple[Comparison, PatchChanges]:
-    vs_reference, patches = measure(candidate, reference)
+    found, patches = measure(candidate, reference)
     if photo is None:
-        comparison = Comparison(reference=None, candidate=vs_reference, candidate_vs_reference=vs_reference)
-        return comparison, patches - 1
+        return Comparison(reference=None, candidate=found, candidate_vs_reference=found), patches - 1
     (before, patches_before), (after, patches_after) = measure(reference, photo), measure(candidate, photo)
-    comparison = Comparison(reference=before, candidate=after, candidate_vs_reference=vs_reference)
+    comparison = Comparison(reference=before, candidate=after, candidate_vs_reference=found)
     return comparison, patches_after - patches_before
 
 

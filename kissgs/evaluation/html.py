@@ -17,9 +17,8 @@ from PIL import Image
 from kissgs.core.array_types import Float32, Float64, UInt8
 from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
-from kissgs.evaluation.detail import LARGE_LOSS
 from kissgs.evaluation.evaluate import background_of, render_clamped
-from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison, format_metric
+from kissgs.evaluation.results import LARGE_LOSS, Comparison, Evaluation, ViewComparison, format_metric
 from kissgs.rendering.images import to_bytes
 from kissgs.rendering.metrics import PATCH, patch_edges
 
@@ -39,11 +38,8 @@ INFERNO = (
 )
 """Matplotlib's colour map "inferno" at ten points, RGB from 0 to 255: its lightness grows evenly."""
 
-FULL_SCALES = (1, 2, 3, 5, 10, 15, 20, 30, 50, 100, 255)
-"""Errors that the brightest colour may stand for, levels of an 8-bit image."""
-
-WINDOW = 32
-"""Side of the square over which the largest error is searched, pixels."""
+FULL_SCALES = (1, 2, 3, 5, 10, 15, 20, 30, 50, 100, 255)  # of 255 levels, for which the brightest colour may stand
+WINDOW = 32  # side of the square over which the largest error is searched, pixels
 
 
 def rms_difference(
@@ -98,7 +94,7 @@ def _cards(evaluation: Evaluation, before: int | None, after: int | None) -> Ite
     mean, to_reference = evaluation.mean, evaluation.mean.candidate_vs_reference.texts()
     if mean.reference is not None:
         of_reference, of_candidate = mean.reference.texts(), mean.candidate.texts()
-        change = f"{_change(mean)} dB: the reference has {of_reference.pop('PSNR')} dB"
+        change = f"{_signed(mean.change or 0.0, 2)} dB: the reference has {of_reference.pop('PSNR')} dB"
         yield "PSNR, candidate to photographs", f"{of_candidate.pop('PSNR')} dB", change
         for name, text in of_candidate.items():
             yield f"{name}, candidate to photographs", text, f"the reference has {of_reference[name]}"
@@ -121,23 +117,8 @@ def _cards(evaluation: Evaluation, before: int | None, after: int | None) -> Ite
         yield "Gaussians", f"{evaluation.candidate_count:,}", counts
 
 
-def _worst_views(evaluation: Evaluation) -> str:
-    """Return the worst views, those of the surroundings included, as plain text to be escaped."""
-    text, surroundings = f"Candidate to reference: {evaluation.extremes}.", evaluation.surroundings
-    if surroundings is None:
-        return text
-    mean = surroundings.mean.candidate_vs_reference.summary
-    return f"{text} Surroundings, {surroundings.views_used} ({surroundings.source}): {mean}; {surroundings.extremes}."
-
-
-def _change(comparison: Comparison) -> str:
-    """Return the change of the PSNR to the photograph as HTML."""
-    return "" if comparison.change is None else _red_if_negative(format_metric(comparison.change, 2, signed=True))
-
-
-def _signed(change: float) -> str:
-    """Return a change of SSIM as HTML."""
-    return _red_if_negative(format_metric(change, 4, signed=True))
+def _signed(change: float, digits: int = 4) -> str:
+    return _red_if_negative(format_metric(change, digits, signed=True))
 
 
 def _red_if_negative(text: str) -> str:
@@ -168,23 +149,12 @@ def _row(name: str, comparison: Comparison) -> str:
     return f"<tr><td>{name}</td>{cells}</tr>"
 
 
-MAX_VIEWS = 12
-"""Largest number of views shown with images, about 10 MB in all."""
-
-MAX_SURROUNDINGS = 4
-"""Largest number of views of the surroundings shown with images."""
-
-MAX_PATCHES = 6
-"""Largest number of patches shown, those that lose most SSIM."""
-
-MAX_SIDE = 1280
-"""Longer side of the large images, pixels; larger ones are reduced."""
-
-QUALITY = 90
-"""WebP quality of the large images; lossless, they would be five times as large."""
-
-MAX_CROP, MIN_CROP = 160, 64
-"""Limits of the side of an enlarged crop, pixels; within them it is half of the image's shorter side."""
+MAX_VIEWS = 12  # largest number of views shown with images, about 10 MB in all
+MAX_SURROUNDINGS = 4  # largest number of views of the surroundings shown with images
+MAX_PATCHES = 6  # largest number of patches shown, those that lose most SSIM
+MAX_SIDE = 1280  # longer side of the large images, pixels; larger ones are reduced
+QUALITY = 90  # WebP quality of the large images; lossless, they would be five times as large
+MAX_CROP, MIN_CROP = 160, 64  # side of an enlarged crop, pixels; within these, half of the image's shorter side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -197,15 +167,15 @@ class ReportScene:
 
 
 def html_report(
-    evaluation: Evaluation,
-    reference: ReportScene,
-    candidate: ReportScene,
-    context: Context = DEFAULT_CONTEXT,
+    evaluation: Evaluation, reference: ReportScene, candidate: ReportScene, context: Context = DEFAULT_CONTEXT
 ) -> str:
     """Return an evaluation as one HTML page with images of the worst views, then of the worst surroundings."""
     shown = _worst_first(evaluation)[:MAX_VIEWS]
     entries = [(f"view-{i}", evaluation, evaluation.views[i]) for i in shown]
+    beyond = ""
     if (around := evaluation.surroundings) is not None:
+        mean = around.mean.candidate_vs_reference.summary
+        beyond = f" Surroundings, {around.views_used} ({around.source}): {mean}; {around.extremes}."
         worst = _worst_first(around)[:MAX_SURROUNDINGS]
         entries += [(f"surroundings-{i}", around, around.views[i]) for i in worst]
     lowest = min((compared for _, _, compared in entries), key=lambda compared: compared.ranking_psnr)
@@ -217,8 +187,8 @@ def html_report(
     patches = _worst_patches(evaluation, (reference, candidate), context)
     context.progress("html", 1.0)
     images = "Their images are" if len(shown) == len(evaluation.views) else f"Images of the worst {len(shown)} are"
-    summary = f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}. {images} below, the "
-    summary += "worst first."
+    used = f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}"
+    summary = f"{used}. {images} below, the worst first."
     if evaluation.note:
         summary += f" {evaluation.note[0].upper()}{evaluation.note[1:]}."
     return Template(files("kissgs.evaluation").joinpath("report.html").read_text(encoding="utf-8")).substitute(
@@ -231,7 +201,7 @@ def html_report(
             for name, value, remark in _cards(evaluation, reference.bytes, candidate.bytes)
         ),
         table=_views_table(evaluation, shown),
-        worst_views=escape(_worst_views(evaluation)),
+        worst_views=escape(f"Candidate to reference: {evaluation.extremes}.{beyond}"),
         sections="\n".join([patches, *sections]),
         colours=", ".join("#" + bytes(color).hex() for color in INFERNO),
         quality=QUALITY,
@@ -244,8 +214,7 @@ def _worst_first(evaluation: Evaluation) -> list[int]:
     return sorted(range(len(evaluation.views)), key=lambda i: evaluation.views[i].ranking_psnr)
 
 
-Patch = tuple[int, int, int]
-"""Index of a view, and row and column of a patch in it."""
+Patch = tuple[int, int, int]  # index of a view, and row and column of a patch in it
 
 
 def _patches_to_show(evaluation: Evaluation) -> list[Patch]:
@@ -323,7 +292,11 @@ def _section(
     layers = {"reference": to_bytes(reference), "candidate": to_bytes(candidate)}
     layers |= {} if photo is None else {"photograph": photo}
     layers["difference"] = heat_map(levels, full)
-    mark, sources = _mark(crop, levels.shape), {layer: _large(pixels) for layer, pixels in layers.items()}
+    mark, sources = _mark(crop, levels.shape), dict[str, str]()
+    for layer, pixels in layers.items():
+        image = Image.fromarray(pixels)
+        image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
+        sources[layer] = _data_uri(image, quality=QUALITY)
     figures = [_slider(name, sources["reference"], sources["candidate"], mark)]
     if photo is not None:
         figures.append(_figure(sources["photograph"], f"photograph {name}", "the photograph"))
@@ -346,7 +319,8 @@ def _numbers(comparison: Comparison) -> str:
     to_reference = f"candidate to reference {comparison.candidate_vs_reference.summary}"
     if comparison.reference is None:
         return to_reference
-    return f"candidate to photograph {comparison.candidate.summary}, change {_change(comparison)} dB · {to_reference}"
+    change = _signed(comparison.change or 0.0, 2)
+    return f"candidate to photograph {comparison.candidate.summary}, change {change} dB · {to_reference}"
 
 
 def _slider(name: str, reference: str, candidate: str, mark: str) -> str:
@@ -371,12 +345,6 @@ def _mark(crop: tuple[slice, slice], shape: tuple[int, ...]) -> str:
     edges = {"top": rows.start / shape[0], "left": columns.start / shape[1]}
     edges |= {"height": (rows.stop - rows.start) / shape[0], "width": (columns.stop - columns.start) / shape[1]}
     return f'<span class="mark" style="{"; ".join(f"{edge}: {100 * at:.2f}%" for edge, at in edges.items())}"></span>'
-
-
-def _large(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
-    image = Image.fromarray(pixels)
-    image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
-    return _data_uri(image, quality=QUALITY)
 
 
 def _lossless(pixels: UInt8[np.ndarray, "H W 3"]) -> str:

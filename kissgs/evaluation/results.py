@@ -10,9 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from kissgs.cameras.views import View
-from kissgs.core.array_types import Float32
+from kissgs.core.array_types import Float32, Float64
 from kissgs.core.positions import WORLD, Origin
-from kissgs.evaluation.detail import LARGE_LOSS, Detail, PatchChanges
 from kissgs.rendering.metrics import PATCH
 
 
@@ -23,6 +22,33 @@ def format_metric(value: float, digits: int, *, signed: bool = False) -> str:
     if math.isnan(value):
         return "NaN"
     return f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # -0.0 + 0.0 is 0.0
+
+
+# Loss of detail: changes of SSIM in small patches, which no mean over an image shows.
+
+PatchChanges = Float64[np.ndarray, "_h _w"]
+"""Change of SSIM in each patch of an image (:func:`kissgs.rendering.metrics.ssim_with_patches`), negative for a loss: a
+candidate's less the original's, both to a photograph; without photographs the candidate's to the original, less 1."""
+
+LARGE_LOSS = 0.05  # loss of SSIM beyond which a patch counts in share_below
+
+
+@dataclass(frozen=True, slots=True)
+class Detail:
+    """Changes of SSIM in patches, -2 to 2 and negative for a loss; all NaN if a rendering failed."""
+
+    worst: float  # of the worst patch
+    worst_percent: float  # mean of the worst 1 % of all patches, rounded up to whole patches
+    share_below: float  # of patches, 0 to 1, that lose more than LARGE_LOSS
+
+    @classmethod
+    def of(cls, views: Sequence[PatchChanges]) -> Detail:
+        """Return the figures over all patches of all views, of which there is at least one."""
+        changes = np.sort(np.concatenate([view.ravel() for view in views]))  # NaN comes last
+        if np.isnan(changes[-1]):
+            return cls(math.nan, math.nan, math.nan)
+        worst = changes[: -(-len(changes) // 100)]
+        return cls(float(worst[0]), float(worst.mean()), float((changes < -LARGE_LOSS).mean()))
 
 
 def detail_text(detail: Detail, against: str) -> str:
@@ -272,16 +298,11 @@ def _psnrs(evaluation: Evaluation) -> list[float]:
 
 def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:
     columns = {name: [getattr(value, name) for value in values] for name in ("ssim", "ms_ssim", "flip", "lpips")}
-    means: dict[str, Any] = {
-        name: None if None in column else sum(column) / len(column) for name, column in columns.items()
-    }
-    return ImageMetrics(psnr=_mean_decibels([value.psnr for value in values]), **means)
-
-
-def _mean_decibels(values: Sequence[float]) -> float:
-    if all(value == math.inf for value in values):
-        return math.inf
-    return sum(value if math.isnan(value) else min(value, MAX_VIEW_PSNR) for value in values) / len(values)
+    means: dict[str, Any] = {name: None if None in of else sum(of) / len(of) for name, of in columns.items()}
+    psnrs = [value.psnr for value in values]
+    bounded = [psnr if math.isnan(psnr) else min(psnr, MAX_VIEW_PSNR) for psnr in psnrs]
+    mean = math.inf if all(psnr == math.inf for psnr in psnrs) else sum(bounded) / len(bounded)
+    return ImageMetrics(psnr=mean, **means)
 
 
 def _point(point: Sequence[float]) -> str:
@@ -297,8 +318,7 @@ def as_json(value: float) -> float | str | None:
 
 # PSNR of an evaluation, and its loss of PSNR and of SSIM, as goals define them.
 
-ASSUMED_PSNR = 30.0
-"""PSNR, decibels, that renderings are assumed to have to photographs if there are none: about that of good captures."""
+ASSUMED_PSNR = 30.0  # decibels to photographs, where there are none: about that of good captures
 
 ESTIMATED_DROP = f"without photographs, the drop of PSNR is estimated for a scene that has {ASSUMED_PSNR:g} dB to them"
 """Note for a drop that was not measured with photographs."""
@@ -307,8 +327,7 @@ SEARCH_SEED = 20_011
 """Seed of the cameras that evaluate the trials of a search. ``evaluate`` has seed 0: a result selected with some
 cameras is better from these than from others."""
 
-WORST_SHARE = 0.05
-"""Share of the views, the worst ones, that a goal limits separately."""
+WORST_SHARE = 0.05  # share of the views, the worst ones, that a goal limits separately
 
 MAX_ERROR_RATIO = 20.0
 """Largest ratio of the worst views' squared error to that of the goal. The mean alone would accept the loss of a part
@@ -333,7 +352,7 @@ def psnr_of(evaluation: Evaluation) -> float:
     """
     evaluation = over_scene(evaluation)
     mean = evaluation.mean.candidate_vs_reference.psnr
-    worst = _mean_of_worst([squared_error(psnr) for psnr in _psnrs(evaluation)]) / MAX_ERROR_RATIO
+    worst = _worst([[squared_error(psnr) for psnr in _psnrs(evaluation)]]) / MAX_ERROR_RATIO
     return mean if math.isnan(mean) or worst <= 0 else min(mean, -10 * math.log10(worst))
 
 
@@ -397,16 +416,11 @@ def _errors_added(evaluation: Evaluation) -> list[float]:
 
 
 def _worst(groups: Sequence[Sequence[float]]) -> float:
-    """Return the largest :func:`_mean_of_worst` of groups of views; NaN if any error is."""
+    """Return the largest mean of the largest errors, :data:`WORST_SHARE` of a group of views; NaN if any error is."""
     if any(math.isnan(error) for errors in groups for error in errors):
         return math.nan
-    return max(_mean_of_worst(errors) for errors in groups)
-
-
-def _mean_of_worst(errors: Sequence[float]) -> float:
-    """Return the mean of the largest errors: :data:`WORST_SHARE` of them, at least one."""
-    count = math.ceil(WORST_SHARE * len(errors))
-    return sum(sorted(errors)[-count:]) / count
+    counts = [math.ceil(WORST_SHARE * len(errors)) for errors in groups]
+    return max(sum(sorted(errors)[-count:]) / count for errors, count in zip(groups, counts, strict=True))
 
 
 def squared_error(psnr: float) -> float:

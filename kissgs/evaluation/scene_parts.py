@@ -16,14 +16,9 @@ from kissgs.rendering.cpu.frame import color_gradients, draw, sums_of_slots
 from kissgs.rendering.cpu.records import Frame
 from kissgs.rendering.rasterizer import drawn_opacities
 
-MORTON_BITS = 21
-"""Bits per axis of a Morton code: as many as 64 bits hold."""
-
-NEIGHBOURS = 64
-"""Number of Gaussians, consecutive in Morton order, that form a neighbourhood."""
-
-FAIRNESS = 0.25
-"""Exponent of prominence when octree cells share a probability: 1 is proportional, 0 gives all cells the same."""
+MORTON_BITS = 21  # bits per axis of a Morton code: as many as 64 bits hold
+NEIGHBOURS = 64  # number of Gaussians, consecutive in Morton order, that form a neighbourhood
+FAIRNESS = 0.25  # exponent of prominence where octree cells share a probability: 0 gives all the same
 
 
 def prominence(splats: Splats) -> Float64[np.ndarray, " N"]:
@@ -106,20 +101,11 @@ def morton_codes(means: Float64[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
 
 # Separate parts of a scene: each may be lost as a whole, and randomly drawn cameras may miss it.
 
-SAMPLE_SIZE = 2048
-"""Largest number of Gaussians in the sample that is clustered."""
-
-MIN_SHARE = 0.004
-"""Smallest share of the scene's prominence that a part has: 0.5 %, less a margin for errors of sampling."""
-
-MIN_SAMPLES = 8
-"""Smallest number of sampled Gaussians in a part."""
-
-MIN_GAP_RATIO = 3.0
-"""Smallest ratio of the gap around a part to the gaps inside it: lower ratios are common between any Gaussians."""
-
-RADIUS_QUANTILE = 0.75
-"""Share of a part's sampled Gaussians within its radius."""
+SAMPLE_SIZE = 2048  # largest number of Gaussians in the sample that is clustered
+MIN_SHARE = 0.004  # of the scene's prominence that a part has: 0.5 %, less a margin for errors of sampling
+MIN_SAMPLES = 8  # smallest number of sampled Gaussians in a part
+MIN_GAP_RATIO = 3.0  # of the gap around a part to gaps inside it: lower ones are common between any Gaussians
+RADIUS_QUANTILE = 0.75  # share of a part's sampled Gaussians within its radius
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,8 +146,7 @@ def find_parts(splats: Splats, counts: Float64[np.ndarray, " N"]) -> tuple[list[
     return parts, part_of
 
 
-Edge = tuple[float, int, int]
-"""Length and both ends."""
+Edge = tuple[float, int, int]  # length and both ends
 
 
 def _spanning_tree(positions: Float64[np.ndarray, "n 3"], sizes: Float64[np.ndarray, " n"]) -> list[Edge]:
@@ -212,11 +197,8 @@ def _separate_parts(edges: list[Edge], shares: Float64[np.ndarray, " n"]) -> lis
 
 # Share of a scene that some views show, from the blending weights of its Gaussians.
 
-SHOWN_SHARE = 1e-6
-"""Share of an image that a Gaussian must exceed to count as shown by it."""
-
-MAX_SIDE = 160
-"""Longer side of the images, pixels; larger ones are rendered at this size."""
+SHOWN_SHARE = 1e-6  # share of an image that a Gaussian must exceed to count as shown by it
+MAX_SIDE = 160  # longer side of the images, pixels; larger ones are rendered at this size
 
 
 def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:

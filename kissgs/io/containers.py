@@ -14,22 +14,13 @@ from typing import Literal, NamedTuple, Protocol, runtime_checkable
 from kissgs.core.errors import InvalidContainerError
 from kissgs.io.files import reason_of
 
-MAX_ZIP_ENTRIES = 1000
-"""Largest number of entries: a container has 12 files, to which users may add notes and previews."""
-
-MAX_TREE_ENTRIES = 20_000
-"""Largest number of entries of a zip of many containers, each of which has up to eight files."""
-
-MAX_DIRECTORY_BYTES = 1 << 21
-"""Largest list of entries in a zip, which is read whole."""
+MAX_ZIP_ENTRIES = 1000  # largest number of entries: a container has 12 files, to which users may add notes and previews
+MAX_TREE_ENTRIES = 20_000  # largest number of entries of a zip of many containers, each of which has up to eight files
+MAX_DIRECTORY_BYTES = 1 << 21  # largest list of entries in a zip, which is read whole
 
 META_NAME = "meta.json"
 
-MAX_METADATA_BYTES = 1 << 20
-"""Largest size of a metadata file, bytes; kissgs writes 4 kB for SOG-XT, and 15 kB for SOG with its codebooks."""
-
-MAX_SIGNED_LOG = 88.7
-"""Largest signed logarithm of a position: exp of more exceeds float32."""
+MAX_METADATA_BYTES = 1 << 20  # largest metadata file, bytes; kissgs writes 4 kB for SOG-XT, 15 kB for SOG
 
 _END, _END64 = b"PK\x05\x06", b"PK\x06\x07"
 _END_SIZE, _MAX_COMMENT = 22, 0xFFFF
@@ -38,8 +29,7 @@ _LOCAL = struct.Struct("<4s22xHH")
 _STORED, _DEFLATED = 0, 8
 _BLOCK = 1 << 20
 
-ZIP_MAGICS = (b"PK\x03\x04", _END)
-"""First bytes of a zip file, and of an empty one."""
+ZIP_MAGICS = (b"PK\x03\x04", _END)  # first bytes of a zip file, and of an empty one
 
 
 @runtime_checkable
@@ -57,21 +47,16 @@ class Source(Protocol):
 
 
 class MemorySource:
-    """Files in memory."""
-
     def __init__(self, files: Mapping[str, bytes]) -> None:
         self._files = files
 
     def names(self) -> frozenset[str]:
-        """See :class:`Source`."""
         return frozenset(self._files)
 
     def size(self, name: str) -> int:
-        """See :class:`Source`."""
         return len(self._files[name])
 
     def read(self, name: str, limit: int) -> bytes:
-        """See :class:`Source`."""
         if name not in self._files:
             raise _missing(name)
         _refuse_larger(name, self.size(name), limit)
@@ -89,15 +74,12 @@ class DirectorySource:
             raise InvalidContainerError(f"cannot read {folder}: {reason_of(error)}") from error
 
     def names(self) -> frozenset[str]:
-        """See :class:`Source`."""
         return self._names
 
     def size(self, name: str) -> int:
-        """See :class:`Source`."""
         return (self._folder / name).stat().st_size
 
     def read(self, name: str, limit: int) -> bytes:
-        """See :class:`Source`."""
         try:
             if not is_below(name) or not (self._folder / name).is_file():
                 raise _missing(name)
@@ -137,15 +119,12 @@ class ZipSource:
                 self._entries[name] = entry
 
     def names(self) -> frozenset[str]:
-        """See :class:`Source`."""
         return frozenset(self._entries)
 
     def size(self, name: str) -> int:
-        """See :class:`Source`."""
         return self._entries[self._key(name)].packed
 
     def read(self, name: str, limit: int) -> bytes:
-        """See :class:`Source`."""
         entry = self._entries.get(self._key(name))
         if entry is None:
             raise _missing(name)
@@ -250,7 +229,7 @@ def _read_directory(file: io.BufferedIOBase, label: str, most: int) -> list[_Ent
 
 
 def zip_names(file: io.BufferedIOBase) -> list[str]:
-    """Return the names of all entries of a zip, folders included; none if it cannot be read."""
+    """Return the names of all entries of a zip, folders included; none of a file that is none."""
     try:
         return [entry.path for entry in _read_directory(file, "the file", MAX_TREE_ENTRIES)]
     except InvalidContainerError:
@@ -286,20 +265,18 @@ def open_source(source: Path | bytes | Mapping[str, bytes], root: str | None = N
     """
     if isinstance(source, bytes):
         yield ZipSource(io.BytesIO(source), "the input", root)
-    elif not isinstance(source, Path):
+        return
+    if not isinstance(source, Path):
         yield MemorySource(source)
-    else:
-        try:
-            if source.exists() and not (source.is_file() or source.is_dir()):
-                raise InvalidContainerError(f"{source} is neither a file nor a folder")
-            file = None if source.is_dir() else source.open("rb")
-        except (OSError, ValueError) as error:
-            raise InvalidContainerError(f"cannot read {source}: {reason_of(error)}") from error
-        if file is None:
-            yield DirectorySource(source)
-            return
-        with file:
-            yield ZipSource(file, str(source), root)
+        return
+    try:
+        if source.exists() and not (source.is_file() or source.is_dir()):
+            raise InvalidContainerError(f"{source} is neither a file nor a folder")
+        file = None if source.is_dir() else source.open("rb")
+    except (OSError, ValueError) as error:
+        raise InvalidContainerError(f"cannot read {source}: {reason_of(error)}") from error
+    with file or contextlib.nullcontext():
+        yield DirectorySource(source) if file is None else ZipSource(file, str(source), root)
 
 
 def _refuse_larger(name: str, size: int, limit: int) -> None:
@@ -312,7 +289,6 @@ def _missing(name: str) -> InvalidContainerError:
 
 
 def stored_size(files: Source, name: str) -> int:
-    """Return the size of a file, bytes."""
     try:
         return files.size(name)
     except (KeyError, OSError, ValueError) as error:

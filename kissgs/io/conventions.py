@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from kissgs.core.array_types import Float, Float32, Float64, Int, Int64, Shaped, UInt8
+from kissgs.core.errors import UnsupportedError
 from kissgs.core.spherical_harmonics import sh_basis
 from kissgs.core.splats import OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_C0, Splats
 
 # Values and 8-bit codes of other formats -> the stored (pre-activation) parameters of a scene.
 
-ROWS = 1 << 14
-"""Gaussians per step, so that temporaries stay in the processor's cache."""
+ROWS = 1 << 14  # Gaussians per step, so that temporaries stay in the processor's cache
 
 _SLOTS = np.array([[0, 1, 2, 3], [1, 0, 2, 3], [1, 2, 0, 3], [1, 2, 3, 0]])
 """Indices of the four components in (largest, first, second, third of the others), by the index of the largest."""
@@ -32,11 +32,8 @@ def log_scales(scales: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
     return logs
 
 
-OPACITY_OF_BYTE = opacity_logits(np.arange(256) / 255)
-"""Opacity logit of each 8-bit opacity."""
-
-SH0_OF_BYTE = ((np.arange(256) / 255 - 0.5) / SH_C0).astype(np.float32)
-"""Constant SH coefficient of each 8-bit colour."""
+OPACITY_OF_BYTE = opacity_logits(np.arange(256) / 255)  # opacity logit of each 8-bit opacity
+SH0_OF_BYTE = ((np.arange(256) / 255 - 0.5) / SH_C0).astype(np.float32)  # constant SH coefficient of each 8-bit colour
 
 
 def look_up(
@@ -69,8 +66,7 @@ def steps(count: int) -> list[slice]:
 
 # Stored (pre-activation) parameters of a scene -> values and codes of other formats.
 
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Indices of the three other components of a quaternion, by the index of the largest."""
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the other components of a quaternion, by the largest
 
 
 def opacities_of(logits: Float32[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
@@ -93,9 +89,7 @@ def to_bytes(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     return to_codes(values).astype(np.uint8)
 
 
-def split_largest(
-    quats: Float32[np.ndarray, "B 4"],
-) -> tuple[Int64[np.ndarray, " B"], Float64[np.ndarray, "B 3"]]:
+def split_largest(quats: Float32[np.ndarray, "B 4"]) -> tuple[Int64[np.ndarray, " B"], Float64[np.ndarray, "B 3"]]:
     """Return the index of each quaternion's largest component, and the others once it is positive."""
     wide = quats.astype(np.float64)
     index = np.abs(wide).argmax(axis=1)[:, None]
@@ -103,25 +97,29 @@ def split_largest(
     return index[:, 0], sign * np.take_along_axis(wide, _OTHERS[index[:, 0]], axis=1)
 
 
-def note_mark(notes: list[str], antialiased: bool) -> None:
-    """Append to ``notes`` that a format without a place for the mark of an antialiased scene leaves it out."""
-    if antialiased:
-        notes.append("the mark of antialiasing is left out, and viewers will draw small and thin Gaussians too opaque")
+def refuse_empty(splats: Splats, ending: str) -> None:
+    """Raise UnsupportedError for a scene without Gaussians, which the format with this ending cannot hold."""
+    if not len(splats):
+        raise UnsupportedError(f"a scene without Gaussians cannot be written as {ending}; write it as .ply")
 
 
-def note_clamped(notes: list[str], what: str, values: np.ndarray, low: float, high: float, limits: str) -> None:
-    """Append to ``notes`` how many Gaussians have a value below ``low`` or above ``high``, if there are any."""
+def marks_left_out(splats: Splats) -> list[str]:
+    """Return what is lost of an antialiased scene in a format without a place for its mark."""
+    text = "the mark of antialiasing is left out, and viewers will draw small and thin Gaussians too opaque"
+    return [text] * splats.antialiased
+
+
+def clamped(what: str, values: np.ndarray, low: float, high: float, limits: str) -> list[str]:
+    """Return a phrase about the number of Gaussians with a value below ``low`` or above ``high``, if there are any."""
     if values.size == 0 or (values.min() >= low and values.max() <= high):
-        return
-    rows = ((values < low) | (values > high)).reshape(len(values), -1).any(axis=1)
-    count = int(rows.sum())
-    notes.append(f"{what} of {count:,} Gaussian{'s' if count > 1 else ''} are clamped to {limits}")
+        return []
+    count = int(((values < low) | (values > high)).reshape(len(values), -1).any(axis=1).sum())
+    return [f"{what} of {count:,} Gaussian{'s' * (count > 1)} are clamped to {limits}"]
 
 
 # Axes of other formats, and those of a ``.ply``: x right, y down, z forward.
 
-Signs = tuple[int, int, int]
-"""Sign of each axis, 1 or -1."""
+Signs = tuple[int, int, int]  # sign of each axis, 1 or -1
 
 
 def axis_signs(frame: str) -> Signs:
@@ -196,11 +194,8 @@ def _quaternion(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 4
 
 # Morton order: Gaussians that follow one another are close to one another.
 
-_BITS = 21
-"""Bits per axis: three axes fill 63 of 64 bits."""
-
-_OUTSIDE = 1e-3
-"""Share of the Gaussians at either end of an axis that is not resolved, so that outliers do not coarsen the rest."""
+_BITS = 21  # bits per axis: three axes fill 63 of 64 bits
+_OUTSIDE = 1e-3  # share of Gaussians at either end of an axis that is not resolved, so that outliers coarsen nothing
 
 _SPREAD = (
     (32, 0x001F00000000FFFF),

@@ -47,7 +47,14 @@ def parse_json(
         raise error(f"{name} has more than {most:,} values, which is the limit; export the scene again")
     try:
         document = json.loads(data.decode("utf-8-sig"), parse_int=parse_int, parse_constant=_refuse_constant)
-        _check_depth(document)
+        level = [document]
+        for _ in range(MAX_DEPTH + 1):
+            nested = [
+                each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)
+            ]
+            level = [value for values in nested for value in values]
+        if any(isinstance(each, dict | list) for each in level):
+            raise ValueError(f"nested more than {MAX_DEPTH} deep")
     except (ValueError, RecursionError) as problem:
         raise error(f"{name} is not readable JSON; export the scene again") from problem
     return document
@@ -65,23 +72,13 @@ def is_number(value: object, limit: float) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < limit
 
 
-def _check_depth(document: object) -> None:
-    level = [document]
-    for _ in range(MAX_DEPTH + 1):
-        nested = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
-        level = [value for values in nested for value in values]
-    if any(isinstance(each, dict | list) for each in level):
-        raise ValueError(f"nested more than {MAX_DEPTH} deep")
-
-
 def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not JSON")
 
 
 # Atomic output: a temporary file beside the destination, renamed when it is complete.
 
-BLOCK = 4096
-"""Bytes that :func:`check_writable` writes: at least one block of the file system."""
+BLOCK = 4096  # bytes that check_writable writes: at least one block of the file system
 
 
 @contextlib.contextmanager
@@ -184,7 +181,6 @@ class SceneFile:
     size: int
 
     def read(self, offset: int, count: int) -> bytes:
-        """Return ``count`` bytes at ``offset``."""
         if offset + count > self.size:
             raise self.cut_short(offset + count)
         self.file.seek(offset)
@@ -206,9 +202,11 @@ class SceneFile:
 
     def cut_short(self, needed: int) -> InvalidSceneError:
         """Return the error of a file that should have ``needed`` bytes or more."""
-        return InvalidSceneError(
-            f"{self.name} is cut short: it needs {needed:,} bytes but has {self.size:,}; export or download it again"
-        )
+        return self.invalid(f"is cut short: it needs {needed:,} bytes but has {self.size:,}")
+
+    def invalid(self, problem: str) -> InvalidSceneError:
+        """Return the error of a file with a problem, which is the predicate of a sentence."""
+        return InvalidSceneError(f"{self.name} {problem}; export or download it again")
 
 
 @runtime_checkable
@@ -220,7 +218,9 @@ class BinaryWriter(Protocol):
 
 
 @contextlib.contextmanager
-def open_scene_file(source: Path | bytes, remedy: str = "name a scene file") -> Iterator[SceneFile]:
+def open_scene_file(
+    source: Path | bytes, remedy: str = "; name a scene file", error_class: type[KissgsError] = InvalidSceneError
+) -> Iterator[SceneFile]:
     """Open a file, or the bytes of one; ``remedy`` is what to do where there is no file, for messages."""
     if isinstance(source, bytes):
         yield SceneFile("the data", io.BytesIO(source), len(source))
@@ -228,13 +228,11 @@ def open_scene_file(source: Path | bytes, remedy: str = "name a scene file") -> 
     try:
         if not source.is_file():  # before opening, because opening a named pipe would wait for its writer
             reason = "it is a folder or a device" if source.exists() else "there is no such file"
-            raise InvalidSceneError(f"cannot read {source}: {reason}; {remedy}")
+            raise error_class(f"cannot read {source}: {reason}{remedy}")
         with source.open("rb") as file:
-            size = file.seek(0, io.SEEK_END)
-            file.seek(0)
-            yield SceneFile(source.name, file, size)
+            yield SceneFile(source.name, file, os.fstat(file.fileno()).st_size)
     except OSError as error:
-        raise InvalidSceneError(f"cannot read {source}: {(error.strerror or str(error)).lower()}") from error
+        raise error_class(f"cannot read {source}: {reason_of(error)}") from error
 
 
 def listed(names: Sequence[str]) -> str:

@@ -23,16 +23,18 @@ from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.positions import WORLD, from_world, origin_for
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
+from kissgs.io import spz as spz_format
 from kissgs.io.containers import is_file_name
 from kissgs.io.conventions import (
     Signs,
     colors_of,
     log_scales,
+    marks_left_out,
     mirror,
     move,
-    note_mark,
     opacities_of,
     opacity_logits,
+    refuse_empty,
     sh_signs,
     steps,
     to_bytes,
@@ -49,16 +51,7 @@ from kissgs.io.files import (
     refuse_more_than,
     whole_number,
 )
-from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
-from kissgs.io.spz import (
-    decode_positions,
-    encode_positions,
-    fractional_bits_for,
-    largest_spz,
-    read_spz,
-    read_spz_info,
-    write_spz,
-)
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, Notes, ReadOptions, titled
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
@@ -70,11 +63,8 @@ _OF_SURFACES = ("KHR_materials", "KHR_texture", "EXT_texture", "MSFT_texture", "
 """Beginnings of the names of extensions that say nothing about Gaussians."""
 
 _NEEDED = {
-    "EXT_mesh_gpu_instancing",
-    "KHR_node_visibility",
-    "EXT_meshopt_compression",
-    "KHR_meshopt_compression",
-    "KHR_draco_mesh_compression",
+    *("EXT_mesh_gpu_instancing", "KHR_node_visibility"),
+    *("EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_draco_mesh_compression"),
 }
 """Extensions that are not read, and without which the Gaussians are others, even in files that do not require them."""
 
@@ -84,11 +74,8 @@ _NEEDED_VALUES = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 _USUAL = {"projection": "perspective", "sortingMethod": "cameraDistance"}
 """How they are drawn here, by key of the extension; other ways are left out, with a note."""
 
-TO_PLY: Signs = (-1, -1, 1)
-"""Signs from glTF's axes to those of a ``.ply``."""
-
-MAX_JSON_BYTES, MAX_GLTF_BYTES = 1 << 22, 1 << 30
-"""Largest size of the JSON in a GLB, some kilobytes for a scene; and of a ``.gltf``, whose buffers may be in it."""
+TO_PLY: Signs = (-1, -1, 1)  # signs from glTF's axes to those of a .ply
+MAX_JSON_BYTES, MAX_GLTF_BYTES = 1 << 22, 1 << 30  # of the JSON in a GLB; of a .gltf, whose buffers may be in it
 
 MAX_SHOWN, MAX_ATTRIBUTES = 1000, 100
 """Largest number of nodes, and of primitives, each counted at every node that shows it; and of attributes of one, of
@@ -137,11 +124,9 @@ class _Document:
         """Return the error of a file that contradicts the format."""
         return InvalidSceneError(f"{self.name} is not valid glTF: {problem}; export it again")
 
-    def unread(self, extension: str) -> UnsupportedError:
+    def unread(self, name: str) -> UnsupportedError:
         """Return the error of a file with an extension without which the Gaussians would be others."""
-        return UnsupportedError(
-            f"{self.name} needs the extension {extension[:60]!r}, which is not read; export it without"
-        )
+        return UnsupportedError(f"{self.name} needs the extension {name[:60]!r}, which is not read; export it without")
 
     def value(self, parent: dict[str, Any], key: str, kind: type, default: int | None = None) -> Any:  # noqa: ANN401
         """Return a list, an object, both empty by default, or a whole number of an object."""
@@ -274,7 +259,7 @@ class _Document:
             raise UnsupportedError(f"{self.name} names a buffer outside its folder; put the file beside it")
         if self._folder is None:
             raise UnsupportedError(f"{self.name} needs the file {path[:80]!r} beside it; give the path, or a .glb")
-        with open_scene_file(self._folder / path, "put the buffer there") as opened:
+        with open_scene_file(self._folder / path, "; put the buffer there") as opened:
             return opened.read(0, opened.size)
 
 
@@ -291,7 +276,7 @@ def _split(opened: SceneFile) -> tuple[bytes, tuple[int, int] | None]:
         raise InvalidSceneError(f"{opened.name} is not valid GLB: its first chunk is not JSON; export it again")
     if length > opened.size:
         raise opened.cut_short(length)
-    text, start = opened.read(20, size), 28 + size
+    text, start = opened.read(20, size), 28 + size  # of the second chunk's data
     if start > length:
         return text, None
     size, kind = struct.unpack("<I4s", opened.read(start - 8, 8))
@@ -365,7 +350,12 @@ def read_gltf(
             _apply(document, part.matrix, own)
             start += part.count
             progress("read", start / max(count, 1))
-    _turn_to_ply(splats)
+    mirror(splats, TO_PLY)
+    # Half a turn of each Gaussian about its own axis, which its ellipsoid does not show: a .ply written as floats gets
+    # back the same numbers.
+    w, x, y, z = (splats.quats[:, i].copy() for i in range(4))
+    for i, values in enumerate((z, -y, x, -w)):
+        splats.quats[:, i] = values
     whole = replace(splats, notes=tuple(notes))
     if (world := placed * TO_PLY).size and origin_for(world, whole.scales) != WORLD:
         whole = from_world(whole, world)
@@ -393,7 +383,10 @@ def _parts(document: _Document) -> tuple[list[_Part], list[str]]:
                 left_out["meshes without Gaussians"] = None
                 continue
             parts.append(part := _part(document, primitive, matrix))
-            left_out |= dict.fromkeys(_not_drawn(document, primitive))
+            splatting = document.value(document.extensions(primitive), EXTENSION, dict)
+            left_out |= dict.fromkeys(key for key in ("indices", "targets") if key in primitive)
+            orders = {key: splatting.get(key, usual) for key, usual in _USUAL.items()}
+            left_out |= {f"{key} {str(found)[:40]!r}": None for key, found in orders.items() if found != _USUAL[key]}
             if part.spz is None:
                 left_out |= dict.fromkeys(name for name in part.attributes if name not in _ATTRIBUTES)
     if not parts:
@@ -402,13 +395,6 @@ def _parts(document: _Document) -> tuple[list[_Part], list[str]]:
             "export it with a node for each mesh"
         )
     return parts, list(left_out)
-
-
-def _not_drawn(document: _Document, primitive: dict[str, Any]) -> list[str]:
-    """Return what a primitive with Gaussians says of drawing them that is not followed."""
-    splatting = document.value(document.extensions(primitive), EXTENSION, dict)
-    orders = [f"{key} {str(splatting[key])[:40]!r}" for key in _USUAL if splatting.get(key, _USUAL[key]) != _USUAL[key]]
-    return [*(key for key in ("indices", "targets") if key in primitive), *orders]
 
 
 def _part(document: _Document, primitive: dict[str, Any], matrix: Float64[np.ndarray, "4 4"]) -> _Part:
@@ -426,7 +412,7 @@ def _part(document: _Document, primitive: dict[str, Any], matrix: Float64[np.nda
         if name not in SPZ_EXTENSIONS:
             raise document.unread(name)
         view = document.value(document.value(compressions, name, dict), "bufferView", int)
-        header = read_spz_info(bytes(document.view(view, most=512)))
+        header = spz_format.read_spz_info(bytes(document.view(view, most=512)))
         if count not in (None, header.count):
             raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
         return _Part(attributes, matrix, header.count, header.sh_degree, view, header.antialiased)
@@ -465,7 +451,9 @@ def _read_attributes(document: _Document, part: _Part, out: Splats) -> None:
 
 def _read_spz(document: _Document, view: int, out: Splats) -> tuple[str, ...]:
     """Read a ``.spz`` inside the file into ``out``, in glTF's axes; return its notes."""
-    stored = read_spz(bytes(document.view(view, most=largest_spz(len(out)))), ReadOptions(max_gaussians=len(out)))
+    most = 2 * spz_format.MAX_EXTENSION_BYTES + 2 * len(out) * spz_format.LARGEST_ROW  # which no such file exceeds
+    data = bytes(document.view(view, most=most))
+    stored = spz_format.read_spz(data, ReadOptions(max_gaussians=len(out)))
     mirror(stored, TO_PLY)
     for name in ATTRIBUTES:
         if name != "shN":
@@ -490,25 +478,12 @@ def _apply(document: _Document, matrix: Float64[np.ndarray, "4 4"], out: Splats)
     move(out, rotation, scale, matrix[:3, 3])
 
 
-def _turn_to_ply(splats: Splats) -> None:
-    """Turn a scene from glTF's axes to those of a ``.ply``, half a turn about z.
-
-    The rotation of each Gaussian follows by half a turn of its own about the same axis, which its ellipsoid does not
-    show, so that a ``.ply`` written as floats gets back the same numbers.
-    """
-    mirror(splats, TO_PLY)
-    w, x, y, z = (splats.quats[:, i].copy() for i in range(4))
-    for i, values in enumerate((z, -y, x, -w)):
-        splats.quats[:, i] = values
-
-
 # Writing of ``.glb``: one primitive, all attributes as floats or as ``.spz`` inside.
 #
 # In the form of floats, colours and opacities are also there as ``COLOR_0``, so that programs without the extension
 # show coloured points.
 
-MAX_GLB_BYTES = (1 << 32) - 1
-"""Largest GLB: its header has 32 bits for the size."""
+MAX_GLB_BYTES = (1 << 32) - 1  # largest GLB: its header has 32 bits for the size
 
 _NOT_IN_SPZ = (f"{EXTENSION}:OPACITY", _BANDS[0][0])
 """Attributes that the extension for ``.spz`` gives no source: there, ``COLOR_0`` is colour and opacity."""
@@ -523,19 +498,12 @@ class _Column:
     values: Callable[[slice], Shaped[np.ndarray, "B width"]]
     dtype: str = "<f4"
 
-    @property
-    def row_bytes(self) -> int:
-        return self.width * np.dtype(self.dtype).itemsize
 
-
-def write_glb(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
-    """Write a scene in glTF's axes."""
-    ends = _ends(splats.means)
+def write_glb(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
+    ends = _ends(splats)
     columns, views, start = list(_columns(splats)), list[dict[str, int]](), 0
     for column in columns:
-        length = len(splats) * column.row_bytes
+        length = len(splats) * column.width * np.dtype(column.dtype).itemsize
         views.append({"buffer": 0, "byteOffset": start, "byteLength": length, "target": 34962})  # ARRAY_BUFFER
         start += length
     _write_head(file, splats, columns, ends, views)
@@ -543,24 +511,20 @@ def write_glb(
         for rows in steps(len(splats)):
             file.write(column.values(rows).astype(column.dtype).tobytes())
         progress("write", done / len(columns))
-    notes: list[str] = []
-    note_mark(notes, splats.antialiased)
-    return tuple(notes)
+    return tuple(marks_left_out(splats))
 
 
-def write_spz_glb(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
+def write_spz_glb(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     """Write a scene as ``.spz`` inside ``.glb``.
 
     The ``.spz`` has its own axes (x right, y up, z back), as the extension wants it, whose text has the library of
     ``.spz`` turn them from and to those of glTF. Accessors have types and counts, and no data.
     """
-    ends = _ends(splats.means)
+    ends = _ends(splats)
     packed = io.BytesIO()  # its size stands before it
-    notes = write_spz(packed, splats, progress=progress)
-    bits = fractional_bits_for(float(np.abs(splats.means).max()))
-    decode_positions(encode_positions(ends, bits), bits, ends)  # as they are read: in steps
+    notes = spz_format.write_spz(packed, splats, progress=progress)
+    bits = spz_format.fractional_bits_for(float(np.abs(splats.means).max()))
+    spz_format.decode_positions(spz_format.encode_positions(ends, bits), bits, ends)  # as they are read: in steps
     columns = [column for column in _columns(splats) if column.name not in _NOT_IN_SPZ]
     body = packed.getbuffer()
     view = {"buffer": 0, "byteOffset": 0, "byteLength": len(body)}
@@ -570,11 +534,10 @@ def write_spz_glb(
     return notes
 
 
-def _ends(means: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "2 3"]:
+def _ends(splats: Splats) -> Float32[np.ndarray, "2 3"]:
     """Return the smallest and the largest coordinates of a scene, which must have Gaussians."""
-    if not len(means):
-        raise UnsupportedError("a scene without Gaussians cannot be written as .glb; write it as .ply")
-    return np.stack([means.min(axis=0), means.max(axis=0)])
+    refuse_empty(splats, ".glb")
+    return np.stack([splats.means.min(axis=0), splats.means.max(axis=0)])
 
 
 def _columns(splats: Splats) -> Iterator[_Column]:
@@ -612,28 +575,11 @@ def _write_head(
     views: list[dict[str, int]],
     compression: dict[str, Any] | None = None,
 ) -> None:
-    """Write all that stands before the buffer; ``compression`` is the extension that gives accessors their data."""
-    text = _json(splats, columns, ends, views, compression or {})
-    body = sum(view["byteLength"] for view in views)
-    body += -body % 4
-    size = 12 + 8 + len(text) + 8 + body
-    if size > MAX_GLB_BYTES:
-        raise UnsupportedError(
-            f"{len(splats):,} Gaussians take {size:,} bytes, and .glb ends at 4 GiB; write .spz or .ply"
-        )
-    file.write(struct.pack("<4sIII4s", _MAGIC, 2, size, len(text), b"JSON") + text)
-    file.write(struct.pack("<I4s", body, b"BIN\0"))
+    """Write all that stands before the buffer; ``compression`` is the extension that gives accessors their data.
 
-
-def _json(
-    splats: Splats,
-    columns: list[_Column],
-    ends: Float32[np.ndarray, "2 3"],
-    views: list[dict[str, int]],
-    compression: dict[str, Any],
-) -> bytes:
-    """Return the JSON, filled up with spaces to a multiple of four bytes; the node moves positions to the world."""
-    accessors: list[dict[str, Any]] = []
+    The JSON is filled up with spaces to a multiple of four bytes; its node moves positions to the world.
+    """
+    compression, accessors = compression or {}, list[dict[str, Any]]()
     for column in columns:
         component = {"componentType": 5126} if column.dtype == "<f4" else {"componentType": 5121, "normalized": True}
         accessors.append({**component, "count": len(splats), "type": _TYPES[column.width]})
@@ -642,6 +588,7 @@ def _json(
     if not compression:
         for i, accessor in enumerate(accessors):
             accessor["bufferView"] = i
+    body = sum(view["byteLength"] for view in views)
     translation = [sign * value + 0.0 for sign, value in zip(TO_PLY, splats.origin, strict=True)]
     primitive = {
         "mode": 0,  # points
@@ -658,10 +605,17 @@ def _json(
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": sum(view["byteLength"] for view in views)}],
+        "buffers": [{"byteLength": body}],
     }
     text = json.dumps(root, separators=(",", ":")).encode("ascii")
-    return text + b" " * (-len(text) % 4)
+    text += b" " * (-len(text) % 4)
+    body += -body % 4
+    size = 12 + 8 + len(text) + 8 + body
+    if size > MAX_GLB_BYTES:
+        count = f"{len(splats):,} Gaussians"
+        raise UnsupportedError(f"{count} take {size:,} bytes, and .glb ends at 4 GiB; write .spz or .ply")
+    file.write(struct.pack("<4sIII4s", _MAGIC, 2, size, len(text), b"JSON") + text)
+    file.write(struct.pack("<I4s", body, b"BIN\0"))
 
 
 FORMAT = Codec(

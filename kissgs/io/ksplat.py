@@ -22,8 +22,7 @@ from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, Re
 
 MAIN_BYTES, SECTION_BYTES = 4096, 1024
 
-MAX_SECTIONS = 1 << 14
-"""Largest number of sections, whose headers are read at once; a scene has one for each level or part of it."""
+MAX_SECTIONS = 1 << 14  # sections, whose headers are read at once; a scene has one for each level or part of it
 
 _MAIN = struct.Struct("<BBxxIIIIHxx3f2f")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH")
@@ -31,8 +30,7 @@ _SECTION = struct.Struct("<IIIIfHxxIIIIH")
 _CENTRE_BYTES = 12
 _FLOATS = ("<f4", "<f2", "<f2")
 _POSITIONS = ("<f4", "<u2", "<u2")
-_SH = ("<f4", "<f2", "u1")
-"""NumPy's type of scales and rotations, of positions, and of SH coefficients, by compression level."""
+_SH = ("<f4", "<f2", "u1")  # NumPy's types of scales and rotations, positions, SH coefficients, by compression level
 
 _DEFAULT_RANGE = (1, 32767, 32767)
 _DEFAULT_SH_RANGE = (-1.5, 1.5)
@@ -112,13 +110,11 @@ def _read_headers(opened: SceneFile) -> _Headers:
     head = opened.read(0, MAIN_BYTES)
     major, minor, most, sections, _, splats, level, *_, sh_low, sh_high = _MAIN.unpack_from(head)
     if (major, minor) != (0, 1):
-        raise UnsupportedError(
-            f"{opened.name} is not a .ksplat file of version 0.1 but {major}.{minor}; export it again"
-        )
+        raise UnsupportedError(f"{opened.name} is .ksplat of version {major}.{minor}; 0.1 is read: export it again")
     if level > 2:
         raise UnsupportedError(f"{opened.name} has compression level {level}; levels 0 to 2 are read")
     if sections > most:
-        raise InvalidSceneError(f"{opened.name} declares {sections} sections with room for {most}; export it again")
+        raise opened.invalid(f"declares {sections} sections with room for {most}")
     if sections > MAX_SECTIONS:
         raise UnsupportedError(f"{opened.name} has {sections:,} sections; at most {MAX_SECTIONS:,} are read")
     offset = MAIN_BYTES + most * SECTION_BYTES
@@ -129,20 +125,20 @@ def _read_headers(opened: SceneFile) -> _Headers:
         section, offset = _read_section_header(opened, level, i, offset)
         found.append(section)
     if (total := sum(section.count for section in found)) != splats:
-        raise InvalidSceneError(
-            f"{opened.name} declares {splats:,} Gaussians, but its sections have {total:,}; export or download it again"
-        )
+        raise opened.invalid(f"declares {splats:,} Gaussians, but its sections have {total:,}")
     low, high = (sh_low or _DEFAULT_SH_RANGE[0]), (sh_high or _DEFAULT_SH_RANGE[1])
     if not np.isfinite([low, high]).all():
-        raise InvalidSceneError(f"{opened.name} has a range of SH coefficients that is not finite; export it again")
+        raise opened.invalid("has a range of SH coefficients that is not finite")
     return _Headers(level, (low, high), tuple(found))
 
 
 def _read_section_header(opened: SceneFile, level: int, index: int, offset: int) -> tuple[_Section, int]:
     """Return a section whose data begins at ``offset``, and where its data ends."""
     where = f"{opened.name}, section {index + 1}"
-    fields = _SECTION.unpack_from(opened.read(MAIN_BYTES + index * SECTION_BYTES, SECTION_BYTES))
-    count, most, bucket_size, buckets, block_size, centre_bytes, middle, _, full, partial, degree = fields
+    header = opened.read(MAIN_BYTES + index * SECTION_BYTES, SECTION_BYTES)
+    count, most, bucket_size, buckets, block_size, centre_bytes, middle, _, full, partial, degree = (
+        _SECTION.unpack_from(header)
+    )
     refuse_degree(degree, where)
     if count > most:
         raise InvalidSceneError(f"{where}: it declares {count:,} Gaussians with room for {most:,}; export it again")
@@ -150,20 +146,15 @@ def _read_section_header(opened: SceneFile, level: int, index: int, offset: int)
         buckets = partial = 0
     elif full + partial != buckets or (count and (centre_bytes != _CENTRE_BYTES or not np.isfinite(block_size))):
         raise InvalidSceneError(f"{where}: its buckets contradict each other; export or download the scene again")
-    dtype = _record(level, 3 * SH_REST_COUNTS[degree])
+    fields = [("means", _POSITIONS[level], 3), ("scales", _FLOATS[level], 3), ("quats", _FLOATS[level], 4)]
+    dtype = np.dtype([*fields, ("rgba", "u1", 4), ("rest", _SH[level], 3 * SH_REST_COUNTS[degree])])
     records = offset + 4 * partial + _CENTRE_BYTES * buckets
     end = records + most * dtype.itemsize
     if end > opened.size:
         raise opened.cut_short(end)
     middle = middle or _DEFAULT_RANGE[level]
-    return _Section(
-        count, degree, dtype, records, buckets, full, bucket_size, offset, block_size / 2 / middle, middle
-    ), end
-
-
-def _record(level: int, rest: int) -> np.dtype:
-    fields = [("means", _POSITIONS[level], 3), ("scales", _FLOATS[level], 3), ("quats", _FLOATS[level], 4)]
-    return np.dtype([*fields, ("rgba", "u1", 4), ("rest", _SH[level], rest)])
+    step = block_size / 2 / middle
+    return _Section(count, degree, dtype, records, buckets, full, bucket_size, offset, step, middle), end
 
 
 @np.errstate(all="ignore")  # values may be any floats; they are not cleaned here
@@ -189,14 +180,11 @@ def _read_buckets(opened: SceneFile, section: _Section) -> tuple[Int64[np.ndarra
     """Return after which Gaussian of the section each bucket ends, and its centre; full buckets stand first."""
     partial = section.buckets - section.full_buckets
     lengths = np.frombuffer(opened.read(section.table_offset, 4 * partial), "<u4").astype(np.int64)
-    centres = np.frombuffer(
-        opened.read(section.table_offset + 4 * partial, _CENTRE_BYTES * section.buckets), "<f4"
-    ).reshape(section.buckets, 3)
+    data = opened.read(section.table_offset + 4 * partial, _CENTRE_BYTES * section.buckets)
+    centres = np.frombuffer(data, "<f4").reshape(section.buckets, 3)
     ends = np.cumsum(np.concatenate([np.full(section.full_buckets, section.bucket_size, np.int64), lengths]))
     if section.count and (not len(ends) or ends[-1] < section.count):
-        raise InvalidSceneError(
-            f"{opened.name}: the buckets of a section hold fewer Gaussians than it; export it again"
-        )
+        raise opened.invalid("has a section whose buckets hold fewer Gaussians than it")
     return ends, centres.astype(np.float64)
 
 
@@ -216,7 +204,7 @@ def _decode_rest(
     width = len(order) // 3
     if not width:
         return
-    values = rows["rest"][:, order].astype(np.float32)
+    values = rows["rest"][:, order].astype(np.float32)  # per coefficient, R, G, B
     if headers.level == 2:
         low, high = headers.sh_range
         values *= np.float32((high - low) / 255)

@@ -15,10 +15,10 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.positions import WORLD, Origin, from_world, in_world, origin_for, world_positions
 from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats, sampled_rows
 from kissgs.io.conventions import (
+    clamped,
     colors_of,
     insert_largest,
     morton_order,
-    note_clamped,
     opacities_of,
     split_largest,
     steps,
@@ -27,40 +27,30 @@ from kissgs.io.conventions import (
 from kissgs.io.files import BinaryWriter, listed, refuse_more_than
 from kissgs.io.ply_rows import (
     BLOCK_ALIGNMENT,
-    MIP_COMMENT,
     Element,
     Encoding,
     Header,
     PlyFile,
     check_complete,
+    header_bytes,
     open_ply,
     rows,
     sh_degree,
 )
-from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, Notes, ReadOptions, titled
 
 # PlayCanvas' compressed ``.ply``: Gaussians quantised to 16 bytes within chunks of 256, SH coefficients to one byte.
 #
 # Element ``chunk`` holds the bounds of each 256 Gaussians, ``vertex`` four packed words per Gaussian, and the optional
 # ``sh`` their ``f_rest_*``. Older files have no colour bounds: their colours span 0 to 1.
 
-_CHUNK = BLOCK_ALIGNMENT
-"""Gaussians per row of element ``chunk``, given by the format; blocks of rows are multiples of it."""
+_CHUNK = BLOCK_ALIGNMENT  # Gaussians per row of element chunk, given by the format; blocks of rows are multiples of it
 
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 """Properties of element ``vertex``: one word each."""
 
-_HALVES = (slice(0, 3), slice(3, 6))
-"""Columns of minima and of maxima among the six bounds of an attribute."""
-
-_MAX_SCALE = 20.0
-"""Bound of log-scales that a file holds, as the format's own tool has it."""
-
-
-def is_compressed(header: Header) -> bool:
-    """Whether the file is a PlayCanvas compressed ``.ply``."""
-    vertex = header.elements.get("vertex")
-    return vertex is not None and any(p.name == "packed_position" for p in vertex.properties)
+_HALVES = (slice(0, 3), slice(3, 6))  # columns of minima and of maxima among the six bounds of an attribute
+_MAX_SCALE = 20.0  # bound of log-scales that a file holds, as the format's own tool has it
 
 
 def check_compressed(ply: PlyFile) -> int:
@@ -69,24 +59,20 @@ def check_compressed(ply: PlyFile) -> int:
     if ply.header.encoding == "ascii":
         raise UnsupportedError(f"{ply.name} is a compressed .ply in ascii; export it as binary")
     if "chunk" not in elements:
-        raise InvalidSceneError(f"{ply.name} is a compressed .ply without element 'chunk'; export it again")
+        raise ply.invalid("is a compressed .ply without element 'chunk'")
     vertex, chunk = elements["vertex"], elements["chunk"]
     _require(ply, vertex, PACKED, "u4")
     _require(ply, chunk, _bounds("", "xyz") + _bounds("scale_", "xyz"), "f4")
     if _has_colour_bounds(chunk):
         _require(ply, chunk, _bounds("", "rgb"), "f4")
     if chunk.count * _CHUNK < vertex.count:
-        raise InvalidSceneError(
-            f"{ply.name} has {chunk.count:,} chunks of {_CHUNK} for {vertex.count:,} Gaussians; export it again"
-        )
+        raise ply.invalid(f"has {chunk.count:,} chunks of {_CHUNK} for {vertex.count:,} Gaussians")
     degree = 0
     if "sh" in elements:
         degree = sh_degree(elements["sh"], ply.name)
         _require(ply, elements["sh"], tuple(f"f_rest_{i}" for i in range(3 * SH_REST_COUNTS[degree])), "u1")
         if elements["sh"].count != vertex.count:
-            raise InvalidSceneError(
-                f"{ply.name} has SH of {elements['sh'].count:,} for {vertex.count:,} Gaussians; export it again"
-            )
+            raise ply.invalid(f"has SH of {elements['sh'].count:,} for {vertex.count:,} Gaussians")
     for element in (chunk, vertex, *([elements["sh"]] if degree else [])):
         check_complete(ply, element)
     return degree
@@ -121,7 +107,9 @@ def _decode_vertices(ply: PlyFile, splats: Splats) -> None:
         own = np.repeat(ranges[start // _CHUNK : -(-part.stop // _CHUNK)], _CHUNK)[: len(block)]
         splats.means[part] = _lerp(own, "", "xyz", _unpack_11_10_11(block["packed_position"]))
         splats.scales[part] = _lerp(own, "scale_", "xyz", _unpack_11_10_11(block["packed_scale"]))
-        splats.quats[part] = _unpack_quats(block["packed_rotation"])
+        rotation = block["packed_rotation"]  # two bits: the largest component; ten bits for each of the others
+        small = (np.stack([rotation >> shift & 1023 for shift in (20, 10, 0)], axis=1) / 1023 - 0.5) * np.sqrt(2)
+        splats.quats[part] = insert_largest(small, (rotation >> 30).astype(np.int64))
         colour = np.stack([block["packed_color"] >> shift & 255 for shift in (24, 16, 8)], axis=1) / 255
         if _has_colour_bounds(chunk):
             colour = _lerp(own, "", "rgb", colour)
@@ -147,21 +135,12 @@ def _unpack_11_10_11(packed: UInt32[np.ndarray, " B"]) -> Float64[np.ndarray, "B
     return np.stack([(packed >> 21) / 2047, (packed >> 11 & 1023) / 1023, (packed & 2047) / 2047], axis=1)
 
 
-def _unpack_quats(packed: UInt32[np.ndarray, " B"]) -> Float64[np.ndarray, "B 4"]:
-    """Unpack smallest-three quaternions: two bits for the index of the largest component, 10 for each of the others."""
-    small = (np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1) / 1023 - 0.5) * np.sqrt(2)
-    return insert_largest(small, (packed >> 30).astype(np.int64))
-
-
 def _lerp(
     ranges: Shaped[np.ndarray, " B"], prefix: str, axes: str, t: Float64[np.ndarray, "B 3"]
 ) -> Float64[np.ndarray, "B 3"]:
     """Interpolate between the minima (at 0) and the maxima (at 1) of each row's chunk."""
-    names = _bounds(prefix, axes)
-    low = np.stack([ranges[name] for name in names[:3]], axis=1).astype(np.float64)
-    high = np.stack([ranges[name] for name in names[3:]], axis=1).astype(np.float64)
-    values: Float64[np.ndarray, "B 3"] = low * (1 - t) + high * t
-    return values
+    ends = np.stack([ranges[name] for name in _bounds(prefix, axes)], axis=1).astype(np.float64)
+    return np.asarray(ends[:, :3] * (1 - t) + ends[:, 3:] * t)
 
 
 def _bounds(prefix: str, axes: str) -> tuple[str, ...]:
@@ -178,15 +157,13 @@ def _require(ply: PlyFile, element: Element, names: tuple[str, ...], code: str) 
     for name in names:
         if codes.get(name) != code:
             found = "none" if name not in codes else f"one of type {np.dtype(codes[name]).name}"
-            raise InvalidSceneError(
-                f"{ply.name} is a compressed .ply whose element {element.name!r} needs a property {name!r} of type "
-                f"{np.dtype(code).name}, but has {found}; export it again"
+            raise ply.invalid(
+                f"is a compressed .ply whose element {element.name!r} needs a property {name!r} of type "
+                f"{np.dtype(code).name}, but has {found}"
             )
 
 
-def write_compressed(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
+def write_compressed(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     """Write a scene in Morton order, so that the 256 Gaussians of a chunk are close to one another."""
     n, k = len(splats), splats.shN.shape[1]
     order = morton_order(splats.means)
@@ -196,7 +173,12 @@ def write_compressed(
         own = slice(part.start // _CHUNK, -(-part.stop // _CHUNK))
         _encode_vertices(splats.select(order[part]), chunks[own], words[part])
         progress("write", part.stop / n / (2 if k else 1))
-    file.write(_header(n, len(chunks), 3 * k, splats.antialiased))
+    bounds = [name for prefix, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb")) for name in _bounds(prefix, axes)]
+    lines = [f"element chunk {len(chunks)}", *(f"property float {name}" for name in bounds)]
+    lines += [f"element vertex {n}", *(f"property uint {name}" for name in PACKED)]
+    if k:
+        lines += [f"element sh {n}", *(f"property uchar f_rest_{i}" for i in range(3 * k))]
+    file.write(header_bytes(lines, splats.antialiased))
     file.write(chunks.tobytes())
     file.write(words.data if n else b"")
     for part in steps(n if k else 0):
@@ -204,20 +186,8 @@ def write_compressed(
         codes = np.floor((splats.shN[order[part]].transpose(0, 2, 1).astype(np.float64) / 8 + 0.5) * 256)
         file.write(np.clip(codes, 0, 255).astype(np.uint8).tobytes())
         progress("write", 0.5 + part.stop / n / 2)
-    notes: list[str] = []
-    note_clamped(notes, "scales", splats.scales, -_MAX_SCALE, _MAX_SCALE, f"e^±{_MAX_SCALE:.0f}")
-    note_clamped(notes, "view-dependent colours", splats.shN, -4, 4, "coefficients of ±4")
-    return tuple(notes)
-
-
-def _header(count: int, chunks: int, rest: int, antialiased: bool) -> bytes:
-    bounds = [name for prefix, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb")) for name in _bounds(prefix, axes)]
-    lines = ["ply", "format binary_little_endian 1.0", *[MIP_COMMENT] * antialiased, f"element chunk {chunks}"]
-    lines += [f"property float {name}" for name in bounds]
-    lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
-    if rest:
-        lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest))]
-    return "\n".join([*lines, "end_header\n"]).encode("ascii")
+    notes = clamped("scales", splats.scales, -_MAX_SCALE, _MAX_SCALE, f"e^±{_MAX_SCALE:.0f}")
+    return (*notes, *clamped("view-dependent colours", splats.shN, -4, 4, "coefficients of ±4"))
 
 
 def _encode_vertices(
@@ -265,8 +235,7 @@ _SCALE = ("scale_0", "scale_1", "scale_2")
 _OPACITY = ("opacity",)
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 _RGB = ("red", "green", "blue")
-_FILTER = "filter_3d"
-"""Name of Mip-Splatting's property in lower case; its own spelling is ``filter_3D``."""
+_FILTER = "filter_3d"  # name of Mip-Splatting's property in lower case; its own spelling is filter_3D
 
 _KNOWN = {*_POSITION, *_NORMAL, *_ROTATION, *_SCALE, *_OPACITY, *_COLOUR, *_RGB, "alpha", *PACKED}
 """Properties that are read or repeat what others say, as ``red`` does beside ``f_dc_0``; INRIA's normals are zero."""
@@ -289,16 +258,11 @@ _IN_TIME = re.compile(
 class PlyInfo:
     """Properties of a scene that the header of its file states."""
 
-    count: int
-    """Number of Gaussians."""
-    sh_degree: int
-    """SH degree, 0 to 3."""
-    encoding: Encoding
-    """Encoding of the body, as the header names it."""
-    compressed: bool
-    """Whether it is PlayCanvas' compressed ``.ply``."""
-    antialiased: bool = False
-    """Whether a comment of Brush or Postshot says that the scene was trained with antialiasing."""
+    count: int  # number of Gaussians
+    sh_degree: int  # SH degree, 0 to 3
+    encoding: Encoding  # encoding of the body, as the header names it
+    compressed: bool  # whether it is PlayCanvas' compressed .ply
+    antialiased: bool = False  # whether a comment of Brush or Postshot says that it was trained with antialiasing
 
 
 def read_ply_info(source: Path | bytes, *, size: int | None = None) -> PlyInfo:
@@ -358,36 +322,31 @@ def read_ply_blocks(source: Path) -> Iterator[Splats]:
                 waiting = []
 
 
-def write_ply(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
+def write_ply(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
     Positions are those of the world: float64 (``property double``) where float32 cannot hold them. An antialiased scene
-    is marked by a comment, :data:`kissgs.io.ply_rows.MIP_COMMENT`.
+    is marked by a comment (:func:`kissgs.io.ply_rows.header_bytes`).
     """
     splats = in_world(splats)
     wide = _POSITION if splats.origin != WORLD else ()
     n, k = len(splats), splats.shN.shape[1]
-    names = (*_POSITION, *_NORMAL, *_COLOUR, *_rest(k), *_OPACITY, *_SCALE, *_ROTATION)
-    header = ["ply", "format binary_little_endian 1.0", *[MIP_COMMENT] * splats.antialiased, f"element vertex {n}"]
-    header += [f"property {'double' if name in wide else 'float'} {name}" for name in names]
-    file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
+    rest_names = (f"f_rest_{i}" for i in range(3 * k))
+    names = (*_POSITION, *_NORMAL, *_COLOUR, *rest_names, *_OPACITY, *_SCALE, *_ROTATION)
+    properties = [f"property {'double' if name in wide else 'float'} {name}" for name in names]
+    file.write(header_bytes([f"element vertex {n}", *properties], splats.antialiased))
     for step in steps(n):
         part = splats.select(step)
         rest = part.shN.transpose(0, 2, 1).reshape(len(part), 3 * k)  # all of R, then G, then B
         normals, opacities = np.zeros_like(part.means), part.opacities[:, None]
         table = np.concatenate([part.means, normals, part.sh0, rest, opacities, part.scales, part.quats], axis=1)
-        file.write((_with_doubles(part, table) if wide else table.astype("<f4", copy=False)).data)
+        if wide:
+            rows = np.empty(len(table), np.dtype([("positions", "<f8", 3), ("others", "<f4", table.shape[1] - 3)]))
+            rows["positions"], rows["others"] = world_positions(part), table[:, 3:]
+            table = rows
+        file.write(table.astype(table.dtype.newbyteorder("<"), copy=False).data)
         progress("write", step.stop / n)
     return ()
-
-
-def _with_doubles(splats: Splats, table: Float32[np.ndarray, "B F"]) -> np.ndarray:
-    """Return rows whose positions are float64."""
-    rows = np.empty(len(table), np.dtype([("positions", "<f8", 3), ("others", "<f4", table.shape[1] - 3)]))
-    rows["positions"], rows["others"] = world_positions(splats), table[:, 3:]
-    return rows
 
 
 def _check(ply: PlyFile) -> PlyInfo:
@@ -395,19 +354,16 @@ def _check(ply: PlyFile) -> PlyInfo:
     vertex = ply.header.elements.get("vertex")
     if vertex is None:
         raise InvalidSceneError(f"{ply.name} has no element 'vertex', so no Gaussians; name a trained 3DGS scene")
-    compressed = is_compressed(ply.header)
+    compressed = any(p.name == PACKED[0] for p in vertex.properties)
     if compressed:
         degree = check_compressed(ply)
     else:
         _require_gaussians(ply.header, ply.name)
         degree = sh_degree(vertex, ply.name)
         check_complete(ply, vertex)
+    encoding, antialiased = ply.header.encoding, ply.header.antialiased
     return PlyInfo(
-        count=vertex.count,
-        sh_degree=degree,
-        encoding=ply.header.encoding,
-        compressed=compressed,
-        antialiased=ply.header.antialiased,
+        count=vertex.count, sh_degree=degree, encoding=encoding, compressed=compressed, antialiased=antialiased
     )
 
 
@@ -437,11 +393,8 @@ def _require_gaussians(header: Header, name: str) -> None:
 def _notes(header: Header) -> tuple[str, ...]:
     """Return what becomes of properties and elements beyond those of 3D Gaussians."""
     names = [p.name for p in header.elements["vertex"].properties]
-    unknown = [
-        name
-        for name in names
-        if name not in _KNOWN and name.lower() != _FILTER and not re.fullmatch(r"f_rest_[0-9]+", name)
-    ]
+    known = re.compile(rf"f_rest_[0-9]+|(?i:{_FILTER})")
+    unknown = [name for name in names if name not in _KNOWN and not known.fullmatch(name)]
     unknown += [f"element {e.name}" for e in header.elements.values() if e.count and e.name not in _KNOWN_ELEMENTS]
     notes = []
     if (name := _filter_of(header.elements["vertex"])) is not None:
@@ -460,10 +413,6 @@ def _has_rgb(vertex: Element) -> bool:
     """Whether the colour is given only by 8-bit red, green, blue."""
     codes = {p.name: p.code for p in vertex.properties}
     return codes.keys().isdisjoint(_COLOUR) and all(codes.get(name) == "u1" for name in _RGB)
-
-
-def _rest(k: int) -> tuple[str, ...]:
-    return tuple(f"f_rest_{i}" for i in range(3 * k))
 
 
 def _read_columns(ply: PlyFile, degree: int, progress: Progress) -> Splats:
@@ -522,7 +471,10 @@ class _Columns:
                 for i, name in enumerate(names):
                     array[:, i] = block[name]
         if self._rgb:
-            _colour_to_sh(out.sh0)
+            colour = out.sh0
+            colour /= 255
+            colour -= 0.5
+            colour /= np.float32(SH_C0)
         if self._filter is not None:
             _apply_filters(block[self._filter], out)
 
@@ -547,13 +499,6 @@ def _positions(block: np.ndarray) -> Float64[np.ndarray, "B 3"]:
     return np.stack([block[axis].astype(np.float64) for axis in _POSITION], axis=1)
 
 
-def _colour_to_sh(colour: Float32[np.ndarray, "N 3"]) -> None:
-    """Convert 8-bit colour to the constant SH coefficient, in place."""
-    colour /= 255
-    colour -= 0.5
-    colour /= np.float32(SH_C0)
-
-
 def _sniff(head: bytes, size: int) -> Match:
     return Match.SURE if head[:3] == b"ply" and head[3:4].isspace() else Match.NO
 
@@ -565,9 +510,5 @@ def _describe(path: Path | bytes, level: int) -> Facts:
     return Facts(title=titled("3DGS scene", *kinds), count=found.count, sh_degree=found.sh_degree, details=details)
 
 
-FORMAT = Codec(
-    sniff=_sniff,
-    info=_describe,
-    read=read_ply,
-    write={".ply": write_ply, ".compressed.ply": write_compressed},
-)
+_WRITERS = {".ply": write_ply, ".compressed.ply": write_compressed}
+FORMAT = Codec(sniff=_sniff, info=_describe, read=read_ply, write=_WRITERS)

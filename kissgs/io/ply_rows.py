@@ -7,7 +7,7 @@ import contextlib
 import io
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,11 +22,8 @@ from kissgs.io.files import SceneFile, open_scene_file, refuse_degree
 
 Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 
-MAX_HEADER_BYTES = 1 << 20
-"""Largest header: one of degree 3 takes 1.5 kB; a megabyte leaves room for metadata in comments."""
-
-MAX_PROPERTIES = 4096
-"""Largest number of properties per element; a degree-3 scene has 62, one with feature vectors some hundred more."""
+MAX_HEADER_BYTES = 1 << 20  # one of degree 3 takes 1.5 kB; a megabyte leaves room for metadata in comments
+MAX_PROPERTIES = 4096  # per element; a degree-3 scene has 62, one with feature vectors some hundred more
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f2", "f4", "f8")
 _TYPES = dict(zip(("char", "uchar", "short", "ushort", "int", "uint", "half", "float", "double"), _CODES, strict=True))
@@ -43,9 +40,6 @@ _LOOKALIKES = {
     b"pk\x03\x04": "this is a ZIP archive, unpack it or name the scene by its real extension",
 }
 """Hints for other files that are often given as a scene, by their first bytes in lower case."""
-
-MIP_COMMENT = "comment SplatRenderMode: mip"
-"""Line that marks a scene as antialiased, as Brush and splat-transform write it."""
 
 _MARK = re.compile(
     r"(?:(?:splat_?render_?mode|rasteri[sz]e[-_ ]?mode)\s*[:=]?\s*([\w-]+)|"
@@ -88,8 +82,7 @@ class Header:
     elements: dict[str, Element]
     nbytes: int
     lines: int
-    antialiased: bool
-    """Whether a comment says that the scene was trained with antialiasing."""
+    antialiased: bool  # whether a comment says that the scene was trained with antialiasing
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +101,12 @@ def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFi
     with open_scene_file(source) as opened:
         header = _read_header(opened)
         yield PlyFile(opened.name, opened.file, opened.size if size is None else size, header)
+
+
+def header_bytes(lines: Sequence[str], antialiased: bool) -> bytes:
+    """Return the header of elements and properties; a scene is marked as Brush and splat-transform mark it."""
+    mark = ["comment SplatRenderMode: mip"] * antialiased
+    return "\n".join(["ply", "format binary_little_endian 1.0", *mark, *lines, "end_header\n"]).encode("ascii")
 
 
 def sh_degree(element: Element, name: str) -> int:
@@ -244,11 +243,8 @@ def _quote(word: str) -> str:
 
 # Rows of a PLY element, binary or ascii, block by block.
 
-BLOCK_BYTES = 1 << 20
-"""Bytes per block: small enough to stay in the processor's cache until all columns are copied."""
-
-BLOCK_ALIGNMENT = 256
-"""Row count that the blocks of :func:`rows`, except the last, are multiples of in binary files."""
+BLOCK_BYTES = 1 << 20  # bytes per block: small enough to stay in the processor's cache until all columns are copied
+BLOCK_ALIGNMENT = 256  # row count that the blocks of rows, except the last, are multiples of in binary files
 
 _INFINITY = re.compile(r"(?<!\S)([+-]?)1\.#inf\d*(e[+-]?\d+)?(?!\S)", re.IGNORECASE)
 _NAN = re.compile(r"(?<!\S)[+-]?(nan(\([^\s()]*\)|[qs])|[qs]nan|1\.#[a-z]+\d*(e[+-]?\d+)?|1\.\$)(?!\S)", re.IGNORECASE)

@@ -12,8 +12,7 @@ from kissgs.core.context import Progress
 from kissgs.core.splats import MAX_GAUSSIANS, Splats
 from kissgs.io.files import BinaryWriter
 
-SceneSource = Path | bytes | Mapping[str, bytes]
-"""A file or folder, the bytes of a file, or the files of a container in memory."""
+SceneSource = Path | bytes | Mapping[str, bytes]  # a file or folder, the bytes of a file, or a container's files
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,34 +59,24 @@ class Match(IntEnum):
     """How surely the beginning of a file is of a format."""
 
     NO = 0
-    POSSIBLE = 1
-    """Text that counts unless the ending is that of a format with a mark."""
-    LIKELY = 2
-    """Plausible numbers without a mark, which count unless the ending is that of another format without one."""
-    SURE = 3
-    """A mark, whatever the ending."""
+    POSSIBLE = 1  # text that counts unless the ending is that of a format with a mark
+    LIKELY = 2  # plausible numbers without a mark, which count unless the ending is that of another format without one
+    SURE = 3  # a mark, whatever the ending
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facts:
     """Statements of a header or of the metadata of a container, for ``kissgs info``."""
 
-    title: str
-    """Name of the format, with what is special about the file."""
-    count: int
-    """Gaussians; of a streamed scene, those of one level and the environment."""
+    title: str  # name of the format, with what is special about the file
+    count: int  # Gaussians; of a streamed scene, those of one level and the environment
     sh_degree: int
     details: dict[str, Any] = field(default_factory=dict)
-    parts: dict[str, int] = field(default_factory=dict)
-    """Bytes of each file of a container, or of each container of a streamed scene."""
-    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Values of the lowest and the highest level of each attribute of a container."""
-    changed: dict[str, int] = field(default_factory=dict)
-    """Gaussians that the encoder removed or corrected, by reason."""
-    notes: tuple[str, ...] = ()
-    """Phrases for what reading leaves out or changes."""
-    lines: tuple[str, ...] = ()
-    """Sentences about details, for the terminal."""
+    parts: dict[str, int] = field(default_factory=dict)  # bytes of each file of a container, or of each container
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)  # values of the lowest and highest level
+    changed: dict[str, int] = field(default_factory=dict)  # Gaussians that the encoder removed or corrected, by reason
+    notes: tuple[str, ...] = ()  # phrases for what reading leaves out or changes
+    lines: tuple[str, ...] = ()  # sentences about details, for the terminal
 
 
 def titled(name: str, *special: str | None) -> str:
@@ -99,20 +88,16 @@ def titled(name: str, *special: str | None) -> str:
 Read = Callable[[Any, ReadOptions, int, Progress], Splats]
 """Read a :data:`SceneSource` without cleaning it, with a number of threads (0: one per processor)."""
 
-Write = Callable[[BinaryWriter, Splats, bool, Progress], tuple[str, ...]]
+Notes = tuple[str, ...]
+Write = Callable[[BinaryWriter, Splats, bool, Progress], Notes]
 """Write a scene, with the axes of a ``.ply`` if true; return a phrase for each loss beyond the format's steps."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Codec:
-    """Code of one format."""
-
-    info: Callable[[Path | bytes, int], Facts]
-    """Describe a file, or a level of detail of a streamed scene."""
+    info: Callable[[Path | bytes, int], Facts]  # describe a file, or a level of detail of a streamed scene
     read: Read
-    sniff: Callable[[bytes, int], Match] = lambda head, size: Match.NO
-    """Recognise the format from the first bytes of a file and its size."""
-    write: Mapping[str, Write] = field(default_factory=dict)
-    """Writers by ending; all but ``.ply`` get a clean scene."""
+    sniff: Callable[[bytes, int], Match] = lambda head, size: Match.NO  # from a file's first bytes and its size
+    write: Mapping[str, Write] = field(default_factory=dict)  # writers by ending; all but .ply get a clean scene
     records_origin: bool = False
     """Whether files of other endings than ``.ply`` record the origin of a scene, as the translation of a node."""

@@ -10,33 +10,30 @@ from pathlib import Path
 
 import numpy as np
 
-from kissgs.core.array_types import Int64, Shaped
+from kissgs.core.array_types import Shaped
 from kissgs.core.context import Progress, silent
-from kissgs.core.errors import InvalidSceneError
 from kissgs.core.splats import Splats, empty_splats
 from kissgs.io.conventions import (
     OPACITY_OF_BYTE,
     SH0_OF_BYTE,
     byte_quats,
+    clamped,
     colors_of,
     log_scales,
-    note_clamped,
-    note_mark,
+    marks_left_out,
     opacities_of,
     steps,
     to_bytes,
 )
 from kissgs.io.files import BinaryWriter, SceneFile, open_scene_file, refuse_more_than
-from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Notes, ReadOptions
 
-ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-"""One Gaussian."""
+ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])  # one Gaussian
 
 
 def read_splat(
     source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
 ) -> Splats:
-    """Read a scene."""
     with open_scene_file(source) as opened:
         count = _count(opened)
         refuse_more_than(reading.max_gaussians, count, opened.name)
@@ -48,28 +45,18 @@ def read_splat(
         return splats
 
 
-def write_splat(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
+def write_splat(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     """Write a scene, large and opaque Gaussians first, as viewers that draw while they load expect."""
-    order = _largest_first(splats)
+    logits = splats.opacities.astype(np.float64)
+    log_weight = splats.scales.sum(axis=1, dtype=np.float64) - np.logaddexp(0, -logits)
+    order = np.argsort(-log_weight, kind="stable")  # by volume times opacity; equal ones keep their order
     for part in steps(len(splats)):
         file.write(_encode(splats.select(order[part])).tobytes())
         progress("write", part.stop / len(splats))
-    notes: list[str] = []
-    if splats.sh_degree:
-        notes.append(f"view-dependent colour (SH degree {splats.sh_degree}) is left out")
-    note_mark(notes, splats.antialiased)
+    notes = [f"view-dependent colour (SH degree {splats.sh_degree}) is left out"] * (splats.sh_degree > 0)
+    notes += marks_left_out(splats)
     edge = 0.5 / 255
-    note_clamped(notes, "colours", colors_of(splats.sh0), -edge, 1 + edge, "0 to 1")
-    return tuple(notes)
-
-
-def _largest_first(splats: Splats) -> Int64[np.ndarray, " N"]:
-    """Return the indices of the Gaussians by volume times opacity, largest first; equal ones keep their order."""
-    logits = splats.opacities.astype(np.float64)
-    log_weight = splats.scales.sum(axis=1, dtype=np.float64) - np.logaddexp(0, -logits)
-    return np.argsort(-log_weight, kind="stable").astype(np.int64)
+    return (*notes, *clamped("colours", colors_of(splats.sh0), -edge, 1 + edge, "0 to 1"))
 
 
 def _encode(splats: Splats) -> Shaped[np.ndarray, " B"]:
@@ -84,10 +71,7 @@ def _encode(splats: Splats) -> Shaped[np.ndarray, " B"]:
 
 def _count(opened: SceneFile) -> int:
     if opened.size % ROW.itemsize:
-        raise InvalidSceneError(
-            f"{opened.name} is not a .splat file or is cut short: its {opened.size:,} bytes are not a multiple of 32; "
-            "export or download it again"
-        )
+        raise opened.invalid(f"is no .splat file or is cut short: its {opened.size:,} bytes are no multiple of 32")
     return opened.size // ROW.itemsize
 
 

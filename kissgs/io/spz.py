@@ -19,12 +19,13 @@ from kissgs.io.conventions import (
     OPACITY_OF_BYTE,
     Signs,
     axis_signs,
+    clamped,
     insert_largest,
     look_up,
     mirror,
-    note_clamped,
     opacities_of,
     quat_signs,
+    refuse_empty,
     sh_signs,
     split_largest,
     steps,
@@ -32,7 +33,7 @@ from kissgs.io.conventions import (
     to_codes,
 )
 from kissgs.io.files import BinaryWriter, SceneFile, listed, open_scene_file, refuse_degree, refuse_more_than
-from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, ReadOptions, titled
+from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, Match, Notes, ReadOptions, titled
 
 # Decompression: gzip and zstd, bounded by what the header needs.
 
@@ -40,11 +41,8 @@ _GZIP = 16 + zlib.MAX_WBITS
 
 _BLOCK_BYTES = 1 << 20
 
-_MAX_RATIO = 1032
-"""Largest ratio of deflate: 258 bytes of two bits."""
-
-_MIN_WINDOW_LOG = 27
-"""Windows of zstd up to 128 MiB are accepted in any case: its command line makes no larger ones unless asked to."""
+_MAX_RATIO = 1032  # largest ratio of deflate: 258 bytes of two bits
+_MIN_WINDOW_LOG = 27  # windows of zstd up to 128 MiB are always accepted: its command line makes no larger ones
 
 
 def inflate_start(head: bytes) -> bytes:
@@ -58,9 +56,7 @@ def inflate_start(head: bytes) -> bytes:
 def inflate(opened: SceneFile, size: int, most_behind: int) -> tuple[UInt8[np.ndarray, " size"], bytes]:
     """Unpack a gzip file of ``size`` bytes and up to ``most_behind`` more; return both parts."""
     if size > _MAX_RATIO * opened.size:
-        raise InvalidSceneError(
-            f"{opened.name} is cut short: {opened.size:,} bytes cannot hold what its header declares; download it again"
-        )
+        raise opened.invalid(f"is cut short: {opened.size:,} bytes cannot hold what its header declares")
     body = np.empty(size, np.uint8)
     behind = bytearray()
     filled = 0
@@ -77,13 +73,11 @@ def inflate(opened: SceneFile, size: int, most_behind: int) -> tuple[UInt8[np.nd
             filled += len(part)
             behind += block[len(part) :]
             if len(behind) > most_behind:
-                raise InvalidSceneError(f"{opened.name} unpacks to more bytes than its header declares; it is damaged")
+                raise opened.invalid("is damaged: it unpacks to more bytes than its header declares")
     except zlib.error as error:
-        raise InvalidSceneError(f"{opened.name} is damaged: gzip cannot unpack it; download it again") from error
+        raise opened.invalid("is damaged: gzip cannot unpack it") from error
     if filled < size or not stream.eof:
-        raise InvalidSceneError(
-            f"{opened.name} is cut short: it unpacks to {filled + len(behind):,} bytes of {size:,}; download it again"
-        )
+        raise opened.invalid(f"is cut short: it unpacks to {filled + len(behind):,} bytes of {size:,}")
     return body, bytes(behind)
 
 
@@ -112,14 +106,9 @@ def unpack_frame(frame: bytes, size: int, what: str) -> bytes:
 
 _BYTE = np.arange(256)
 
-SCALE_OF_BYTE = (_BYTE / 16 - 10).astype(np.float32)
-"""Natural logarithm of a standard deviation, in steps of 1/16."""
-
-COLOR_OF_BYTE = ((_BYTE / 255 - 0.5) / 0.15).astype(np.float32)
-"""Constant SH coefficient; 0.15, not the harmonic's value, is the format's factor."""
-
-SH_OF_BYTE = ((_BYTE - 128) / 128).astype(np.float32)
-"""Other SH coefficients."""
+SCALE_OF_BYTE = (_BYTE / 16 - 10).astype(np.float32)  # natural logarithm of a standard deviation, in steps of 1/16
+COLOR_OF_BYTE = ((_BYTE / 255 - 0.5) / 0.15).astype(np.float32)  # constant SH coefficient; 0.15 is the format's factor
+SH_OF_BYTE = ((_BYTE - 128) / 128).astype(np.float32)  # other SH coefficients
 
 SH_STEPS = (4, 8)
 """Steps of the codes that are written, in the first band and above: 6 and 5 bits. Readers need not know them.
@@ -216,12 +205,10 @@ _EXTENSION = struct.Struct("<II")
 
 _ANTIALIASED, _HAS_EXTENSIONS, _SPARK_TREE = 1, 2, 0x80
 
-_COEFFICIENTS = (*SH_REST_COUNTS, 24)
-"""Number of SH coefficients beyond the constant one in a file of degree 0 to 4."""
+_COEFFICIENTS = (*SH_REST_COUNTS, 24)  # number of SH coefficients beyond the constant one in a file of degree 0 to 4
 
 _COORDINATES = 0xADBE0003
-_EXTENSION_NAMES = {0xADBE0002: "the limits of the camera"}
-"""Contents of other known extension records."""
+_EXTENSION_NAMES = {0xADBE0002: "the limits of the camera"}  # contents of other known extension records
 
 _FRAMES = ("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 """Frame of each value of the extension for coordinate systems; the first is unspecified.
@@ -232,13 +219,11 @@ rotations of its Gaussians in opposite directions, so that it is unknown how fil
 
 DEFAULT_FRAME, PLY_FRAME = "RUB", "RDF"
 
-_LARGEST_ROW = 20 + 3 * _COEFFICIENTS[-1]
-"""Bytes of a Gaussian before compression, with all SH coefficients."""
+LARGEST_ROW = 20 + 3 * _COEFFICIENTS[-1]  # bytes of a Gaussian before compression, with all SH coefficients
 
 _MAX_FRACTIONAL_BITS = 31
 
-MAX_EXTENSION_BYTES = 1 << 20
-"""Largest size of all extension records: the known ones take 12 and 20 bytes."""
+MAX_EXTENSION_BYTES = 1 << 20  # largest size of all extension records: the known ones take 12 and 20 bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -267,7 +252,6 @@ class SpzInfo:
 
 
 def read_spz_info(source: Path | bytes) -> SpzInfo:
-    """Read the header."""
     with open_scene_file(source) as opened:
         return _read_header(opened)
 
@@ -295,19 +279,12 @@ def read_spz(
         return replace(splats, notes=(f"left out: {listed(unread)}",)) if unread else splats
 
 
-def largest_spz(count: int) -> int:
-    """Return a size in bytes that no file of ``count`` Gaussians exceeds."""
-    return 2 * MAX_EXTENSION_BYTES + 2 * count * _LARGEST_ROW
-
-
 def _read_header(opened: SceneFile) -> SpzInfo:
     head = opened.file.read(512)
     gzipped = head.startswith(GZIP_MAGIC)
     plain = inflate_start(head) if gzipped else head
     if len(plain) < _HEADER.size or not plain.startswith(MAGIC):
-        raise InvalidSceneError(
-            f"{opened.name} is not an .spz file: its header is missing; export or download it again"
-        )
+        raise opened.invalid("is not an .spz file: its header is missing")
     _, version, count, degree, fractional_bits, flags, _ = _HEADER.unpack_from(plain)
     if not 1 <= version <= 4 or gzipped != (version < 4):
         raise UnsupportedError(
@@ -321,10 +298,7 @@ def _read_header(opened: SceneFile) -> SpzInfo:
             f"{opened.name} holds Spark's levels of detail, coarse Gaussians among the fine ones; export it without"
         )
     if fractional_bits > _MAX_FRACTIONAL_BITS:
-        raise InvalidSceneError(
-            f"{opened.name} declares {fractional_bits} fractional bits of positions, where "
-            f"{_MAX_FRACTIONAL_BITS} is the largest number; it is damaged"
-        )
+        raise opened.invalid(f"has {fractional_bits} fractional bits of positions; {_MAX_FRACTIONAL_BITS} are the most")
     return SpzInfo(
         version=version,
         count=count,
@@ -353,23 +327,17 @@ def _read_frames(opened: SceneFile, info: SpzInfo) -> tuple[dict[str, UInt8[np.n
     number, table = head[15], struct.unpack_from("<I", head, 16)[0]
     widths = {name: width for name, width in info.widths.items() if width}
     if number != len(widths):
-        raise InvalidSceneError(
-            f"{opened.name} has {number} streams; SH degree {info.stored_degree} needs {len(widths)}: export it again"
-        )
+        raise opened.invalid(f"has {number} streams, where SH degree {info.stored_degree} needs {len(widths)}")
     if not _HEADER_BYTES_V4 <= table <= _HEADER_BYTES_V4 + MAX_EXTENSION_BYTES:
-        raise InvalidSceneError(f"{opened.name} has its table of streams at byte {table:,}; it is damaged")
+        raise opened.invalid(f"is damaged: its table of streams is at byte {table:,}")
     extensions = opened.read(_HEADER_BYTES_V4, table - _HEADER_BYTES_V4) if info.extensions else b""
     entries = list(_TABLE_ENTRY.iter_unpack(opened.read(table, number * _TABLE_ENTRY.size)))
     start = table + number * _TABLE_ENTRY.size
     if start + sum(packed for packed, _ in entries) != opened.size:
-        raise InvalidSceneError(
-            f"{opened.name} is cut short or damaged: its streams do not end at its last byte; download it again"
-        )
+        raise opened.invalid("is cut short or damaged: its streams do not end at its last byte")
     for (name, width), (_, raw) in zip(widths.items(), entries, strict=True):
         if raw != info.count * width:
-            raise InvalidSceneError(
-                f"{opened.name} declares {raw:,} bytes of {name} for {info.count:,} Gaussians; export it again"
-            )
+            raise opened.invalid(f"declares {raw:,} bytes of {name} for {info.count:,} Gaussians")
     streams = {"sh": np.empty((info.count, 0), np.uint8)}
     for (name, width), (packed, raw) in zip(widths.items(), entries, strict=True):
         data = unpack_frame(opened.read(start, packed), raw, f"{opened.name}: its stream of {name}")
@@ -419,16 +387,10 @@ def _read_extensions(extensions: bytes, name: str) -> tuple[str, list[str]]:
 
 # Writing: version 3, one gzip member without extension records, which the most readers take.
 
-_Encode = Callable[[slice], UInt8[np.ndarray, "B width"]]
 
-
-def write_spz(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
-) -> tuple[str, ...]:
-    """Write a scene."""
+def write_spz(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
     count = len(splats)
-    if not count:
-        raise UnsupportedError("a scene without Gaussians cannot be written as .spz; write it as .ply")
+    refuse_empty(splats, ".spz")
     reach = float(np.abs(splats.means).max())
     bits = fractional_bits_for(reach)
     encoders = _encoders(splats, bits, axis_signs(PLY_FRAME if raw_axes else DEFAULT_FRAME))
@@ -443,35 +405,32 @@ def write_spz(
     return _notes(splats, reach, bits)
 
 
-def _encoders(splats: Splats, bits: int, signs: Signs) -> list[_Encode]:
+def _encoders(splats: Splats, bits: int, signs: Signs) -> list[Callable[[slice], UInt8[np.ndarray, "B width"]]]:
     """Return the encoder of each stream, in the order of the file."""
     of_axes = np.array(signs, np.float32)
     of_quats = np.array(quat_signs(signs), np.float32)
     of_sh = sh_signs(signs, splats.shN.shape[1])[:, None]
-    encoders: list[_Encode] = [
+    return [
         lambda part: encode_positions(splats.means[part] * of_axes, bits),
         lambda part: to_bytes(255 * opacities_of(splats.opacities[part]))[:, None],
         lambda part: encode_colors(splats.sh0[part]),
         lambda part: encode_scales(splats.scales[part]),
         lambda part: encode_smallest_three(splats.quats[part] * of_quats),
+        lambda part: encode_sh(splats.shN[part] * of_sh),  # nothing, without view-dependent colour
     ]
-    if splats.sh_degree:
-        encoders.append(lambda part: encode_sh(splats.shN[part] * of_sh))
-    return encoders
 
 
 def _notes(splats: Splats, reach: float, bits: int) -> tuple[str, ...]:
     """Return what is lost beyond the steps that the format always has."""
-    notes: list[str] = []
-    if bits < 12:
-        notes.append(f"positions have steps of {2.0**-bits:g}, because the scene reaches {reach:,.0f} from the origin")
-    limit = (1 << 23) - 1
-    note_clamped(notes, "positions", splats.means, -limit - 1, limit + 0.5, f"±{limit:,}")
-    note_clamped(notes, "scales", splats.scales, -10 - 1 / 32, 5.9375 + 1 / 32, "e^-10 to e^5.94")
-    edge = (0.5 + 0.5 / 255) / 0.15
-    note_clamped(notes, "colours", splats.sh0, -edge, edge, "coefficients of ±3.33")
-    note_clamped(notes, "view-dependent colours", splats.shN, -1 - 1 / 32, 1 + 1 / 32, "coefficients of ±1")
-    return tuple(notes)
+    steps_of = f"positions have steps of {2.0**-bits:g}, because the scene reaches {reach:,.0f} from the origin"
+    limit, edge = (1 << 23) - 1, (0.5 + 0.5 / 255) / 0.15
+    return (
+        *[steps_of] * (bits < 12),
+        *clamped("positions", splats.means, -limit - 1, limit + 0.5, f"±{limit:,}"),
+        *clamped("scales", splats.scales, -10 - 1 / 32, 5.9375 + 1 / 32, "e^-10 to e^5.94"),
+        *clamped("colours", splats.sh0, -edge, edge, "coefficients of ±3.33"),
+        *clamped("view-dependent colours", splats.shN, -1 - 1 / 32, 1 + 1 / 32, "coefficients of ±1"),
+    )
 
 
 def _sniff(head: bytes, size: int) -> Match:
@@ -486,11 +445,7 @@ def _describe(path: Path | bytes, level: int) -> Facts:
         title=titled("SPZ scene", f"version {found.version}", antialiased),
         count=found.count,
         sh_degree=found.sh_degree,
-        details={
-            "version": found.version,
-            "antialiased": found.antialiased,
-            "fractional_bits": found.fractional_bits,
-        },
+        details={name: getattr(found, name) for name in ("version", "antialiased", "fractional_bits")},
     )
 
 

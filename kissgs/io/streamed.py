@@ -23,17 +23,10 @@ from kissgs.io.containers import Source, is_file_name, open_source, stored_size
 from kissgs.io.files import marked, parse_json, refuse_more_than, whole_number
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions, SceneSource, titled
 
-MAX_TREE_BYTES = 1 << 25
-"""Largest size of a manifest, bytes; one of a thousand leaves and five levels takes 330 kB."""
-
-MAX_TREE_VALUES = 1 << 22
-"""Largest number of values in a manifest; one of a thousand leaves and five levels has 30,000."""
-
-MAX_ROWS = 1 << 40
-"""Largest number of a row that a manifest may name."""
-
-MAX_LEVELS = 64
-"""Largest number of levels; each has a fraction of the Gaussians of the one before."""
+MAX_TREE_BYTES = 1 << 25  # largest size of a manifest, bytes; one of a thousand leaves and five levels takes 330 kB
+MAX_TREE_VALUES = 1 << 22  # largest number of values in a manifest; one of a thousand leaves and five levels has 30,000
+MAX_ROWS = 1 << 40  # largest number of a row that a manifest may name
+MAX_LEVELS = 64  # largest number of levels; each has a fraction of the Gaussians of the one before
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,25 +37,17 @@ class Container:
     sh_degree: int
     antialiased: bool
     notes: tuple[str, ...] = ()  # phrases for what reading leaves out
-    ranges: Callable[[], dict[str, tuple[float, float]]]
-    """Returns the values of the lowest and the highest level of each attribute."""
-    stored: Callable[[], tuple[str, int]]
-    """Returns the name of the container and the bytes of all its files."""
-    decode: Callable[[Splats, Workers], None]
-    """Decodes all Gaussians into a scene, whose SH coefficients above the container's degree are zero."""
+    ranges: Callable[[], dict[str, tuple[float, float]]]  # values of the lowest and the highest level, by attribute
+    stored: Callable[[], tuple[str, int]]  # returns the name of the container and the bytes of all its files
+    decode: Callable[[Splats, Workers], None]  # into a scene, whose SH coefficients above its own degree are zero
 
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Contents of a manifest."""
-
     levels: int
-    filenames: tuple[str, ...]
-    """Files of the containers: their metadata, or they themselves."""
-    rows: tuple[tuple[tuple[int, int, int], ...], ...]
-    """Row ranges of the leaves per level, ``(file, offset, count)``, by file and offset, without overlap."""
-    environment: str | None
-    """File of the environment."""
+    filenames: tuple[str, ...]  # files of the containers: their metadata, or they themselves
+    rows: tuple[tuple[tuple[int, int, int], ...], ...]  # by level: (file, offset, count), in order, without overlap
+    environment: str | None  # file of the environment
     origin: Origin
 
     def count(self, level: int) -> int:
@@ -100,19 +85,13 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class StreamedFormat:
-    """Format of streamed scenes."""
-
     title: str
-    manifest: str
-    """File name of the manifest."""
-    containers: str | None
-    """Value that the manifest's key "format" must have where it has one; None if any value is valid."""
-    opened: Callable[[Source, str], Container]
-    """Reads and checks the metadata of the container of a file."""
+    manifest: str  # file name of the manifest
+    containers: str | None  # value of the manifest's key "format", which it may lack; None: any value is valid
+    opened: Callable[[Source, str], Container]  # reads and checks the metadata of the container of a file
 
     @property
     def codec(self) -> Codec:
-        """Code of the format."""
         return Codec(info=self.describe, read=self.decode)
 
     def describe(self, path: Path | bytes, level: int) -> Facts:

@@ -9,8 +9,7 @@ from decimal import ROUND_CEILING, Context
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from kissgs.evaluation.detail import Detail
-from kissgs.evaluation.results import MAX_VIEW_PSNR, as_json, drop_of, over_scene, psnr_of, ssim_drop_of
+from kissgs.evaluation.results import MAX_VIEW_PSNR, Detail, as_json, drop_of, over_scene, psnr_of, ssim_drop_of
 from kissgs.settings import QUALITIES, EncodeSettings
 
 if TYPE_CHECKING:

@@ -30,7 +30,6 @@ class Resources:
     gpus: float = 0.0  # a fraction shares one
 
     def fits(self, free: Resources) -> bool:
-        """Whether ``free`` resources suffice."""
         return self.cpus <= free.cpus and self.memory <= free.memory and self.gpus <= free.gpus
 
     def __str__(self) -> str:
@@ -46,16 +45,12 @@ class WorkItem:
     """``"module:name"`` of a function ``(arguments, progress) -> result``, which every node can import. It may run more
     than once, if a node is lost, and must therefore write its files atomically."""
 
-    arguments: dict[str, Any] = field(default_factory=dict)
-    """JSON. Files are named by paths that every node sees, or that are relative to ``folder``."""
+    arguments: dict[str, Any] = field(default_factory=dict)  # JSON; paths are seen by every node, or relative to folder
 
     resources: Resources = Resources()
 
-    seconds: float | None = None
-    """Limit of the time since the start of its process."""
-
-    memory_limit: int | None = None
-    """Limit of the memory of its process, bytes, enforced on Linux."""
+    seconds: float | None = None  # limit of the time since the start of its process
+    memory_limit: int | None = None  # limit of the memory of its process, bytes, enforced on Linux
 
     folder: str | None = None
     """Current folder of its process; None for a new temporary one on the machine that runs it, which is removed when
@@ -66,8 +61,7 @@ class WorkItem:
     to a temporary one, and what is new or changed there comes back, all through Ray's object store: now and then the
     files directly in it, and after success those in its folders, too. Without files, the node must see the folder."""
 
-    retries: int = 3
-    """Number of times that it is started again after its node was lost."""
+    retries: int = 3  # number of times that it is started again after its node was lost
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:

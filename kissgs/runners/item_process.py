@@ -23,8 +23,7 @@ from kissgs.core.context import Progress
 from kissgs.core.errors import KissgsError
 from kissgs.runners.contract import MEMORY_LIMIT
 
-EVENT_SECONDS = 0.25
-"""Minimum seconds between progress events of a stage."""
+EVENT_SECONDS = 0.25  # minimum seconds between progress events of a stage
 
 WITHOUT_MEMORY = ("can't start new thread", "error return without exception set", "failed to map")
 """Parts of messages of Python and of its loader of libraries when there is no memory."""
@@ -83,7 +82,6 @@ class Throttle:
         self._last, self._next = ("", -1.0, ""), 0.0
 
     def __call__(self, stage: str, fraction: float, note: str = "") -> None:
-        """See :class:`kissgs.Progress`."""
         now = time.monotonic()
         event = stage, round(min(1.0, max(0.0, fraction)), 4), note
         if event == self._last or (stage == self._last[0] and now < self._next):

@@ -38,8 +38,7 @@ from kissgs.runners.contract import (
     report,
 )
 
-PREFIX = "kissgs-item-"
-"""Beginning of the names of temporary folders of items."""
+PREFIX = "kissgs-item-"  # beginning of the names of temporary folders of items
 
 
 @contextlib.contextmanager
@@ -84,23 +83,15 @@ def _opened(folder: Path) -> Iterator[int]:
 # Only a process of its own can be ended at any moment, be limited in its memory, and crash alone. Ray's worker
 # processes, below which it runs on a cluster, run many tasks and have no hard limit of memory.
 
-OUT_OF_MEMORY = re.compile(
-    "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.IGNORECASE
-)
+OUT_OF_MEMORY = re.compile("MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.I)
 """Messages of Python, C++, LLVM, OpenBLAS and the C library when an allocation fails; any of them may be the first."""
 
-NEAR_LIMIT = 0.8
-"""Share of the memory limit above which a crash without such a message is attributed to the limit."""
-
-SAMPLE_SECONDS = 0.1
-"""Seconds between looks at a process's time and memory."""
-
-LOG_BYTES = 4000
-"""Bytes of the end of standard error that are kept."""
+NEAR_LIMIT = 0.8  # share of the memory limit above which a crash without such a message is attributed to the limit
+SAMPLE_SECONDS = 0.1  # seconds between looks at a process's time and memory
+LOG_BYTES = 4000  # bytes of the end of standard error that are kept
 
 
-ProgressEvent = tuple[str, float, str]
-"""Stage, completed fraction and note, see :class:`kissgs.Progress`."""
+ProgressEvent = tuple[str, float, str]  # stage, completed fraction and note of Progress
 
 
 class ItemProcess:
@@ -146,20 +137,20 @@ class ItemProcess:
         threading.Thread(target=self._watch, args=(process.pid,), daemon=True).start()
         final: Outcome | None = None
         try:
-            for event in _events_of(process):
-                if isinstance(event, Outcome):
-                    final = event
+            assert process.stdout is not None  # noqa: S101
+            for event in json_lines(process.stdout):
+                if "outcome" in event:
+                    final = Outcome(**event["outcome"])
                 else:
-                    yield event
+                    yield event["stage"], event["fraction"], event["note"]
         finally:  # also if the caller asks for no more events
             status = self._finish(process, wait=final is not None)
         return status, final
 
     def _not_started(self, error: OSError) -> Outcome:
         reason, machine = (error.strerror or str(error)).lower(), socket.gethostname()
-        if self._item.folder is not None and isinstance(
-            error, (FileNotFoundError, NotADirectoryError, PermissionError)
-        ):
+        of_folder = isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError)
+        if self._item.folder is not None and of_folder:
             message = f"the machine {machine} cannot use the folder of the work: {reason}"
             return Outcome("error", code=NODE_UNUSABLE, message=message, log=str(self._item.folder))
         message = f"the machine {machine} could not start a process: {reason}"
@@ -179,15 +170,10 @@ class ItemProcess:
             self._process = process
             if self._killed:  # during the start
                 self._kill()
-        task = {
-            "parent": os.getpid(),
-            "function": self._item.function,
-            "arguments": self._item.arguments,
-            "memory_limit": self._item.memory_limit,
-        }
+        own = {name: getattr(self._item, name) for name in ("function", "arguments", "memory_limit")}
         assert process.stdin is not None  # noqa: S101
         with contextlib.suppress(BrokenPipeError):  # it has ended already, which the missing final event shows
-            process.stdin.write(json.dumps(task).encode() + b"\n")
+            process.stdin.write(json.dumps({"parent": os.getpid(), **own}).encode() + b"\n")
             process.stdin.flush()
         return process
 
@@ -241,12 +227,6 @@ class ItemProcess:
         return Outcome("error", code=INTERNAL, message=message, log=text)
 
 
-def _events_of(process: subprocess.Popen[bytes]) -> Iterator[ProgressEvent | Outcome]:
-    assert process.stdout is not None  # noqa: S101
-    for event in json_lines(process.stdout):
-        yield Outcome(**event["outcome"]) if "outcome" in event else (event["stage"], event["fraction"], event["note"])
-
-
 def json_lines(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
     """Yield the events that a process writes, until it ends; a line that it was killed in is none."""
     for line in lines:
@@ -280,11 +260,9 @@ class LocalRunner:
 
     @property
     def nodes(self) -> tuple[Resources, ...]:
-        """See :class:`kissgs.runners.Runner`."""
         return ()
 
     def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
-        """See :class:`kissgs.runners.Runner`."""
         item_id, process, outcome = secrets.token_hex(8), ItemProcess(item), Future[Outcome]()
         with self._lock:
             if self._closed:
@@ -300,21 +278,17 @@ class LocalRunner:
         return RunHandle(item_id, outcome)
 
     def cancel(self, item_id: str) -> None:
-        """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             if item_id in self._items:
                 self._items[item_id][0].kill()
 
     def refusal(self, resources: Resources) -> str | None:
-        """See :class:`kissgs.runners.Runner`."""
         return None
 
     def health_problem(self) -> str | None:
-        """See :class:`kissgs.runners.Runner`."""
         return "the runner is closed" if self._closed else None
 
     def close(self) -> None:
-        """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             self._closed = True
             items = list(self._items.values())

@@ -21,7 +21,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import ray
 from ray.exceptions import RayError, RayTaskError, TaskCancelledError
@@ -31,26 +31,13 @@ from kissgs.core.errors import OutputError, RunnerError
 from kissgs.runners import ray_node
 from kissgs.runners.contract import INTERNAL, LOST, NODE_UNUSABLE, Outcome, WorkItem
 
-CONNECT_SECONDS = 5.0
-"""Maximum seconds for a connection to the head's port."""
-
-OBJECT_STORE_BYTES = 80 << 20
-"""Size of the object store of a cluster that is started here: nearly the smallest; nothing is kept there."""
-
-NODES_SECONDS = 1.0
-"""Seconds between two looks at the cluster's nodes."""
-
-RETRY_SECONDS = 1.0
-"""Seconds before an item whose node was lost is started again: Ray may not know of the loss yet."""
-
-FORCE_SECONDS = 5.0
-"""Seconds after which a cancelled task that has not ended is killed."""
-
-EVENTS_AHEAD = 4
-"""Events of a start that have not been read, beyond which its task waits: they may be blocks of files."""
-
-LOCAL = "local"
-"""Argument instead of an address: start a cluster on this machine."""
+CONNECT_SECONDS = 5.0  # maximum seconds for a connection to the head's port
+OBJECT_STORE_BYTES = 80 << 20  # of a cluster that is started here: nearly the smallest; nothing is kept there
+NODES_SECONDS = 1.0  # seconds between two looks at the cluster's nodes
+RETRY_SECONDS = 1.0  # seconds before an item whose node was lost is started again: Ray may not know of the loss yet
+FORCE_SECONDS = 5.0  # seconds after which a cancelled task that has not ended is killed
+EVENTS_AHEAD = 4  # events of a start that have not been read, beyond which its task waits: they may be blocks of files
+LOCAL = "local"  # argument instead of an address: start a cluster on this machine
 
 Send = Callable[[dict[str, Any]], None]
 
@@ -74,24 +61,18 @@ def main() -> None:
         send({"nodes": _nodes()})
         asyncio.run(Driver(send).run())
     except NoCluster:
+        # Replace this process by one that starts a cluster on this machine, with a token of its own: without one, Ray
+        # would let everyone in who reaches its ports, or write one to the home folder. It reads its environment when it
+        # is imported, so that this process cannot set one.
         os.dup2(out.fileno(), 1)
-        _begin_again()
+        protected = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        os.execve(sys.executable, [sys.executable, "-P", "-m", f"{__package__}.ray_driver", LOCAL], protected)
     except RunnerError as error:
         send({"failed": str(error)})
     finally:
         ray.shutdown()
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _begin_again() -> NoReturn:
-    """Replace this process by one that starts a cluster on this machine, with a token of its own.
-
-    Without a token, Ray would let everyone in who reaches its ports, or write one to the home folder. It reads its
-    environment when it is imported, so that this process cannot set one.
-    """
-    protected = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
-    os.execve(sys.executable, [sys.executable, "-P", "-m", f"{__package__}.ray_driver", LOCAL], protected)
 
 
 def _nodes() -> list[dict[str, Any]]:

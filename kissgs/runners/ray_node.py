@@ -16,14 +16,9 @@ from kissgs._version import __version__
 from kissgs.runners.contract import NODE_UNUSABLE, Outcome, WorkItem
 from kissgs.runners.process import ItemProcess, temporary_folder
 
-BLOCK_BYTES = 8 << 20
-"""Bytes of a block; the object store of a small cluster has 80 MB."""
-
-CHECKPOINT_SECONDS = 30.0
-"""Seconds between two looks for files that the function has written while it runs."""
-
-Times = dict[str, int]
-"""Times of the last change of files, by their names relative to a folder, ns."""
+BLOCK_BYTES = 8 << 20  # bytes of a block; the object store of a small cluster has 80 MB
+CHECKPOINT_SECONDS = 30.0  # seconds between two looks for files that the function has written while it runs
+Times = dict[str, int]  # times of the last change of files, by their names relative to a folder, ns
 
 
 def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]] | None) -> Iterator[dict[str, Any]]:

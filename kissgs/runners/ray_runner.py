@@ -25,14 +25,9 @@ from kissgs.core.errors import RunnerError
 from kissgs.runners.contract import UNREACHABLE, Outcome, Resources, RunHandle, WorkItem, log, refusal_of, report
 from kissgs.runners.process import child_environment, json_lines
 
-CONNECT_SECONDS = 60.0
-"""Maximum seconds for the connection to a cluster, or the start of one on this machine."""
-
-RECONNECT_SECONDS = 5.0
-"""Minimum seconds between two attempts to connect again."""
-
-CLOSE_SECONDS = 20.0
-"""Maximum seconds for the end of all items and of the driver; then it is killed, and Ray ends the items."""
+CONNECT_SECONDS = 60.0  # maximum seconds for the connection to a cluster, or the start of one on this machine
+RECONNECT_SECONDS = 5.0  # minimum seconds between two attempts to connect again
+CLOSE_SECONDS = 20.0  # for the end of all items and of the driver; then it is killed, and Ray ends the items
 
 NOT_INSTALLED = "Ray is not installed; install it on every machine with: pip install 'kissgs[ray]'"
 
@@ -64,11 +59,9 @@ class RayRunner:
 
     @property
     def nodes(self) -> tuple[Resources, ...]:
-        """See :class:`kissgs.runners.Runner`."""
         return self._nodes
 
     def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
-        """See :class:`kissgs.runners.Runner`."""
         item_id, outcome = secrets.token_hex(8), Future[Outcome]()
         with self._lock:
             if self._closed:
@@ -82,17 +75,14 @@ class RayRunner:
         return RunHandle(item_id, outcome)
 
     def cancel(self, item_id: str) -> None:
-        """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             if item_id in self._items:
                 self._send({"cancel": item_id})
 
     def refusal(self, resources: Resources) -> str | None:
-        """See :class:`kissgs.runners.Runner`."""
         return self._problem or refusal_of(resources, self._nodes)
 
     def health_problem(self) -> str | None:
-        """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             ended = self._driver is None and not self._closed
             if ended and time.monotonic() > self._last_attempt + RECONNECT_SECONDS:
@@ -104,7 +94,6 @@ class RayRunner:
             return self._problem
 
     def close(self) -> None:
-        """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             self._closed = True
             driver, outcomes = self._driver, [outcome for _, outcome in self._items.values()]

@@ -23,12 +23,10 @@ from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptio
 from kissgs.io.streamed import Container, StreamedFormat
 from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, MAX_SH_ENTRIES, Rest, SogLayout, read_layout
 
-_FREE_PIXELS = 1 << 20
-"""Pixels that images may have beyond four per Gaussian: encoders may round sides up to powers of two."""
+_FREE_PIXELS = 1 << 20  # beyond four per Gaussian: encoders may round sides up to powers of two
 
 
 def describe(path: Path | bytes, level: int) -> Facts:
-    """Return the facts of a SOG container."""
     with open_source(path) as files:
         layout = read_layout(files)
         parts = {name: stored_size(files, name) for name in (META_NAME, *layout.images)}
@@ -70,14 +68,10 @@ def decode_files(files: Source, layout: SogLayout, out: Splats, pool: Workers, f
     SH coefficients above the container's degree are left as they are. ``folder`` is the prefix of file names.
     """
     images = _Images(files, layout, folder)
-    jobs: list[Callable[[], None]] = [
-        lambda: _decode_quats(images, out.quats),
-        lambda: _decode_means(images, out.means),
-        lambda: _decode_rest(images, out),
-        lambda: _decode_scales(images, out.scales),
-        lambda: _decode_colors(images, out),
-    ]
-    pool.map(lambda job: job(), jobs)
+    jobs: tuple[Callable[[_Images, Splats], None], ...] = (
+        *(_decode_quats, _decode_means, _decode_rest, _decode_scales, _decode_colors),
+    )
+    pool.map(lambda job: job(images, out), jobs)
 
 
 class _Images:
@@ -124,7 +118,7 @@ def _decode_image(data: bytes, name: str, width: int, height: int, channels: int
     return decode_plane(data, name, width=width, height=height, channels=channels)
 
 
-def _decode_means(images: _Images, out: Float32[np.ndarray, "N 3"]) -> None:
+def _decode_means(images: _Images, out: Splats) -> None:
     layout = images.layout
     levels = images.plane(layout.files["means_high"], 3).astype(np.uint16)
     levels <<= 8
@@ -134,10 +128,10 @@ def _decode_means(images: _Images, out: Float32[np.ndarray, "N 3"]) -> None:
         logs = layout.low[axis] + (layout.high[axis] - layout.low[axis]) * position
         table = signed_exp(logs).astype(np.float32)
         for part in steps(len(out)):
-            out[part, axis] = table[levels[part, axis]]
+            out.means[part, axis] = table[levels[part, axis]]
 
 
-def _decode_quats(images: _Images, out: Float32[np.ndarray, "N 4"]) -> None:
+def _decode_quats(images: _Images, out: Splats) -> None:
     name = images.layout.files["quats"]
     pixels = images.plane(name, 4)
     if len(pixels) and int(pixels[:, 3].min()) < FIRST_TAG:
@@ -147,12 +141,12 @@ def _decode_quats(images: _Images, out: Float32[np.ndarray, "N 4"]) -> None:
         )
     for part in steps(len(out)):
         small = (pixels[part, :3] / 255 - 0.5) * np.sqrt(2)
-        out[part] = insert_largest(small, pixels[part, 3].astype(np.int64) - FIRST_TAG)
+        out.quats[part] = insert_largest(small, pixels[part, 3].astype(np.int64) - FIRST_TAG)
 
 
-def _decode_scales(images: _Images, out: Float32[np.ndarray, "N 3"]) -> None:
+def _decode_scales(images: _Images, out: Splats) -> None:
     name = images.layout.files["scales"]
-    _decode_levels(name, images.plane(name, 3), images.layout.scales, out)
+    _decode_levels(name, images.plane(name, 3), images.layout.scales, out.scales)
 
 
 def _decode_colors(images: _Images, out: Splats) -> None:
@@ -163,10 +157,7 @@ def _decode_colors(images: _Images, out: Splats) -> None:
 
 
 def _decode_levels(
-    name: str,
-    levels: UInt8[np.ndarray, "N 3"],
-    table: Float32[np.ndarray, "3 256"],
-    out: Float32[np.ndarray, "N 3"],
+    name: str, levels: UInt8[np.ndarray, "N 3"], table: Float32[np.ndarray, "3 256"], out: Float32[np.ndarray, "N 3"]
 ) -> None:
     for channel in range(3):
         _check_levels(name, levels[:, channel], table[channel])
@@ -203,7 +194,6 @@ FORMAT = Codec(info=describe, read=decode)
 
 
 def _opened(files: Source, name: str) -> Container:
-    """Read the container of a metadata file."""
     layout, folder = read_layout(files, name), name[: name.rfind("/") + 1]
 
     def stored() -> tuple[str, int]:

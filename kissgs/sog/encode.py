@@ -17,7 +17,7 @@ from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.containers import META_NAME
 from kissgs.io.conventions import OPACITY_OF_BYTE
-from kissgs.io.planes import compress_images
+from kissgs.io.images import compress_images
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.quantize import ByteTables, ContainerModel, Quantized
 from kissgs.planning.sh_codebook import COEFFICIENTS
@@ -26,30 +26,21 @@ from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG
 
 # Description of SOG 2 for the planner: its tables, and no mask for padding.
 
-FIRST_DRAWN = 2
-"""Smallest level of opacity that viewers draw: they leave out opacities of 1/255 and less."""
+FIRST_DRAWN = 2  # smallest level of opacity that viewers draw: they leave out opacities of 1/255 and less
+LAST_DRAWN = 254  # largest level to use: 255 is an opacity of 1, whose logit no decoder can give back
 
-LAST_DRAWN = 254
-"""Largest level to use: 255 is an opacity of 1, whose logit no decoder can give back."""
-
-SOG = ContainerModel(
-    tables=ByteTables(
-        opacity_logits=OPACITY_OF_BYTE.astype(np.float64), first_drawn=FIRST_DRAWN, last_drawn=LAST_DRAWN
-    ),
-    padding_last=True,
-    entry_bits=130,
-)
+_LOGITS = OPACITY_OF_BYTE.astype(np.float64)
+_TABLES = ByteTables(opacity_logits=_LOGITS, first_drawn=FIRST_DRAWN, last_drawn=LAST_DRAWN)
+SOG = ContainerModel(tables=_TABLES, padding_last=True, entry_bits=130)
 
 
 MEANS, QUATS, SCALES, SH0 = ("means_l.webp", "means_u.webp"), "quats.webp", "scales.webp", "sh0.webp"
 SHN = ("shN_centroids.webp", "shN_labels.webp")
 
-FILES = (META_NAME, *MEANS, QUATS, SCALES, SH0, *SHN)
-"""Names of all files that a container may have."""
+FILES = (META_NAME, *MEANS, QUATS, SCALES, SH0, *SHN)  # names of all files that a container may have
 
 
 def write_files(plan: EncodingPlan, settings: EncodeSettings, context: Context = DEFAULT_CONTEXT) -> Encoded:
-    """Make the files of a plan."""
     if not plan.grid.mask.any():
         raise UnsupportedError("a SOG file cannot hold a scene without visible Gaussians; write SOG-XT (.zip) instead")
     context.progress("images", 0.0)

@@ -10,31 +10,16 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.positions import WORLD, Origin, read_origin, signed_exp
+from kissgs.core.positions import MAX_SIGNED_LOG, WORLD, Origin, read_origin, signed_exp
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.io.containers import (
-    MAX_METADATA_BYTES,
-    MAX_SIGNED_LOG,
-    META_NAME,
-    Source,
-    is_antialiased,
-    is_file_name,
-    stated_text,
-)
+from kissgs.io.containers import MAX_METADATA_BYTES, META_NAME, Source, is_antialiased, is_file_name, stated_text
 from kissgs.io.conventions import OPACITY_OF_BYTE
 from kissgs.io.files import is_number, listed, parse_json, whole_number
 
-ENTRIES_PER_ROW = 64
-"""Entries of the SH codebook in a row of its image."""
-
-FIRST_TAG = 252
-"""Alpha of a rotation whose largest component is w; 253 to 255 are x, y, z."""
-
-MAX_SH_ENTRIES = 1 << 16
-"""Largest number of entries of the SH codebook: labels have two bytes."""
-
-MAX_FLOAT32 = 3e38
-"""Bound of numbers, which float32 must hold."""
+ENTRIES_PER_ROW = 64  # entries of the SH codebook in a row of its image
+FIRST_TAG = 252  # alpha of a rotation whose largest component is w; 253 to 255 are x, y, z
+MAX_SH_ENTRIES = 1 << 16  # largest number of entries of the SH codebook: labels have two bytes
+MAX_FLOAT32 = 3e38  # bound of numbers, which float32 must hold
 
 _LEVELS = 256
 
@@ -48,10 +33,8 @@ _KNOWN = {"version", "count", "asset", "model", "means", "scales", "quats", "sh0
 class Rest:
     """View-dependent colour: the codebook, and the files of its entries and of each Gaussian's entry."""
 
-    entries: int | None
-    """Number of entries; None: as many as the image has (version 1)."""
-    coefficients: int
-    """3, 8 or 15."""
+    entries: int | None  # number of entries; None: as many as the image has (version 1)
+    coefficients: int  # 3, 8 or 15
     table: Float32[np.ndarray, " 256"]
     centroids: str
     labels: str
@@ -71,15 +54,12 @@ class SogLayout:
     scales: Float32[np.ndarray, "3 256"]
     sh0: Float32[np.ndarray, "3 256"]
     opacities: Float32[np.ndarray, " 256"]
-    files: dict[str, str]
-    """Names of the images ``means_low``, ``means_high``, ``scales``, ``quats``, ``sh0``."""
+    files: dict[str, str]  # names of the images means_low, means_high, scales, quats, sh0
     rest: Rest | None
-    model: str | None
-    """Variant of the renderer that the scene was made for, such as "antialiased"."""
+    model: str | None  # variant of the renderer that the scene was made for, such as "antialiased"
     generator: str | None
     origin: Origin
-    unknown: tuple[str, ...]
-    """Keys of the file that are not read."""
+    unknown: tuple[str, ...]  # keys of the file that are not read
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -88,17 +68,14 @@ class SogLayout:
 
     @property
     def images(self) -> list[str]:
-        """Names of the images."""
         return [*self.files.values(), *([self.rest.centroids, self.rest.labels] if self.rest else [])]
 
     @property
     def antialiased(self) -> bool:
-        """Whether the scene was trained with antialiasing."""
         return is_antialiased(self.model)
 
     @property
     def sh_degree(self) -> int:
-        """SH degree, 0 to 3."""
         return SH_REST_COUNTS.index(self.rest.coefficients) if self.rest else 0
 
     def value_ranges(self) -> dict[str, tuple[float, float]]:
@@ -137,10 +114,14 @@ def _read(document: dict[str, Any], version: int) -> SogLayout:
     table = _even_table if first else _codebook
     colors = table(document, "sh0", 4 if first else 3)
     asset = document.get("asset")
+    low, high = (_numbers(_part(document, "means"), key, "means.", 3) for key in ("mins", "maxs"))
+    if max(np.abs(low).max(), np.abs(high).max()) > MAX_SIGNED_LOG:
+        raise _MetadataError(f"the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold")
     return SogLayout(
         version=version,
         count=_first_count(document) if first else _whole(document, "count", "", 0, 1 << 32),
-        **_means(document),
+        low=low,
+        high=high,
         scales=table(document, "scales", 3),
         sh0=colors[:3],
         opacities=np.clip(colors[3], OPACITY_OF_BYTE[0], OPACITY_OF_BYTE[-1]) if first else OPACITY_OF_BYTE,
@@ -199,13 +180,6 @@ def _part(document: dict[str, Any], key: str) -> dict[str, Any]:
     return part
 
 
-def _means(document: dict[str, Any]) -> dict[str, Float64[np.ndarray, " 3"]]:
-    low, high = (_numbers(_part(document, "means"), key, "means.", 3) for key in ("mins", "maxs"))
-    if max(np.abs(low).max(), np.abs(high).max()) > MAX_SIGNED_LOG:
-        raise _MetadataError(f"the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold")
-    return {"low": low, "high": high}
-
-
 def _numbers(part: dict[str, Any], key: str, where: str, count: int) -> Float64[np.ndarray, " count"]:
     values = part.get(key)
     values = values if isinstance(values, list) else [values]
@@ -248,9 +222,7 @@ def _files(document: dict[str, Any]) -> dict[str, str]:
 def _names(part: dict[str, Any], key: str, count: int) -> list[str]:
     names = part.get("files")
     if not isinstance(names, list) or len(names) != count or not all(map(is_file_name, names)):
-        raise _MetadataError(
-            f"{key}.files does not name {count} image{'s' if count > 1 else ''}; export the scene again"
-        )
+        raise _MetadataError(f"{key}.files does not name {count} image{'s' * (count > 1)}; export the scene again")
     return names
 
 

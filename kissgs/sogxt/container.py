@@ -19,22 +19,12 @@ from kissgs.io.files import atomic_file, check_writable, move_into_place, path_s
 
 YAML_NAME, JSON_NAME, SCENE_NAME = "container_meta.yaml", "meta.json", "scene.json"
 
-FORMAT = "sog-xt"
-"""Name of the format in ``meta.json``."""
-
-CHECKSUM = "kissgs_crc32"
-"""Key of the metadata's checksum, outside ``kissgs``, so that it shows a loss of that block."""
+FORMAT = "sog-xt"  # name of the format in meta.json
+CHECKSUM = "kissgs_crc32"  # key of the metadata's checksum, outside kissgs, so that it shows a loss of that block
 
 PLANES = (
-    "active_mask.webp",
-    "means_bytes_0.webp",
-    "means_bytes_1.webp",
-    "opacities.webp",
-    "scales.webp",
-    "quaternions.webp",
-    "f_dc.webp",
-    "f_rest_labels.webp",
-    "f_rest_centroids.webp",
+    *("active_mask.webp", "means_bytes_0.webp", "means_bytes_1.webp", "opacities.webp", "scales.webp"),
+    *("quaternions.webp", "f_dc.webp", "f_rest_labels.webp", "f_rest_centroids.webp"),
 )
 
 FILES = (YAML_NAME, JSON_NAME, SCENE_NAME, *PLANES)
@@ -79,13 +69,13 @@ def write_container(
     A folder is replaced only if it holds the files of a container, or those of ``names``, and nothing else.
     """
     check_destination(path, overwrite=overwrite, names={*files, *names})
-    if is_packed(path):
-        data = zip_bytes(files)
-        with atomic_file(path, overwrite=overwrite) as file:
-            file.write(data)
-        return len(data)
-    _write_directory(files, path)
-    return sum(map(len, files.values()))
+    if not is_packed(path):
+        _write_directory(files, path)
+        return sum(map(len, files.values()))
+    data = zip_bytes(files)
+    with atomic_file(path, overwrite=overwrite) as file:
+        file.write(data)
+    return len(data)
 
 
 def check_destination(path: Path, *, overwrite: bool, names: Collection[str] = FILES) -> None:
@@ -99,16 +89,13 @@ def check_destination(path: Path, *, overwrite: bool, names: Collection[str] = F
     present, folder = path_state(path)
     if present and not overwrite:
         raise OutputError(f"{path} exists already; choose another name or allow overwriting (--force)")
-    if present and (not folder or _names_in(path) - set(names)):
+    try:
+        found = {entry.name for entry in path.iterdir()} if folder else set()
+    except OSError as error:
+        raise OutputError(f"cannot list {path}: {reason_of(error)}") from error
+    if present and (not folder or found - set(names)):
         raise OutputError(f"{path} holds more than a container; name an empty or a new folder, or a .zip file")
     check_writable(path)
-
-
-def _names_in(folder: Path) -> set[str]:
-    try:
-        return {entry.name for entry in folder.iterdir()}
-    except OSError as error:
-        raise OutputError(f"cannot list {folder}: {reason_of(error)}") from error
 
 
 def _write_directory(files: Mapping[str, bytes], path: Path) -> None:

@@ -33,11 +33,8 @@ CHANNELS_OF_PLAIN = {"quaternions": 4, "scales": 3, "f_dc": 3, "opacities": 1}
 """Number of channels of the attributes that are one image of 8-bit levels each."""
 
 
-MAX_PLANE_BYTES = 1 << 30
-"""Largest size of the mask, bytes."""
-
-MAX_FILE_BYTES = 1 << 28
-"""Largest size of a zip in a streamed scene, bytes; one of 400,000 Gaussians takes about 5 MB."""
+MAX_PLANE_BYTES = 1 << 30  # largest size of the mask, bytes
+MAX_FILE_BYTES = 1 << 28  # largest size of a zip in a streamed scene, bytes; one of 400,000 Gaussians takes about 5 MB
 
 
 def describe(path: Path | bytes, level: int) -> Facts:
@@ -123,17 +120,10 @@ class _Planes:
 
     def load(self, pool: Workers) -> None:
         """Decode all images in parallel, the slowest first."""
-        jobs = [
-            self.load_means,
-            self.load_codebook,
-            self.load_labels,
-            *(lambda field=field: self.load_plain(*field) for field in CHANNELS_OF_PLAIN.items()),
-            self.load_mask,
-        ]
-        pool.map(lambda job: job(), jobs)
+        plain = (lambda field=field: self.load_plain(*field) for field in CHANNELS_OF_PLAIN.items())
+        pool.map(lambda job: job(), [self.load_means, self.load_codebook, self.load_labels, *plain, self.load_mask])
 
     def load_mask(self) -> None:
-        """Load the mask of the cells that hold a Gaussian."""
         self.mask = self.grid_plane("active_mask", 1)
 
     def load_plain(self, field: str, channels: int) -> None:

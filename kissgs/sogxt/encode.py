@@ -12,8 +12,7 @@ from kissgs.core.context import DEFAULT_CONTEXT, Context, load_kernels
 from kissgs.core.resources import blas_workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
-from kissgs.io.images import pixels_crc32
-from kissgs.io.planes import compress_images
+from kissgs.io.images import compress_images, pixels_crc32
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.planner import plan_encoding
 from kissgs.planning.quantize import Quantized, observed_range

@@ -15,10 +15,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from pydantic_core import PydanticCustomError
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.core.positions import WORLD, Origin, read_origin, recorded, signed_exp
+from kissgs.core.positions import MAX_SIGNED_LOG, WORLD, Origin, read_origin, recorded, signed_exp
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE, SH_REST_COUNTS
 from kissgs.formats import LEVELS_NAME, LOD_NAME
-from kissgs.io.containers import MAX_METADATA_BYTES, MAX_SIGNED_LOG, Source, is_antialiased, stated_text
+from kissgs.io.containers import MAX_METADATA_BYTES, Source, is_antialiased, stated_text
 from kissgs.io.files import parse_json
 from kissgs.sogxt.container import CHECKSUM, FORMAT, JSON_NAME, YAML_NAME
 
@@ -38,8 +38,7 @@ ATTRIBUTE_OF = {field: field for field in CHANNELS} | {"quaternions": "quats", "
 CHECKED = ("f_dc", "opacities", "scales", "quaternions", "means", "f_rest_centroids")
 """Order of the ranges in the checksum of the metadata."""
 
-FLOAT32_OVERFLOW = 2.0**128 - 2.0**103
-"""Smallest number that does not round to a finite float32."""
+FLOAT32_OVERFLOW = 2.0**128 - 2.0**103  # smallest number that does not round to a finite float32
 
 
 def _no_bool(value: Any) -> Any:  # noqa: ANN401
@@ -90,7 +89,6 @@ class Layout(BaseModel):
 
     @property
     def antialiased(self) -> bool:
-        """Whether the scene was trained with antialiasing."""
         return is_antialiased(self.model)
 
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
@@ -126,19 +124,13 @@ class Layout(BaseModel):
 
     def to_yaml(self) -> bytes:
         """Return ``container_meta.yaml``: ASCII, floats always with a point, so that YAML 1.1 readers see numbers."""
+
+        def quantize(field: str) -> dict[str, Any]:
+            return {"simple_quantize": self._range_entry(field, "min_values", "max_values")}
+
         document: dict[str, Any] = {
-            "meta": {
-                "grid_side": self.grid_side,
-                "f_rest_centroids_side": self.codebook_side,
-                "image_codec": "webp",
-            },
-            "ops": [
-                {
-                    "input_fields": [field],
-                    "transforms": [{"simple_quantize": self._range_entry(field, "min_values", "max_values")}],
-                }
-                for field in CHANNELS
-            ],
+            "meta": {"grid_side": self.grid_side, "f_rest_centroids_side": self.codebook_side, "image_codec": "webp"},
+            "ops": [{"input_fields": [field], "transforms": [quantize(field)]} for field in CHANNELS],
         }
         if self.model is not None:
             document["model"] = self.model
@@ -221,17 +213,10 @@ def scene_json(files: Mapping[str, bytes]) -> bytes:
 
 # Reading of a container's metadata: ``meta.json`` if it exists, else the YAML. Unknown keys are ignored.
 
-MAX_YAML_EVENTS = 20_000
-"""Largest number of values, and beginnings and ends of lists and mappings, of the YAML; kissgs writes about 500."""
-
-MAX_YAML_DEPTH = 50
-"""Largest nesting; kissgs writes 6 levels."""
-
-MAX_YAML_ALIASES = 20
-"""Largest number of aliases: dumpers write one if two fields share a list; thousands would take long to go through."""
-
-MAX_NUMBER_LENGTH = 100
-"""Largest number of characters of a number of the YAML; kissgs writes up to 25. Longer ones are text."""
+MAX_YAML_EVENTS = 20_000  # values, and beginnings and ends of lists and mappings; kissgs writes about 500
+MAX_YAML_DEPTH = 50  # largest nesting; kissgs writes 6 levels
+MAX_YAML_ALIASES = 20  # dumpers write one if two fields share a list; thousands would take long
+MAX_NUMBER_LENGTH = 100  # characters of a number of the YAML; kissgs writes up to 25; longer ones are text
 
 _CONSTANTS: dict[str, float | bool | None] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
@@ -246,12 +231,10 @@ _NUMBER = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]
 
 _WORD = re.compile(r"""[^ \t\r\n,:"'\[\]{}]+""")
 
-MISSING = object()
-"""Placeholder for a missing checksum: other encoders and early versions of kissgs write none."""
+MISSING = object()  # placeholder for a missing checksum: other encoders and early versions of kissgs write none
 
 
 def read_layout(source: Source) -> Layout:
-    """Read and check the metadata of a container."""
     names = source.names()
     if JSON_NAME in names:
         layout = _layout_of(_from_json(source.read(JSON_NAME, MAX_METADATA_BYTES)), JSON_NAME)
@@ -280,7 +263,9 @@ def _layout_of(raw: dict[str, Any], name: str) -> Layout:
         # Some YAML dumpers write numbers as text, so that is accepted; in JSON it is refused, as in browsers.
         layout = Layout.model_validate(raw, strict=name == JSON_NAME)
     except ValidationError as error:
-        raise InvalidContainerError(f"{name}: {_first_problem(error)}") from error
+        problem = error.errors()[0]
+        where = ".".join(map(str, problem["loc"]))
+        raise InvalidContainerError(f"{name}: {where}: {problem['msg'].lower()}") from error
     _check_ranges(layout, name)
     if checksum is not MISSING and checksum != layout.checksum:
         raise InvalidContainerError(f"{name} is damaged: its numbers do not give its {CHECKSUM}; copy it again")
@@ -330,9 +315,8 @@ def _check_ranges(layout: Layout, name: str) -> None:
             if len(values) != channels:
                 raise InvalidContainerError(f"{name}: the range of {field} has {len(values)} numbers, not {channels}")
     if np.abs(layout.limits("means")).max() > MAX_SIGNED_LOG:
-        raise InvalidContainerError(
-            f"{name}: the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold"
-        )
+        reason = f"the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold"
+        raise InvalidContainerError(f"{name}: {reason}")
 
 
 def _from_yaml(data: bytes) -> dict[str, Any]:
@@ -345,9 +329,7 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InvalidContainerError(f"{YAML_NAME} is not readable YAML") from error
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
-        raise InvalidContainerError(
-            f"{YAML_NAME} lacks 'meta' or 'ops', or they are not of the expected form"
-        ) from error
+        raise InvalidContainerError(f"{YAML_NAME} lacks 'meta' or 'ops', or they are of another form") from error
     _require_webp(sides.get("image_codec") if isinstance(sides, dict) else None)
     recorded = document.get("kissgs")
     return {
@@ -382,7 +364,11 @@ def _load_yaml(data: bytes) -> Any:  # noqa: ANN401
         parent, items = waiting[-1]
         value: Any
         if isinstance(event, yaml.CollectionEndEvent):
-            value = _mapping(items) if isinstance(parent, yaml.MappingStartEvent) else items
+            value = items
+            if isinstance(parent, yaml.MappingStartEvent):
+                if not all(isinstance(key, str) and key != "<<" for key in items[::2]):
+                    raise yaml.YAMLError("a key is no text, or merges mappings")
+                value = dict(zip(items[::2], items[1::2], strict=True))
             event, items = waiting.pop()[0], waiting[-1][1]
         elif isinstance(event, yaml.AliasEvent):
             if event.anchor not in anchors:
@@ -399,13 +385,6 @@ def _load_yaml(data: bytes) -> Any:  # noqa: ANN401
     if len(documents) > 1:
         raise yaml.YAMLError("more than one document")
     return documents[0] if documents else None
-
-
-def _mapping(items: list[Any]) -> dict[str, Any]:
-    keys = items[::2]
-    if not all(isinstance(key, str) and key != "<<" for key in keys):
-        raise yaml.YAMLError("a key is no text, or merges mappings")
-    return dict(zip(keys, items[1::2], strict=True))
 
 
 def _value(text: str) -> bool | float | str | None:
@@ -511,8 +490,3 @@ def _spread(values: Any, channels: int) -> list[Any]:  # noqa: ANN401
     """Return one number per channel: repeat a number, or the first of a list of another length, as browsers do."""
     numbers = values if isinstance(values, list) else [values]
     return numbers if len(numbers) == channels else numbers[:1] * channels
-
-
-def _first_problem(error: ValidationError) -> str:
-    problem = error.errors()[0]
-    return f"{'.'.join(map(str, problem['loc']))}: {problem['msg'].lower()}"

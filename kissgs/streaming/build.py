@@ -59,20 +59,15 @@ from kissgs.streaming.levels import (
 
 # Settings of the files of a level.
 
-COARSER_DB = 6.0
-"""Decibels by which coarser levels are encoded less accurately, with rate-distortion planning."""
-
-COARSER_STEPS = 1.6
-"""Steps of coarser levels of SH degree 0 in units of the finest level's, without rate-distortion planning."""
+COARSER_DB = 6.0  # decibels by which coarser levels are encoded less accurately, with rate-distortion planning
+COARSER_STEPS = 1.6  # of levels of SH degree 0, in units of the finest level's, without rate-distortion planning
 
 
 def file_settings(settings: EncodeSettings, level: int, sh_degree: int) -> EncodeSettings:
     """Return the settings of the files of a level.
 
-    There is one class of steps: within each leaf, classes would have an order of their own, which costs 5 % of the
-    bytes. Coarser levels are encoded less accurately, because the error of merging is larger than that of the finest
-    level's encoding; where there is no codebook that could be smaller, the steps are larger. docs/method/streaming.md
-    has what it saves and costs.
+    Classes of steps would have an order of their own within each leaf, which costs 5 % of the bytes. Merging has a
+    larger error than the finest level's encoding, so coarser levels are less accurate (docs/method/streaming.md).
     """
     settings = settings.model_copy(update={"step_classes": 1})
     if level == 0:
@@ -96,11 +91,8 @@ VIEWS_PER_CHUNK, MOST_VIEWS = 2, 1024
 """Least number of cameras per chunk, because a large scene needs more than the default, which falls with its size; and
 the largest number of all cameras, whose choice would take hours."""
 
-MIN_SIZE = 64
-"""Smallest side of the images in which coarse levels are measured, pixels."""
-
-REACH = 1.3
-"""Size of the image in which a sampled Gaussian counts as seen, in units of the image's."""
+MIN_SIZE = 64  # smallest side of the images in which coarse levels are measured, pixels
+REACH = 1.3  # size of the image in which a sampled Gaussian counts as seen, in units of the image's
 
 
 def measure_file(
@@ -123,13 +115,8 @@ def measure_file(
     if not seeing:
         return Sensitivity.none(len(splats), splats.sh_degree)
     uncertainty = VIEW_UNCERTAINTY[False] if settings.view_uncertainty is None else settings.view_uncertainty
-    found = measure_sensitivity(
-        concatenate([splats, others]),
-        WeightedCameras(seeing, [1.0] * len(seeing), black()),
-        view_uncertainty=uncertainty,
-        threads=threads,
-        progress=progress,
-    )
+    whole, weighted = concatenate([splats, others]), WeightedCameras(seeing, [1.0] * len(seeing), black())
+    found = measure_sensitivity(whole, weighted, view_uncertainty=uncertainty, threads=threads, progress=progress)
     own = _rows(found, slice(len(splats)))
     share = np.float32(len(seeing) / len(cameras))  # the mean is over the images of all cameras
     for values in (own.position_hessian, own.shape_hessian, own.color_weight, own.prior):
@@ -155,21 +142,15 @@ def _rows(sensitivity: Sensitivity, rows: slice) -> Sensitivity:
 # The steps. Every one reads and writes files of the work folder, and the last file that it writes marks it as done. So
 # interrupted work goes on where it was, and steps may run in any process that sees the folder.
 
-Blocks = Callable[[], Iterable[Splats]]
-"""Function that reads the scene from its beginning, some Gaussians at a time."""
-
-CHUNK = 400_000
-"""Largest number of Gaussians in a chunk, but for the scatter of estimated medians."""
+Blocks = Callable[[], Iterable[Splats]]  # function that reads the scene from its beginning, some Gaussians at a time
+CHUNK = 400_000  # largest number of Gaussians in a chunk, but for the scatter of estimated medians
 
 LEAF, MOST_ENTRIES = 32_768, 4096
 """Largest number of Gaussians in a leaf; and about that of leaves times levels, because the manifest takes about 105
 bytes for each level of each leaf, before the first image: large scenes have larger leaves."""
 
-UNEVEN = 1.1
-"""Ratio of the largest to the mean size of chunks: their cuts are medians of a sample."""
-
-COARSEST = 50_000
-"""Largest number of Gaussians in the coarsest level, which with the manifest makes a viewer's first image."""
+UNEVEN = 1.1  # ratio of the largest to the mean size of chunks: their cuts are medians of a sample
+COARSEST = 50_000  # Gaussians at most in the coarsest level, which with the manifest makes the first image
 
 
 def partition(
@@ -264,9 +245,8 @@ def make_levels(work: Path, layout: Layout, chunk: int, threads: int, progress: 
 
 def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: int) -> None:
     """Choose the cameras that sensitivity is measured with, and write them to a file."""
-    coarsest = concatenate(
-        [_read_level(work, layout, layout.levels - 1, layout.filled), read_environment(work, layout)]
-    )
+    level = _read_level(work, layout, layout.levels - 1, layout.filled)
+    coarsest = concatenate([level, read_environment(work, layout)])
     total = sum(layout.counts) + layout.environment
     least = min(MOST_VIEWS, VIEWS_PER_CHUNK * len(layout.filled))
     views = settings.sensitivity_views or max(default_view_count(total), least)
@@ -296,15 +276,9 @@ def make_file(
             sensitivity = measure_file(splats, others, cameras, file.level, settings, threads, progress)
             del others
         context = Context(threads, progress=progress)
-        plan = plan_encoding(
-            splats,
-            settings,
-            context,
-            sensitivity=sensitivity,
-            container=MODELS[layout.container],
-            groups=groups,
-            keep_costs=False,
-        )
+        model = MODELS[layout.container]
+        kept: dict[str, Any] = {"groups": groups, "keep_costs": False}
+        plan = plan_encoding(splats, settings, context, sensitivity=sensitivity, container=model, **kept)
         del sensitivity, splats
         encoded = write_files(layout.container, plan, settings, context)
         write_container(encoded.files, work / OUT / layout.path(file.name), overwrite=True)
@@ -332,19 +306,12 @@ def coarse_note(work: Path, layout: Layout) -> str:
     return note.removesuffix(f": {STREAMED_REMEDY}") if layout.container == "sog" else note
 
 
-def environment_count(work: Path) -> int:
-    """Return the number of Gaussians in the file of the environment."""
-    return sum(read_counts(work, ENVIRONMENT)["counts"])
-
-
 def read_environment(work: Path, layout: Layout) -> Splats:
-    """Return the Gaussians of the environment."""
     rows = read_rows(environment_file(work), layout.sh_degree, layout.environment)
     return from_rows(rows, antialiased=layout.antialiased)
 
 
 def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -> Splats:
-    """Return the Gaussians of a level of some chunks."""
     rows = [
         read_rows(level_file(work, chunk, level), layout.sh_degree, sum(read_leaves(work, chunk)["counts"][level]))
         for chunk in chunks

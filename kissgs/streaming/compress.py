@@ -26,6 +26,7 @@ from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_l
 from kissgs.runners import Resources, Runner, WorkItem, error_of
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.streaming import build
+from kissgs.streaming import work_folder as scratch
 from kissgs.streaming.build import Blocks
 from kissgs.streaming.layout import (
     CAMERAS,
@@ -35,22 +36,13 @@ from kissgs.streaming.layout import (
     Layout,
     keep_layout,
     leaves_file,
+    read_counts,
     read_layout,
     rows_file,
     work_folder,
     write_json,
 )
 from kissgs.streaming.levels import row_bytes
-from kissgs.streaming.work_folder import (
-    check_destination,
-    check_space,
-    claimed,
-    finish,
-    megabytes,
-    needed_bytes,
-    read_json,
-    remove,
-)
 
 # ``with_time_left``: progress events of the work items of a streamed scene, with an estimate of the time left.
 
@@ -61,8 +53,7 @@ SHARES = {
 """Share of each stage in the CPU seconds of a million Gaussians of degree 3, without and with rate-distortion planning,
 that is, with the presets ``fast`` and ``balanced``."""
 
-LEAST_SECONDS = 5.0
-"""Time after which the pace of the work is known well enough."""
+LEAST_SECONDS = 5.0  # time after which the pace of the work is known well enough
 
 
 def with_time_left(progress: Progress, rate_distortion: bool) -> Progress:
@@ -95,8 +86,7 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-REPORT = "report.json"
-"""File of the work folder: the report, once everything is made."""
+REPORT = "report.json"  # file of the work folder: the report, once everything is made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,14 +166,14 @@ def compress_streamed(
         manifest = manifest.parent.resolve() / manifest.name
     container, work = MANIFESTS[manifest.name], work_folder(manifest)
     _check_settings(settings)
-    if read_json(work / REPORT) is None:
-        check_destination(manifest, source, overwrite=overwrite)
-    with claimed(work, {"container": container, **_identity(source, settings, reading)}):
-        if (found := read_json(work / REPORT)) is None:
+    if scratch.read_json(work / REPORT) is None:
+        scratch.check_destination(manifest, source, overwrite=overwrite)
+    with scratch.claimed(work, {"container": container, **_identity(source, settings, reading)}):
+        if (found := scratch.read_json(work / REPORT)) is None:
             layout = _partition(work, source, container, settings, reading, threads, progress)
             found = asdict(_make(work, layout, settings, runner, threads, progress))
             write_json(work / REPORT, found)
-        finish(work, manifest, source, overwrite=overwrite)
+        scratch.finish(work, manifest, source, overwrite=overwrite)
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
 
 
@@ -224,14 +214,9 @@ def _make(
 # Work items: the levels of a chunk ("chunk"), or a container of the result ("file"). Those of a step do not depend on
 # each other. One that is run twice, because its node was given up, writes the same bytes again.
 
-PROCESS_BYTES = 500_000_000
-"""Memory of an item for libraries, bytes."""
-
-MEMORY_RATIO = 5
-"""Memory of an item for each byte of the Gaussians of its file as float32."""
-
-POLL_SECONDS = 0.5
-"""Seconds between reports of progress, which may also stop the work."""
+PROCESS_BYTES = 500_000_000  # memory of an item for libraries, bytes
+MEMORY_RATIO = 5  # memory of an item for each byte of the Gaussians of its file as float32
+POLL_SECONDS = 0.5  # seconds between reports of progress, which may also stop the work
 
 
 def _is_made(item: dict[str, Any]) -> bool:
@@ -245,7 +230,7 @@ def run_item(item: dict[str, Any], progress: Progress) -> dict[str, Any]:
     A node that was given up may still be at work: what it completes meanwhile, it takes the input of.
     """
     work, threads = Path(item["work"]), item["threads"]
-    if read_json(work / PARTITION) is None:
+    if scratch.read_json(work / PARTITION) is None:
         raise UnsupportedError(
             f"the machine {socket.gethostname()} does not see {work}; "
             "--ray needs storage that all machines see at the same path"
@@ -345,17 +330,21 @@ def _partition(
     progress: Progress,
 ) -> Layout:
     """Partition the scene, unless that has been done."""
-    if read_json(work / PARTITION) is not None:
+    announced = "{} takes up to {} until the work is done"  # the size of the work folder
+    if scratch.read_json(work / PARTITION) is not None:
         layout = read_layout(work)
-        _announce(work, needed_bytes(layout.source_count, layout.sh_degree), progress)
+        needed = scratch.needed_bytes(layout.source_count, layout.sh_degree)
+        progress("scratch", 1.0, announced.format(work, scratch.megabytes(needed)))
         return layout
     encode, before = settings.encode, _identity(source, settings, reading)
     try:
         (work / OUT).mkdir(exist_ok=True)
         blocks, count, sh_degree = _reader(source, reading, threads)
-        needed = needed_bytes(count, sh_degree)
-        check_space(work, needed)  # later, files are deleted as others are written, so that the folder hardly grows
-        _announce(work, needed, progress)
+        needed = scratch.needed_bytes(count, sh_degree)
+        scratch.check_space(
+            work, needed
+        )  # later, files are deleted as others are written, so that the folder hardly grows
+        progress("scratch", 1.0, announced.format(work, scratch.megabytes(needed)))
         stages = with_time_left(progress, encode.rate_distortion)
         layout = build.partition(work, blocks, count, container, encode, stages)
         if not any(layout.counts):
@@ -363,15 +352,10 @@ def _partition(
         if _identity(source, settings, reading) != before:
             raise InvalidSceneError(f"{source} was changed while it was read; run the same command again")
     except BaseException:
-        remove(work)  # a partition that is not complete is of no use
+        scratch.remove(work)  # a partition that is not complete is of no use
         raise
     keep_layout(work, layout)
     return layout
-
-
-def _announce(work: Path, needed: int, progress: Progress) -> None:
-    """Report the size of the work folder."""
-    progress("scratch", 1.0, f"{work} takes up to {megabytes(needed)} until the work is done")
 
 
 def _report(work: Path, layout: Layout) -> StreamedReport:
@@ -383,9 +367,8 @@ def _report(work: Path, layout: Layout) -> StreamedReport:
         if path.exists():  # files without a visible Gaussian are not written
             sizes[file.level] += stored_bytes(path)
     environment = out / layout.path(ENVIRONMENT)
-    environment_count, environment_bytes = 0, 0
-    if environment.exists():
-        environment_count, environment_bytes = build.environment_count(work), stored_bytes(environment)
+    environment_count = sum(read_counts(work, ENVIRONMENT)["counts"]) if environment.exists() else 0
+    environment_bytes = stored_bytes(environment) if environment.exists() else 0
     pruned = sum(layout.counts) + layout.environment - document["counts"][0] - environment_count
     return StreamedReport(
         source_count=layout.source_count,

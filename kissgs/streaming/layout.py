@@ -12,14 +12,9 @@ from kissgs.formats import MANIFESTS, ContainerName
 from kissgs.io.containers import META_NAME
 from kissgs.io.files import atomic_file
 
-CONTEXT = 280_000
-"""Largest number of Gaussians of the level that stands for other chunks where sensitivity is measured."""
-
-PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"
-"""Names in the work folder: the marker of the partition, the cameras, and the folder of the result."""
-
-ENVIRONMENT = "environment"
-"""Name of the environment's container."""
+CONTEXT = 280_000  # largest number of Gaussians of the level that stands for other chunks where sensitivity is measured
+PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"  # the partition's marker; cameras; the result
+ENVIRONMENT = "environment"  # name of the environment's container
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +50,6 @@ class Layout:
 
     @property
     def manifest(self) -> str:
-        """File name of the manifest."""
         return next(name for name, container in MANIFESTS.items() if container == self.container)
 
     @property
@@ -100,7 +94,6 @@ def continuation(work: Path) -> str:
 
 
 def read_layout(work: Path) -> Layout:
-    """Return the layout of a scene that is partitioned."""
     found = json.loads((work / PARTITION).read_bytes())
     return Layout(**{**found, **{name: tuple(found[name]) for name in ("counts", "notes", "origin")}})
 
@@ -121,12 +114,10 @@ def chunk_file(work: Path, chunk: int) -> Path:
 
 
 def environment_file(work: Path) -> Path:
-    """Return the file of the Gaussians of the environment."""
     return work / "environment.f32"
 
 
 def level_file(work: Path, chunk: int, level: int) -> Path:
-    """Return the file of the Gaussians of one level of a chunk."""
     return work / f"chunk_{chunk}_level_{level}.f32"
 
 
@@ -146,6 +137,5 @@ def read_counts(work: Path, name: str) -> dict[str, Any]:
 
 
 def write_json(path: Path, values: object) -> None:
-    """Write JSON atomically."""
     with atomic_file(path, overwrite=True) as file:
         file.write(json.dumps(values, separators=(",", ":")).encode())

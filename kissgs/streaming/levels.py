@@ -26,16 +26,13 @@ from kissgs.rendering.rasterizer import render
 
 
 def row_bytes(sh_degree: int) -> int:
-    """Return the bytes of one Gaussian."""
     return 4 * (14 + 3 * SH_REST_COUNTS[sh_degree])
 
 
 def to_rows(splats: Splats) -> Float32[np.ndarray, "N F"]:
     """Return all numbers of each Gaussian in a row."""
-    rest = splats.shN.reshape(len(splats), 3 * splats.shN.shape[1])
-    return np.concatenate(
-        [splats.means, splats.quats, splats.scales, splats.opacities[:, None], splats.sh0, rest], axis=1
-    )
+    rest, logits = splats.shN.reshape(len(splats), 3 * splats.shN.shape[1]), splats.opacities[:, None]
+    return np.concatenate([splats.means, splats.quats, splats.scales, logits, splats.sh0, rest], axis=1)
 
 
 def from_rows(rows: Float32[np.ndarray, "N F"], *, antialiased: bool) -> Splats:
@@ -44,18 +41,11 @@ def from_rows(rows: Float32[np.ndarray, "N F"], *, antialiased: bool) -> Splats:
     means, quats, scales, opacities, sh0, rest = parts
     shN = rest.reshape(len(rows), rest.shape[1] // 3, 3)
     return Splats(
-        means=means,
-        quats=quats,
-        scales=scales,
-        opacities=opacities[:, 0],
-        sh0=sh0,
-        shN=shN,
-        antialiased=antialiased,
+        means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh0=sh0, shN=shN, antialiased=antialiased
     )
 
 
 def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
-    """Append rows to a file."""
     with _explained("write", path), path.open("ab") as file:
         file.write(np.ascontiguousarray(rows).data)
 
@@ -73,7 +63,6 @@ def sync(path: Path) -> None:
 
 
 def read_rows(path: Path, sh_degree: int, count: int) -> Float32[np.ndarray, "N F"]:
-    """Read a file of ``count`` rows."""
     with _explained("read", path):
         values, size = np.fromfile(path, np.float32), path.stat().st_size
     if size != count * row_bytes(sh_degree):
@@ -110,17 +99,13 @@ def leaf_groups(
 #
 # The leaf is drawn alone. Other Gaussians in front of it could only hide differences.
 
-SIZE = 128
-"""Width and height of the images, pixels; the leaf fills them."""
+SIZE = 128  # width and height of the images, pixels; the leaf fills them
 
 DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
 """Directions from which a leaf is seen."""
 
-DISTANCE = 4.0
-"""Distance of the cameras, in radii of the leaf."""
-
-INSIDE = 0.9
-"""Share of a leaf's Gaussians within its radius: a few may be far away."""
+DISTANCE = 4.0  # distance of the cameras, in radii of the leaf
+INSIDE = 0.9  # share of a leaf's Gaussians within its radius: a few may be far away
 
 BACKGROUND = (0.5, 0.5, 0.5)
 
@@ -139,9 +124,11 @@ def level_errors(levels: Sequence[Splats]) -> list[float]:
 
 
 def _cameras(leaf: Splats) -> list[Camera]:
+    """Return cameras around the ball around the centre that holds most of the leaf, or its median Gaussian."""
     means = leaf.means.astype(np.float64)
     centre = np.median(means, axis=0)
-    radius = _radius(means - centre, leaf)
+    size = float(np.exp(np.median(leaf.scales.max(axis=1).astype(np.float64))))
+    radius = max(float(np.quantile(np.linalg.norm(means - centre, axis=1), INSIDE)), 2 * size)
     fov, up = 2 * np.arctan(1 / DISTANCE), np.array([0.1, 1.0, 0.2])
     return [
         look_at(centre + DISTANCE * radius * direction, centre, up, fov=fov, width=SIZE, height=SIZE)
@@ -149,16 +136,9 @@ def _cameras(leaf: Splats) -> list[Camera]:
     ]
 
 
-def _radius(offsets: Float64[np.ndarray, "N 3"], leaf: Splats) -> float:
-    """Return the radius of the ball around the centre that holds most of the leaf, or its median Gaussian."""
-    size = float(np.exp(np.median(leaf.scales.max(axis=1).astype(np.float64))))
-    return max(float(np.quantile(np.linalg.norm(offsets, axis=1), INSIDE)), 2 * size)
-
-
 # Levels of detail of one chunk: each leaf merged to half its Gaussians, again and again.
 
-MERGING = 0.7
-"""Share of merging in the time for the levels of a chunk; the rest measures their errors."""
+MERGING = 0.7  # share of merging in the time for the levels of a chunk; the rest measures their errors
 
 
 def chunk_levels(
@@ -169,21 +149,19 @@ def chunk_levels(
     Returned are the levels, and the counts by level, the bounds and the errors of the leaves, as JSON.
     """
     order, edges = leaf_groups(chunk.means, leaf)
+
+    def leaf_levels(at: int) -> list[Splats]:
+        finest = chunk.select(order[edges[at] : edges[at + 1]])
+        counts = [max(1, -(-len(finest) >> level)) for level in range(1, levels)]
+        return [finest, *merged_levels(finest, counts, threads=1)]
+
     with Workers(threads) as pool:
-        leaves = pool.map(
-            lambda at: _leaf_levels(chunk.select(order[edges[at] : edges[at + 1]]), levels),
-            range(len(edges) - 1),
-            lambda fraction: progress("merge", MERGING * fraction),
-        )
+        numbers = range(len(edges) - 1)
+        leaves = pool.map(leaf_levels, numbers, lambda fraction: progress("merge", MERGING * fraction))
         errors = pool.map(level_errors, leaves, lambda fraction: progress("merge", MERGING + (1 - MERGING) * fraction))
     counts = [[len(own[level]) for own in leaves] for level in range(levels)]
     stated = {"counts": counts, "bounds": [bounds(concatenate(own)).tolist() for own in leaves], "errors": errors}
     return [concatenate([own[level] for own in leaves]) for level in range(levels)], stated
-
-
-def _leaf_levels(leaf: Splats, levels: int) -> list[Splats]:
-    counts = [max(1, -(-len(leaf) >> level)) for level in range(1, levels)]
-    return [leaf, *merged_levels(leaf, counts, threads=1)]
 
 
 def bounds(splats: Splats) -> Float64[np.ndarray, "2 3"]:
@@ -200,17 +178,10 @@ def bounds(splats: Splats) -> Float64[np.ndarray, "2 3"]:
 # They look alike from everywhere in the scene, so no distance says which of their levels to draw; and they would widen
 # the boxes of the leaves that they are in.
 
-FAR = 8.0
-"""Distance from which Gaussians belong to the environment, in units of their median distance from the centre."""
-
-FEWEST, MOST = 1_000, 65_536
-"""Least and largest number of Gaussians in an environment. Viewers draw it always and whole, so it must be small."""
-
-LARGEST_SHARE = 0.3
-"""Largest share of a scene in its environment."""
-
-ONE_SIDED = 0.7
-"""Length of the mean direction of Gaussians from which they do not surround the scene. Half a sphere has 0.5."""
+FAR = 8.0  # distance from which Gaussians belong to the environment, in units of their median distance from the centre
+FEWEST, MOST = 1_000, 65_536  # Gaussians of an environment, which viewers draw always and whole
+LARGEST_SHARE = 0.3  # largest share of a scene in its environment
+ONE_SIDED = 0.7  # length of the mean direction from which Gaussians do not surround the scene: half a sphere has 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,9 +198,8 @@ class Environment:
         if not len(positions):
             return none
         points = positions.astype(np.float64)
-        found = cls(
-            center := np.median(points, axis=0), FAR * float(np.median(np.linalg.norm(points - center, axis=1)))
-        )
+        center = np.median(points, axis=0)
+        found = cls(center, FAR * float(np.median(np.linalg.norm(points - center, axis=1))))
         far = points[found.contains(positions)] - center
         estimate = len(far) / len(points) * count
         if found.radius <= 0 or not FEWEST <= estimate <= min(MOST, LARGEST_SHARE * count):
@@ -238,5 +208,4 @@ class Environment:
         return found if np.linalg.norm(directions.mean(axis=0)) < ONE_SIDED else none
 
     def contains(self, means: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Return whether each position belongs to the environment."""
         return np.linalg.norm(means.astype(np.float64) - self.center, axis=1) > self.radius

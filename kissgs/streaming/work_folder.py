@@ -21,14 +21,9 @@ from kissgs.streaming.build import CHUNK
 from kissgs.streaming.layout import OUT, continuation, write_json
 from kissgs.streaming.levels import row_bytes
 
-WORK, LOCK = "work.json", "lock"
-"""Files: which work the folder belongs to; locked by the process that works in it."""
-
-TEMPORARY = ".kissgs."
-"""Beginning of the names of files that are being written."""
-
-ENCODED_BYTES = 30
-"""Upper estimate of the encoded bytes of a Gaussian with all its levels."""
+WORK, LOCK = "work.json", "lock"  # files: which work the folder belongs to; locked by the process that works in it
+TEMPORARY = ".kissgs."  # beginning of the names of files that are being written
+ENCODED_BYTES = 30  # upper estimate of the encoded bytes of a Gaussian with all its levels
 
 
 def check_destination(manifest: Path, source: Path, *, overwrite: bool) -> None:

@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 
-MAX_CLOCK_LEAD_SECONDS = 2 * 86400.0
-"""Largest lead of a recorded time over this clock that is trusted; a larger one was written with a wrong clock."""
+MAX_CLOCK_LEAD_SECONDS = 2 * 86400.0  # of a recorded time over this clock; beyond it, its clock was wrong
 
 
 def ticks() -> float:

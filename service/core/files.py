@@ -9,8 +9,7 @@ from typing import Any, Literal
 import kissgs
 from kissgs.formats import UPLOADS
 
-Format = Literal["sogxt", "sog"]
-"""Names of the library's containers."""
+Format = Literal["sogxt", "sog"]  # names of the library's containers
 
 DEFAULT: Format = "sogxt"
 
@@ -46,11 +45,8 @@ def container_file(options: dict[str, Any]) -> ContainerFile:
     return CONTAINER_FILES[options.get("format", DEFAULT)]
 
 
-BYTES_PER_GAUSSIAN = (68, 104, 164, 248)
-"""Bytes per Gaussian of a ``.ply``, by SH degree."""
-
-STEPS_BYTES = 300_000
-"""Upper bound for a checkpoint's record of completed steps, at the largest step count that the settings allow."""
+BYTES_PER_GAUSSIAN = (68, 104, 164, 248)  # bytes per Gaussian of a .ply, by SH degree
+STEPS_BYTES = 300_000  # upper bound of a checkpoint's record of steps, at the largest count that settings allow
 
 FINETUNE_BYTES, ENTRY_BYTES, MAX_ENTRIES = 12 * 14, 12 * 45, 1 << 16
 """Fine-tuning state in bytes per Gaussian and per codebook entry, and the approximate maximum number of entries."""

@@ -8,11 +8,8 @@ from typing import Any
 from sqlalchemy import JSON, BigInteger, Float, ForeignKey, Index, Integer, String, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 4
-"""Version of the tables below and of the results in them. A database of another version is refused, not misread."""
-
-NOTE_CHARS = 200
-"""Maximum length of a progress note; longer notes are truncated."""
+SCHEMA_VERSION = 4  # of the tables and the results in them; a database of another version is refused
+NOTE_CHARS = 200  # maximum length of a progress note; longer notes are truncated
 
 
 class State(StrEnum):

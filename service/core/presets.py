@@ -12,8 +12,7 @@ from .schemas import COMPACTED, FINETUNED, SEARCHED, PresetFacts, Presets
 MEASURED_ON = "fox, 79,451 Gaussians of SH degree 3, seven held-out photographs"
 MEASURED_BY = "kissgs compress fox.ply, kissgs evaluate fox.ply fox.zip --views fox"
 
-EVALUATION = 60.0
-"""Approximate CPU seconds per million Gaussians to decode, select 24 cameras, and render two small images from each."""
+EVALUATION = 60.0  # CPU seconds per million Gaussians, about: to decode, choose 24 cameras, render twice from each
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,13 +20,15 @@ class _Facts:
     """Texts and figures of a preset, and approximate CPU seconds: a fixed part, and a part per million Gaussians."""
 
     title: str
-    text: str
+    description: str
     bytes_per_gaussian: float
     psnr_change: float
-    encoding: float  # per million Gaussians
+    cpu_seconds_per_million: float  # of encoding
     training: tuple[float, float]  # of a compaction to one fifth
     tuning: tuple[float, float]  # of all Gaussians
 
+
+_STATED = ("title", "description", "bytes_per_gaussian", "psnr_change", "cpu_seconds_per_million")
 
 _FACTS: dict[kissgs.Preset, _Facts] = {
     kissgs.Preset.FAST: _Facts(
@@ -52,29 +53,18 @@ def presets() -> Presets:
         presets=[
             PresetFacts(
                 name=name,
-                title=facts.title,
-                description=facts.text,
                 settings=kissgs.Settings(preset=name).model_dump(mode="json"),
-                bytes_per_gaussian=facts.bytes_per_gaussian,
-                psnr_change=facts.psnr_change,
-                cpu_seconds_per_million=facts.encoding,
+                **{each: getattr(facts, each) for each in _STATED},
             )
             for name, facts in _FACTS.items()
         ],
     )
 
 
-START_SECONDS = 1.0
-"""Fixed seconds of every job, to start a process and import the library."""
-
-BUSY_CORES = 1.8
-"""Average number of busy cores on a two-core server."""
-
-SEARCH_FACTOR = 4.0
-"""Factor on the total time of a job that searches for a goal, which encodes several times."""
-
-TUNED_CONTAINERS = 2.0
-"""Containers that a search for the number of Gaussians fine-tunes."""
+START_SECONDS = 1.0  # fixed seconds of every job, to start a process and import the library
+BUSY_CORES = 1.8  # average number of busy cores on a two-core server
+SEARCH_FACTOR = 4.0  # factor on the total time of a job that searches for a goal, which encodes several times
+TUNED_CONTAINERS = 2.0  # containers that a search for the number of Gaussians fine-tunes
 
 
 def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
@@ -84,7 +74,7 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     """
     name, *stages = kind.split("+")
     facts, millions = _FACTS[kissgs.Preset(name)], gaussians / 1e6
-    encoding = (facts.encoding + evaluate * EVALUATION) * millions
+    encoding = (facts.cpu_seconds_per_million + evaluate * EVALUATION) * millions
     compacts, tunes, searches = (suffix.removeprefix("+") in stages for suffix in (COMPACTED, FINETUNED, SEARCHED))
     training, tuning = (fixed + per_million * millions for fixed, per_million in (facts.training, facts.tuning))
     if compacts and tunes and searches:
@@ -93,8 +83,7 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     return START_SECONDS + cpu * (SEARCH_FACTOR if searches else 1.0) / BUSY_CORES
 
 
-LONGEST_FINETUNING = 2.0
-"""Largest factor on the time of a job that fine-tunes with a time limit: up to twice the usual number of steps."""
+LONGEST_FINETUNING = 2.0  # factor on the time of a job that fine-tunes with a time limit: up to twice the steps
 
 
 def limited_seconds(kind: str, evaluate: bool, gaussians: int, unlimited: float, limit: float) -> float:

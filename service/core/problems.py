@@ -110,7 +110,6 @@ class ProblemError(Exception):
 
 
 def problem(code: str, detail: str, *, errors: list[dict[str, Any]] | None = None) -> Problem:
-    """Build the document of one problem."""
     kind = PROBLEM_TYPES[code]
     return Problem(
         type=f"/v1/problems/{code}",
@@ -124,12 +123,10 @@ def problem(code: str, detail: str, *, errors: list[dict[str, Any]] | None = Non
 
 
 def invalid(detail: str) -> ProblemError:
-    """Return the problem of an invalid request."""
     return ProblemError("invalid-request", detail)
 
 
 def disk_full(detail: str) -> ProblemError:
-    """Return the problem of a full disk."""
     return ProblemError("disk-full", detail, retry_after=600)
 
 

@@ -16,8 +16,7 @@ from .problems import Problem
 COMPACTED = "+compact"
 FINETUNED = "+finetune"
 SEARCHED = "+search"
-TIMED = "+time"
-"""Suffixes of the preset's name in :attr:`JobOptions.kind`."""
+TIMED = "+time"  # suffixes of the preset's name in kind
 
 
 class JobOptions(kissgs.Settings):

@@ -14,22 +14,17 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 PREFIX = "KISSGS_"
 
-CLIENT_NAMES = {"KISSGS_SERVER", "KISSGS_KEY"}
-"""Variables of `kissgs remote`, which are accepted because the same shell may run both."""
+CLIENT_NAMES = {"KISSGS_SERVER", "KISSGS_KEY"}  # of `kissgs remote`: the same shell may run both
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
-OWNER = r"[A-Za-z0-9._@-]{1,64}"
-"""Valid names of key owners."""
+OWNER = r"[A-Za-z0-9._@-]{1,64}"  # valid names of key owners
 
 Seconds = Annotated[float, Field(gt=0, le=10 * 365 * 86400)]
 
 
-Words = Annotated[
-    tuple[str, ...],
-    BeforeValidator(lambda value: _words(value.lower()) if isinstance(value, str) else value),
-]
-"""Words of a text, in lower case, as browsers send them."""
+_LOWER = BeforeValidator(lambda value: _words(value.lower()) if isinstance(value, str) else value)
+Words = Annotated[tuple[str, ...], _LOWER]  # of a text, in lower case, as browsers send them
 
 
 class SettingsError(Exception):

@@ -29,10 +29,9 @@ from ..core.settings import ServiceSettings, SettingsError
 from ..jobs.admission import Admission
 from ..jobs.container import ServiceContainer
 from ..jobs.decoding import Decoder
-from ..jobs.expiry import ExpiryTask
 from ..jobs.process import JobRunners
-from ..jobs.recovery import recover
 from ..jobs.status import EventStream, QueueEstimator
+from ..jobs.upkeep import ExpiryTask, recover
 from ..jobs.worker import JobCompletion, Worker
 from ..storage.database import error_text, is_full
 from ..storage.job_files import JobStorage
@@ -174,7 +173,10 @@ def _answer_errors(app: FastAPI) -> None:
                 text = f"{request.scope['path'][:200]} does not exist; /openapi.json lists all paths"
                 return answer(ProblemError("not-found", text))
             case HTTPStatus.METHOD_NOT_ALLOWED:
-                allowed = _allowed(request.scope["path"])
+                # Of all routes with this path: FastAPI names the methods of the first one.
+                routes = [route for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)]
+                fitting = [r.methods or set() for r in routes if r.path_regex.match(request.scope["path"])]
+                allowed = ", ".join(sorted(set().union(*fitting))) or "GET, HEAD"
                 text = f"{request.method[:20]} is not allowed for this path; use {allowed}"
                 return answer(ProblemError("method-not-allowed", text, headers={"Allow": allowed}))
             case _:
@@ -190,13 +192,6 @@ def _answer_errors(app: FastAPI) -> None:
         if is_full(error):
             return answer(disk_full("the server's disk is full; try again later"))
         return answer(unusable_database())
-
-
-def _allowed(path: str) -> str:
-    """List the methods of all routes with this path; FastAPI lists only those of the first route."""
-    routes = [route for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)]
-    fitting = [route.methods or set() for route in routes if route.path_regex.match(path)]
-    return ", ".join(sorted(set().union(*fitting))) or "GET, HEAD"
 
 
 def _describe(app: FastAPI, *, keys_required: bool) -> None:

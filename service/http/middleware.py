@@ -41,7 +41,6 @@ class RequestMiddleware:
         self._app, self._metrics, self._settings = app, metrics, settings
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -56,7 +55,10 @@ class RequestMiddleware:
             if message["type"] == "http.response.start":
                 status = message["status"]
                 self._metrics.latency.labels(_route(scope)).observe(time.perf_counter() - begun)
-                _mark(MutableHeaders(scope=message), request_id)
+                answered = MutableHeaders(scope=message)
+                answered["X-Request-ID"] = request_id
+                answered.update(SECURITY_HEADERS)
+                answered.setdefault("Content-Security-Policy", PAGE_POLICY)  # the preview page has its own
             await send(message)
 
         try:
@@ -80,7 +82,8 @@ class RequestMiddleware:
         Requests without an ``Origin`` header do not come from a page of another site.
         """
         host = headers.get("host", "")
-        if not self._is_ours(host):
+        name = host.rpartition(":")[0] if re.search(r":[0-9]*$", host) else host
+        if not self._settings.answers_to(name.strip("[]").lower()):
             text = f"the host name {host[:100]!r} is not accepted; the operator can add it to KISSGS_NAMES"
             return ProblemError("foreign", text)
         origin = headers.get("origin")
@@ -91,10 +94,6 @@ class RequestMiddleware:
         text = f"pages of {origin[:100]!r} may not use this service; the operator can add it to KISSGS_CORS_ORIGINS"
         return ProblemError("foreign", text)
 
-    def _is_ours(self, host: str) -> bool:
-        name = host.rpartition(":")[0] if re.search(r":[0-9]*$", host) else host
-        return self._settings.answers_to(name.strip("[]").lower())
-
 
 def _site(origin: str) -> str | None:
     """Return host and port of an origin in lower case; None if it has none or is malformed."""
@@ -102,12 +101,6 @@ def _site(origin: str) -> str | None:
         return urlsplit(origin).netloc.lower() or None
     except ValueError:  # brackets without a valid IPv6 address
         return None
-
-
-def _mark(headers: MutableHeaders, request_id: str) -> None:
-    headers["X-Request-ID"] = request_id
-    headers.update(SECURITY_HEADERS)
-    headers.setdefault("Content-Security-Policy", PAGE_POLICY)  # the preview page has its own
 
 
 def _route(scope: Scope) -> str:

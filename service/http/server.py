@@ -30,34 +30,23 @@ HEADER_SECONDS = 20.0
 """Timeout for the headers of a request, and for the remaining body of a refused request, whose client is still to
 receive the response."""
 
-READ_SECONDS = 60.0
-"""Timeout for a client to receive any bytes of a pending response."""
-
-MAX_HEADER_BYTES = 64 << 10
-"""Maximum bytes of the headers of a request."""
-
-READ_BYTES = 32 << 10
-"""Maximum bytes per read from a connection."""
-
-PARSE_SECONDS_PER_BYTE = 2e-7
-"""Allowed CPU seconds per received byte. A normal body needs a hundredth; one in chunks of single bytes, tenfold."""
-
-MAX_PARSE_DEBT_SECONDS = 0.1
-"""CPU seconds beyond the allowance after which a connection is closed."""
+READ_SECONDS = 60.0  # timeout for a client to receive any bytes of a pending response
+MAX_HEADER_BYTES = 64 << 10  # maximum bytes of the headers of a request
+READ_BYTES = 32 << 10  # maximum bytes per read from a connection
+PARSE_SECONDS_PER_BYTE = 2e-7  # CPU time allowed; a normal body needs a hundredth, chunks of one byte tenfold
+MAX_PARSE_DEBT_SECONDS = 0.1  # CPU seconds beyond the allowance after which a connection is closed
 
 MAX_CONNECTIONS = 1000
 """Maximum number of connections. Beyond it, the address with the most loses one, so that no address, by event streams
 or slow requests, shuts out the others; a proxy, whose address is that of all clients, may still have all."""
 
-OTHER_DESCRIPTORS = 256
-"""File descriptors reserved for other uses than connections: uploads, downloads, the database, jobs."""
+OTHER_DESCRIPTORS = 256  # file descriptors reserved for uploads, downloads, the database, jobs
 
 
 class StrictConnection(h11.Connection):
     """h11 that refuses requests whose end other programs may see elsewhere, and take the rest for a request."""
 
     def next_event(self) -> h11.Event | type[h11.NEED_DATA] | type[h11.PAUSED]:
-        """Return the next event."""
         event = super().next_event()
         if isinstance(event, h11.Request):
             names = {name for name, _ in event.headers}
@@ -152,7 +141,6 @@ class TimeoutProtocol(H11Protocol):
         self.transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Cancel the timers of the connection."""
         for timer in (self._listening, self._watching):
             if timer is not None:
                 timer.cancel()
@@ -170,7 +158,6 @@ def allow_connections() -> None:
 
 
 def listen(settings: ServiceSettings) -> socket.socket:
-    """Open the listening socket."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
         listener = socket.create_server((settings.host, settings.port), family=family, backlog=2048)
@@ -214,7 +201,6 @@ class Server(uvicorn.Server):
 
 
 def config_of(app: object) -> uvicorn.Config:
-    """Return the uvicorn configuration for an application."""
     return uvicorn.Config(
         app,  # type: ignore[arg-type]
         http=TimeoutProtocol,

@@ -14,6 +14,8 @@ from anyio.to_thread import run_sync
 from pydantic import ValidationError
 from starlette.requests import Request
 
+from kissgs.formats import UPLOADS
+
 from ..core.files import checkpoint_bytes
 from ..core.models import Job
 from ..core.presets import can_train
@@ -28,12 +30,10 @@ RAW_TYPES = ("", "application/octet-stream", "application/ply", "application/x-p
 FORM_TYPE = "multipart/form-data"
 log = logging.getLogger("kissgs.service")
 
-STOPPING = "stopping"
-"""Subscription that only the closing of the notifier wakes."""
+STOPPING = "stopping"  # subscription that only the closing of the notifier wakes
 
 MAX_OPTIONS_BYTES = 64 << 10
-MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)
-"""Maximum bytes of a form in addition to the scene."""
+MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)  # maximum bytes of a form in addition to the scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +122,8 @@ def address_of(client: tuple[str, int] | None) -> str:
 def _check_headers(request: Request, kind: str) -> None:
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding != "identity":
-        raise ProblemError(
-            "media-type", f"the content encoding {encoding[:40]!r} is not supported; send the scene without it"
-        )
+        text = f"the content encoding {encoding[:40]!r} is not supported; send the scene without it"
+        raise ProblemError("media-type", text)
     if kind != FORM_TYPE and kind not in RAW_TYPES:
         raise ProblemError(
             "media-type",
@@ -153,9 +152,8 @@ async def _form_bytes(context: ServiceContainer, request: Request, spool: Spool)
         yield chunk
         received += len(chunk)
         if received - spool.size > MAX_FORM_BYTES + len(chunk):
-            raise invalid(
-                f"the form has more than {MAX_FORM_BYTES} bytes beside the scene, which is the limit; send less"
-            )
+            beside = f"{MAX_FORM_BYTES} bytes beside the scene"
+            raise invalid(f"the form has more than {beside}, which is the limit; send less")
 
 
 async def _receive_form(
@@ -214,7 +212,7 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
         idempotency_key=submission.key,
     )
     try:
-        context.storage.adopt(received.path, job.id, received.file_name)
+        context.storage.adopt(received.path, job.id, f"scene{UPLOADS[received.info.format]}")
         return context.admission.add(job), True
     except BaseException as error:
         context.storage.remove_job(job.id)

@@ -28,8 +28,7 @@ from ..jobs.admission import Admission
 
 MAX_PART_HEADER_BYTES = 8192
 
-MAX_PREAMBLE_BYTES = 8192
-"""Maximum bytes before the first boundary, where RFC 2046 allows text, which is ignored."""
+MAX_PREAMBLE_BYTES = 8192  # maximum bytes before the first boundary, where RFC 2046 allows text, which is ignored
 
 
 _PARAMETER = re.compile(rb';[ \t]*([^\s;="]+)[ \t]*=[ \t]*("(?:[^"\\]|\\.)*"|[^;"]*)')
@@ -163,27 +162,20 @@ async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterato
         raise invalid("the form ends before its last boundary; send it again")
 
 
-BLOCK_BYTES = 1 << 20
-"""Bytes per write. Each write is one call to a thread; memory holds one or two blocks per upload."""
-
-LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")
-"""Last line of a header, matched as a whole because a comment may end with ``end_header``."""
-
-HEAD_BYTES = 512
-"""Bytes from which a format is recognised."""
+BLOCK_BYTES = 1 << 20  # bytes per write. Each write is one call to a thread; memory holds one or two blocks per upload.
+LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")  # of a header; a comment may end with end_header, too
+HEAD_BYTES = 512  # bytes from which a format is recognised
 
 GAUSSIANS_PER_BYTE = 2
 """Largest number of Gaussians per byte of an upload. Real files have up to 0.12 (``fast``), and 0.23 at the lowest
 quality; a position alone takes more than 4 bits. Images of equal pixels hold millions in 4 kB, which keep a worker for
 hours: all of them cover the same pixels, and each takes 2 ms. No setting, because no real file comes near it."""
 
-FREE_GAUSSIANS = 1 << 16
-"""Number of Gaussians that an upload of any size may have."""
+FREE_GAUSSIANS = 1 << 16  # number of Gaussians that an upload of any size may have
 
 CLOSE = {"Connection": "close"}
 
-STEP_BYTES = 16 << 20
-"""Disk space reserved per step as bytes arrive, so that a large Content-Length alone reserves nothing."""
+STEP_BYTES = 16 << 20  # reserved per step as bytes arrive: a large Content-Length alone reserves nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,11 +186,6 @@ class Received:
     size: int
     sha256: str
     info: kissgs.SceneInfo
-
-    @property
-    def file_name(self) -> str:
-        """Name of the upload in the folder of its job."""
-        return f"scene{UPLOADS[self.info.format]}"
 
 
 class Spool:
@@ -284,8 +271,7 @@ class Spool:
             yield self._file
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
-            text = f"the upload cannot be written: {reason}; try again later"
-            raise disk_full(text) from error
+            raise disk_full(f"the upload cannot be written: {reason}; try again later") from error
 
     def _read_info(self) -> kissgs.SceneInfo:
         """Read the headers of the complete upload; refuse formats that are not one binary file."""
@@ -293,19 +279,14 @@ class Spool:
         try:
             kind = kissgs.recognise(self._path, name=name)
             if kind not in UPLOADS:
-                raise ProblemError(
-                    "unsupported",
-                    f"the upload is a zip file, but not a .sog; send a {alternatives(tuple(UPLOADS.values()))}",
-                )
-            if kind == "gltf" and not self._is_glb():  # as large as the upload, and would be parsed in this process
-                raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")
+                wanted = alternatives(tuple(UPLOADS.values()))
+                raise ProblemError("unsupported", f"the upload is a zip file, but not a .sog; send a {wanted}")
+            with self._path.open("rb") as file:  # JSON is as large as the upload, and would be parsed in this process
+                if kind == "gltf" and file.read(4) != b"glTF":
+                    raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")
             return kissgs.read_scene_info(self._path, name=name)
         except kissgs.KissgsError as error:
             raise self._named(error) from error
-
-    def _is_glb(self) -> bool:
-        with self._path.open("rb") as file:
-            return file.read(4) == b"glTF"
 
     def _check_header(self) -> None:
         """Validate the header as soon as it has arrived, long before the last byte of an invalid file."""
@@ -388,9 +369,8 @@ async def _next(chunks: AsyncIterator[bytes], stopped: asyncio.Future[Any], idle
             raise ProblemError("upload-timeout", text, headers=CLOSE)
         return coming.result()
     except ClientDisconnect as error:
-        raise ProblemError(
-            "upload-aborted", "the connection closed before the upload was complete; send it again"
-        ) from error
+        text = "the connection closed before the upload was complete; send it again"
+        raise ProblemError("upload-aborted", text) from error
     finally:
         coming.cancel()
 

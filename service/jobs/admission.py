@@ -18,8 +18,7 @@ from ..storage.job_files import JobStorage
 from ..storage.job_records import LimitExceeded, Store
 from .status import QueueEstimator
 
-BUSY_SECONDS = 5.0
-"""``Retry-After`` of refusals because of simultaneous uploads, seconds."""
+BUSY_SECONDS = 5.0  # Retry-After of refusals because of simultaneous uploads, seconds
 
 PARSES_AT_ONCE = 2
 """Uploads whose headers are read at a time, which takes up to 30 MB and half a second each. One hostile upload does not
@@ -58,7 +57,6 @@ class Admission:
 
     @property
     def uploads(self) -> int:
-        """Number of uploads in progress."""
         return self._uploads.total()
 
     @contextlib.contextmanager
@@ -95,7 +93,12 @@ class Admission:
                 oldest = self.store.oldest_reclaimable()
                 if oldest is None:
                     raise self._full(size)
-                self._reclaim(oldest)
+                # Its upload, and its decoded scene, which can be decoded again.
+                self.store.monitor.check_files()
+                for path in self.storage.reclaimable_files(oldest.id):
+                    self.storage.discard(path)
+                left = self.storage.job_bytes(oldest.id)
+                self.store.update(oldest.number, upload_kept=False, reclaimable_bytes=0, disk_bytes=left)
             self._reserved += size
 
     def wrote(self, size: int) -> None:
@@ -109,26 +112,14 @@ class Admission:
             self._reserved -= size
             self._written -= written
 
-    def _reclaim(self, job: Job) -> None:
-        """Remove the upload of an ended job, and its decoded scene, which can be decoded again."""
-        self.store.monitor.check_files()
-        self.storage.reclaim(job.id)
-        left = self.storage.job_bytes(job.id)
-        self.store.update(job.number, upload_kept=False, reclaimable_bytes=0, disk_bytes=left)
-
     def _fits(self, size: int, reclaimable: int = 0) -> bool:
-        taken = self.store.disk_bytes() + self._reserved - reclaimable
-        free = self.storage.free_bytes() - (self._reserved - self._written)
-        return (
-            taken + size <= self.settings.max_disk_bytes and free + reclaimable - size >= self.settings.min_free_bytes
-        )
+        taken = self.store.disk_bytes() + self._reserved - reclaimable + size
+        free = self.storage.free_bytes() - (self._reserved - self._written) + reclaimable - size
+        return taken <= self.settings.max_disk_bytes and free >= self.settings.min_free_bytes
 
     def _full(self, size: int) -> ProblemError:
-        text = (
-            f"the server has no disk space for {size:,} more bytes; try again later, "
-            "or delete jobs that you no longer need"
-        )
-        return disk_full(text)
+        remedy = "try again later, or delete jobs that you no longer need"
+        return disk_full(f"the server has no disk space for {size:,} more bytes; {remedy}")
 
     def _refused(self, limit: str) -> ProblemError:
         seconds = self.queue.current().seconds_to_room()

@@ -25,8 +25,7 @@ from .decoding import Decoder
 from .status import EventStream, QueueEstimator
 from .worker import Worker
 
-READY_SECONDS = 2.0
-"""Age up to which the result of a check is given again: each check writes to the disk, and anybody may ask for one."""
+READY_SECONDS = 2.0  # of a check's result: each check writes to the disk, and anybody may ask for one
 
 
 class Readiness:
@@ -38,7 +37,6 @@ class Readiness:
         self._checked = 0.0
 
     async def health(self, check: Callable[[], Awaitable[Health]]) -> Health:
-        """Return the latest result, or that of a new check."""
         clock = asyncio.get_running_loop().time
         async with self._lock:
             if self._found is None or clock() - self._checked > READY_SECONDS:
@@ -49,8 +47,6 @@ class Readiness:
 
 @dataclass(frozen=True, slots=True)
 class ServiceContainer:
-    """All parts of a running service."""
-
     settings: ServiceSettings
     store: Store
     storage: JobStorage

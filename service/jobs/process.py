@@ -11,43 +11,28 @@ from typing import Any
 
 import kissgs
 from kissgs import runners
-from kissgs.runners import (
-    INTERNAL,
-    MEMORY_LIMIT,
-    NODE_UNUSABLE,
-    NOT_STARTED,
-    TIME_LIMIT,
-    UNREACHABLE,
-    Outcome,
-    Resources,
-    RunHandle,
-    Runner,
-    WorkItem,
-)
+from kissgs.runners import Outcome, Resources, RunHandle, Runner, WorkItem
 
 from ..core.settings import ServiceSettings
 from .job_process import without_paths
 
 log = logging.getLogger("kissgs.service")
 
-COMPRESS, DECODE = "job_process:compress", "job_process:decode"
-"""Functions of this package that tasks name."""
+COMPRESS, DECODE = "job_process:compress", "job_process:decode"  # functions of this package that tasks name
 
 UNUSABLE_NODES = "the machines that run jobs cannot work on this one; try again later"
 UNUSABLE_MACHINE = "the job's files cannot be used on this machine; try again later"
 """Sentences for clients about nodes of a cluster, and about this machine, whose names and faults are in the log."""
 
-OnProgress = Callable[[str, float, str], Awaitable[None]]
-"""Callback with a stage, its completed fraction (0 to 1), and a note, which may be empty."""
+OnProgress = Callable[[str, float, str], Awaitable[None]]  # gets stage, fraction (0 to 1), and a note or ""
 
 
-POSTPONED = (UNREACHABLE, NOT_STARTED)
-"""Codes of "lost" outcomes of jobs that cannot run at the moment; the message, if any, is for the log."""
+POSTPONED = (runners.UNREACHABLE, runners.NOT_STARTED)  # codes of "lost" outcomes of jobs that cannot run at the moment
 
 
 def postponed(reason: str = "") -> Outcome:
     """Return the outcome of a job that cannot run at the moment."""
-    return Outcome("lost", code=NOT_STARTED, message=reason)
+    return Outcome("lost", code=runners.NOT_STARTED, message=reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +48,6 @@ class JobRunners:
 
     @classmethod
     def open(cls, settings: ServiceSettings) -> JobRunners:
-        """Open the runner that the settings name."""
         local = runners.LocalRunner()
         if settings.ray_address is None:
             return cls(settings, local, local)
@@ -79,7 +63,6 @@ class JobRunners:
         self.local.close()
 
     def runner_of(self, task: dict[str, Any]) -> Runner:
-        """Return the runner of a task."""
         return self.local if task["function"] == DECODE else self.runner
 
     def request(self, *, trains: bool = False) -> Resources:
@@ -95,7 +78,8 @@ class JobRunners:
 
         It is not started again when its node is lost: the database counts the starts of jobs.
         """
-        requested = self.request(trains=_trains(task))
+        wanted = kissgs.Settings.model_validate(task.get("settings", {}))
+        requested = self.request(trains=wanted.compact.enabled or bool(wanted.finetune.enabled))
         threads = self.settings.job_threads if self.runner_of(task) is self.local else int(requested.cpus)
         return WorkItem(
             f"{__package__}.{task['function']}",
@@ -107,11 +91,6 @@ class JobRunners:
             files=tuple(task["files"]),
             retries=0,
         )
-
-
-def _trains(task: dict[str, Any]) -> bool:
-    settings = kissgs.Settings.model_validate(task.get("settings", {}))
-    return settings.compact.enabled or bool(settings.finetune.enabled)
 
 
 class JobProcess:
@@ -173,7 +152,7 @@ class JobProcess:
             log.error("a job's process failed: %s\n%s", outcome.message, outcome.log)
         if outcome.kind in ("done", "cancelled") or outcome.code in POSTPONED:
             return outcome
-        if outcome.code == NODE_UNUSABLE:
+        if outcome.code == runners.NODE_UNUSABLE:
             return self._unusable(outcome)
         if outcome.kind == "lost":
             log.warning("a job was lost: %s", outcome.message)
@@ -191,11 +170,11 @@ class JobProcess:
         return Outcome("lost", code="internal", message=UNUSABLE_NODES)
 
     def _detail(self, outcome: Outcome, task: dict[str, Any]) -> str:
-        if outcome.code == TIME_LIMIT:
+        if outcome.code == runners.TIME_LIMIT:
             seconds = self._runner.settings.job_seconds
             return f"the job took longer than {seconds:g} s; choose a faster preset or fewer Gaussians"
-        if outcome.code == MEMORY_LIMIT:
+        if outcome.code == runners.MEMORY_LIMIT:
             return "the job exceeded its memory limit; submit a scene with fewer Gaussians"
-        if outcome.code == INTERNAL:
+        if outcome.code == runners.INTERNAL:
             return "the job failed because of an error in kissgs; please report it with the scene"
         return without_paths(outcome.message, task)

@@ -29,7 +29,6 @@ class QueueEstimator:
         self._latest: Queue | None = None
 
     def current(self) -> Queue:
-        """Return the estimates at this moment."""
         with self._lock:
             changes = self._store.changes  # first, so that a change during the reading is read the next time
             if self._latest is None or changes != self._changes:
@@ -92,32 +91,30 @@ class Queue:
         return min(300.0, max(1.0, min(map(self._remaining, self._running), default=1.0) / self._workers))
 
 
+_OF_JOBS = ("id", "name", "upload_bytes", "gaussians", "sh_degree", "starts", "problem")
 _OF_RESULTS = ("source_format", "compacted", "finetuning", "invisible", "cleaned", "evaluation")
-"""Entries of a result's summary that the status has under the same names."""
+"""Columns of a job, and entries of a result's summary, that the status has under the same names."""
 
 
 def job_status(job: Job, queue: Queue) -> JobStatus:
-    """Return the current status of a job."""
     waits, runs, result = job.state == State.QUEUED, job.state == State.RUNNING, job.result or {}
+    estimate = None
+    if waits or runs:
+        seconds = queue.seconds_left(job)
+        estimate = Estimate(seconds_left=round(seconds, 1), ready_at=as_datetime(queue.now + seconds))
     return JobStatus(
-        id=job.id,
-        name=job.name,
         state=State(job.state),
         position=queue.position(job) if waits else None,
         progress=Progress(stage=job.stage, fraction=job.fraction, note=job.note) if runs and job.stage else None,
-        estimate=_estimate(job, queue) if waits or runs else None,
+        estimate=estimate,
         options=JobOptions.stored(job.options),
-        upload_bytes=job.upload_bytes,
-        gaussians=job.gaussians,
-        sh_degree=job.sh_degree,
         kept=result.get("count"),
         note=result.get("note") or None,
         sizes=_sizes(job),
         timings=_timings(job, queue.now),
-        starts=job.starts,
-        problem=job.problem,
         links=_links(job),
         expires_at=as_datetime(job.expires_at) if job.expires_at is not None else None,
+        **{name: getattr(job, name) for name in _OF_JOBS},
         **{name: result.get(name) for name in _OF_RESULTS},
     )
 
@@ -128,11 +125,6 @@ def _kind_without_limit(job: Job) -> str:
         return job.preset
     open_to_tuning = job.options["finetune"]["enabled"] is None and can_train()
     return job.preset.removesuffix(TIMED) + (FINETUNED if open_to_tuning else "")
-
-
-def _estimate(job: Job, queue: Queue) -> Estimate:
-    seconds = queue.seconds_left(job)
-    return Estimate(seconds_left=round(seconds, 1), ready_at=as_datetime(queue.now + seconds))
 
 
 def _sizes(job: Job) -> Sizes | None:
@@ -176,11 +168,8 @@ def _links(job: Job) -> Links:
     )
 
 
-KEEPALIVE_SECONDS = 15.0
-"""Seconds without an event after which a comment is sent, so that the connection is not taken for dead."""
-
-RETRY_MILLISECONDS = 1000
-"""Delay after which a browser reconnects, milliseconds."""
+KEEPALIVE_SECONDS = 15.0  # without an event; then a comment is sent, so that the connection is not taken for dead
+RETRY_MILLISECONDS = 1000  # delay after which a browser reconnects, milliseconds
 
 
 @dataclass(frozen=True)

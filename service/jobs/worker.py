@@ -192,24 +192,16 @@ def outcome_of(error: Exception) -> Outcome:
     return INTERNAL_ERROR
 
 
-IDLE_SECONDS = 1.0
-"""Seconds after which an idle worker reads the queue even without a notification."""
+IDLE_SECONDS = 1.0  # seconds after which an idle worker reads the queue even without a notification
 
 LOST_SECONDS, MOST_LOST_SECONDS = 5.0, 60.0
 """Pause before a job is started again whose first start was lost, which doubles with every start; the longest one. On a
 bad node that is free, starts fail at once: without pauses, the job would soon have none left."""
 
-MOST_POSTPONED_SECONDS = 8.0
-"""Longest pause of a worker after jobs that could not be started; the first is IDLE_SECONDS."""
-
-REST_POLL_SECONDS = 0.1
-"""Interval between looks whether a pause must end, seconds."""
-
-CHECKPOINT = "checkpoint.npz"
-"""Name of a job's checkpoint; that of fine-tuning after compaction has the same beginning."""
-
-QUEUE = "queue"
-"""Name that is notified when a job is added to the queue."""
+MOST_POSTPONED_SECONDS = 8.0  # longest pause after jobs that could not be started; the first is IDLE_SECONDS
+REST_POLL_SECONDS = 0.1  # interval between looks whether a pause must end, seconds
+CHECKPOINT = "checkpoint.npz"  # name of a job's checkpoint; that of fine-tuning after compaction has the same beginning
+QUEUE = "queue"  # name that is notified when a job is added to the queue
 
 
 @dataclass
@@ -233,7 +225,6 @@ class Worker:
     _postponed_reason: str = ""
 
     def start(self) -> None:
-        """Start to run jobs."""
         self._loops = [asyncio.create_task(self._loop(i)) for i in range(self.settings.workers)]
 
     def health_problem(self) -> str | None:
@@ -265,7 +256,6 @@ class Worker:
         await asyncio.gather(*self._loops, return_exceptions=True)
 
     def kill_running(self) -> None:
-        """Kill all job processes."""
         for process in self._processes.values():
             process.kill()
 

@@ -22,14 +22,9 @@ from ..core.models import SCHEMA_VERSION, Base, Job, Meta
 from ..core.settings import SettingsError
 from .job_files import RESERVE_BYTES
 
-WAIT_SECONDS = 2.0
-"""Maximum wait for a lock during a check, seconds."""
-
-MAX_SCAN_SHARE = 0.01
-"""Maximum share of time spent on reading all pages of the database in search of damage."""
-
-IDENTITY = "identity"
-"""Row of ``meta`` with a random number that identifies the database."""
+WAIT_SECONDS = 2.0  # maximum wait for a lock during a check, seconds
+MAX_SCAN_SHARE = 0.01  # maximum share of time spent on reading all pages of the database in search of damage
+IDENTITY = "identity"  # row of meta with a random number that identifies the database
 
 DISK_FULL = f"database or disk is full; free {RESERVE_BYTES:,} bytes there"
 """SQLite's words for a full disk, and the remedy."""
@@ -178,14 +173,9 @@ def _inode(path: Path) -> tuple[int, int] | None:
 
 Sessions = sessionmaker[Session]
 
-START_SECONDS = 5.0
-"""Maximum wait for a lock at the start, seconds."""
-
-LOCK_SECONDS = 30.0
-"""Maximum wait for a lock after the start, seconds."""
-
-IDENTITY_BITS = 48
-"""Bits of the number of a database, which a float column holds exactly."""
+START_SECONDS = 5.0  # maximum wait for a lock at the start, seconds
+LOCK_SECONDS = 30.0  # maximum wait for a lock after the start, seconds
+IDENTITY_BITS = 48  # bits of the number of a database, which a float column holds exactly
 
 _HINTS = {
     "locked": "another program has locked it; stop that program and start again",

@@ -36,21 +36,16 @@ from ..core.settings import SettingsError
 
 log = logging.getLogger("kissgs.service")
 
-ORPHANED = ".orphaned"
-"""Name of the folder, within ``jobs``, for folders that no job of the database owns."""
+ORPHANED = ".orphaned"  # name of the folder, within jobs, for folders that no job of the database owns
 
 JOB = re.compile("[0-9a-f]{32}")
 
-RESERVE_BYTES = 1 << 20
-"""Bytes of the reserve: to open an SQLite database and change it takes 100 kB of journal, each change 20 to 40."""
+RESERVE_BYTES = 1 << 20  # to open an SQLite database and change it takes 100 kB of journal, each change 40
 
 _UPLOAD = re.compile(r"[0-9a-f]{16}\.part")
 
-RESULT = "result"
-"""Name of the folder of a job's result."""
-
-UNFINISHED = ("work-*", ".*.part")
-"""Patterns of incomplete files in a job's folder: work folders, and checkpoints that are being written."""
+RESULT = "result"  # name of the folder of a job's result
+UNFINISHED = ("work-*", ".*.part")  # in a job's folder: work folders, and checkpoints being written
 
 JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", "checkpoint*.npz", "decoded.ply", "decoded.json")
 """Patterns of all files that the service creates in a job's folder."""
@@ -68,9 +63,8 @@ class JobStorage:
                 folder.mkdir(exist_ok=True)
             self._lock: IO[str] = (self.root / "lock").open("a")
         except OSError as error:
-            raise SettingsError(
-                f"KISSGS_DATA_DIR: cannot use {root}: {(error.strerror or str(error)).lower()}"
-            ) from error
+            reason = (error.strerror or str(error)).lower()
+            raise SettingsError(f"KISSGS_DATA_DIR: cannot use {root}: {reason}") from error
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -89,7 +83,6 @@ class JobStorage:
         self._lock.close()
 
     def new_upload(self) -> Path:
-        """Return a new path for an upload."""
         return self.incoming / f"{secrets.token_hex(8)}.part"
 
     def discard(self, path: Path) -> None:
@@ -119,7 +112,6 @@ class JobStorage:
         sync_folder(self.jobs)
 
     def upload(self, job_id: str) -> Path:
-        """Return the path of the job's upload."""
         paths = [self.jobs / job_id / name for name in UPLOAD_FILES]
         return next((path for path in paths if path.exists()), paths[0])
 
@@ -132,7 +124,6 @@ class JobStorage:
         return self.jobs / job_id / "decoded.ply"
 
     def discard_checkpoints(self, job_id: str) -> None:
-        """Remove the checkpoints of a job."""
         for path in (self.jobs / job_id).glob("checkpoint*.npz"):
             self.discard(path)
 
@@ -141,25 +132,16 @@ class JobStorage:
         return [path for path in (self.upload(job_id), self.decoded(job_id)) if path.exists()]
 
     def reclaimable_bytes(self, job_id: str) -> int:
-        """Return the bytes that an ended job can do without."""
         return sum(path.stat().st_size for path in self.reclaimable_files(job_id))
 
-    def reclaim(self, job_id: str) -> None:
-        """Remove the upload and the decoded scene of an ended job."""
-        for path in self.reclaimable_files(job_id):
-            self.discard(path)
-
     def upload_name(self, job_id: str) -> str | None:
-        """Return the name of the job's upload; None if there is none."""
         path = self.upload(job_id)
         return path.name if path.is_file() else None
 
     def checkpoints(self, job_id: str) -> list[str]:
-        """Return the names of the job's checkpoints."""
         return sorted(path.name for path in (self.jobs / job_id).glob("checkpoint*.npz"))
 
     def new_work(self, job_id: str) -> Path:
-        """Create a new work folder for a job process."""
         folder = self.jobs / job_id / f"work-{secrets.token_hex(8)}"
         folder.mkdir()
         return folder
@@ -202,7 +184,6 @@ class JobStorage:
         return found
 
     def job_bytes(self, job_id: str) -> int:
-        """Return the size of all files of a job, bytes."""
         return sum(path.stat().st_size for path in (self.jobs / job_id).rglob("*") if path.is_file())
 
     # Removal ----------------------------------------------------------------------------------------------------------
@@ -262,7 +243,6 @@ class JobStorage:
         return self.jobs / ORPHANED
 
     def job_ids(self) -> set[str]:
-        """Return the ids of all jobs that have a folder."""
         return {path.name for path in self.jobs.iterdir() if JOB.fullmatch(path.name) and path.is_dir()}
 
     def set_aside(self, job_id: str, why: str) -> None:
@@ -279,12 +259,10 @@ class JobStorage:
         for job_id in unknown:
             self._move_to_orphaned(self.jobs / job_id)
         if unknown:
-            log.warning(
-                "folders of jobs that the database does not know were moved to %s: %d", self.orphaned, len(unknown)
-            )
+            text = "folders of jobs that the database does not know were moved to %s: %d"
+            log.warning(text, self.orphaned, len(unknown))
 
     def count_orphaned(self) -> int:
-        """Return the number of entries of the orphaned folder."""
         try:
             return sum(1 for _ in self.orphaned.iterdir())
         except OSError:
@@ -303,25 +281,22 @@ class JobStorage:
     def health_problem(self) -> str | None:
         """Return why files cannot be stored; None if they can. Takes microseconds."""
         for folder, opened in self._opened.items():
+            unusable = f"the data folder cannot be used: its folder {folder.name}"
             try:
                 same = os.path.samestat(folder.stat(), os.fstat(opened))
             except OSError:
-                return f"the data folder cannot be used: its folder {folder.name} is missing; restore it"
+                return f"{unusable} is missing; restore it"
             if not same:
-                return f"the data folder cannot be used: its folder {folder.name} was replaced; restart the service"
+                return f"{unusable} was replaced; restart the service"
             if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
-                return (
-                    f"the data folder cannot be used: its folder {folder.name} is not writable; change its permissions"
-                )
+                return f"{unusable} is not writable; change its permissions"
         return None
 
     def check(self) -> None:
-        """Check that files can be stored."""
         if problem := self.health_problem():
             raise OSError(problem)
 
     def free_bytes(self) -> int:
-        """Return the free bytes of the disk."""
         return shutil.disk_usage(self.root).free
 
     def keep_reserve(self) -> None:

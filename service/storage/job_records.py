@@ -50,7 +50,6 @@ class Store:
         self.changes = 0  # of the queue so far
 
     def close(self) -> None:
-        """Close all connections."""
         self._engine.dispose()
         self.monitor.close()
 
@@ -78,16 +77,21 @@ class Store:
 
     # Reading ----------------------------------------------------------------------------------------------------------
 
+    def _one(self, query: sa.Select[Any]) -> Any:  # noqa: ANN401
+        with self._reading() as session:
+            return session.scalar(query)
+
+    def _all(self, query: sa.Select[Any]) -> list[Any]:
+        with self._reading() as session:
+            return list(session.scalars(query))
+
     def get(self, job_id: str, owner: str | None = None) -> Job | None:
         """Return a job by id; None if it does not exist or has another owner than ``owner``."""
-        with self._reading() as session:
-            job = session.scalar(sa.select(Job).where(Job.id == job_id))
+        job = self._one(sa.select(Job).where(Job.id == job_id))
         return job if job is not None and owner in (None, job.owner) else None
 
     def by_idempotency_key(self, owner: str, key: str) -> Job | None:
-        """Return the job that ``owner`` submitted with this key; None if there is none."""
-        with self._reading() as session:
-            return session.scalar(sa.select(Job).where(Job.owner == owner, Job.idempotency_key == key))
+        return self._one(sa.select(Job).where(Job.owner == owner, Job.idempotency_key == key))
 
     def listing(self, owner: str, *, limit: int, before: int | None = None, state: State | None = None) -> list[Job]:
         """Return up to ``limit`` jobs of an owner with a number below ``before``, newest first."""
@@ -96,44 +100,35 @@ class Store:
             query = query.where(Job.number < before)
         if state is not None:
             query = query.where(Job.state == state)
-        with self._reading() as session:
-            return list(session.scalars(query))
+        return self._all(query)
 
     def in_state(self, *states: State) -> list[Job]:
         """Return all jobs in one of ``states``, oldest first."""
-        with self._reading() as session:
-            return list(session.scalars(sa.select(Job).where(Job.state.in_(states)).order_by(Job.number)))
+        return self._all(sa.select(Job).where(Job.state.in_(states)).order_by(Job.number))
 
     def active(self) -> list[Job]:
         """Return all queued and running jobs, with only the columns that estimates need."""
         columns = load_only(Job.owner, Job.state, Job.preset, Job.evaluate, Job.gaussians, Job.options, Job.started_at)
-        with self._reading() as session:
-            return list(session.scalars(sa.select(Job).where(Job.state.in_(ACTIVE)).options(columns)))
+        return self._all(sa.select(Job).where(Job.state.in_(ACTIVE)).options(columns))
 
     def events(self, number: int, after: int = 0) -> list[Event]:
         """Return the events of a job with a ``seq`` above ``after``, in order."""
-        query = sa.select(Event).where(Event.job == number, Event.seq > after).order_by(Event.seq)
-        with self._reading() as session:
-            return list(session.scalars(query))
+        return self._all(sa.select(Event).where(Event.job == number, Event.seq > after).order_by(Event.seq))
 
     # Sums ----------------------------------------------------------------------------------------------------------
 
     def counts(self) -> dict[State, int]:
-        """Return the number of jobs in each state."""
         with self._reading() as session:
             rows = session.execute(sa.select(Job.state, sa.func.count()).group_by(Job.state)).all()
         found = {State(state): count for state, count in rows}
         return {state: found.get(state, 0) for state in State}
 
     def active_of(self, owner: str) -> int:
-        """Return the number of queued and running jobs of an owner."""
         with self._reading() as session:
             return _count(session, Job.owner == owner, Job.state.in_(ACTIVE))
 
     def disk_bytes(self) -> int:
-        """Return the disk space of all jobs, bytes."""
-        with self._reading() as session:
-            return session.scalar(sa.select(sa.func.sum(Job.disk_bytes))) or 0
+        return self._one(sa.select(sa.func.sum(Job.disk_bytes))) or 0
 
     def rates(self, preset: str, evaluate: bool) -> list[float]:
         """Return seconds per Gaussian of up to 21 recent jobs of a preset, with or without evaluation."""
@@ -145,9 +140,7 @@ class Store:
         return [spent / count for spent, count in latest if spent and count >= 10_000][:21]
 
     def ids(self, *states: State) -> set[str]:
-        """Return the ids of all jobs in ``states``, by default of all jobs."""
-        with self._reading() as session:
-            return set(session.scalars(sa.select(Job.id).where(Job.state.in_(states or tuple(State)))))
+        return set(self._all(sa.select(Job.id).where(Job.state.in_(states or tuple(State)))))
 
     def due(self, states: Iterable[State], before: float) -> list[tuple[int, str]]:
         """Return number and id of up to 200 jobs in ``states`` that expire before a time."""
@@ -157,15 +150,12 @@ class Store:
 
     def oldest_reclaimable(self) -> Job | None:
         """Return the oldest ended job with reclaimable files; None if there is none."""
-        query = sa.select(Job).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED)).order_by(Job.number).limit(1)
-        with self._reading() as session:
-            return session.scalar(query)
+        query = sa.select(Job).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
+        return self._one(query.order_by(Job.number).limit(1))
 
     def reclaimable_bytes(self) -> int:
-        """Return the bytes of all reclaimable files of ended jobs."""
         query = sa.select(sa.func.sum(Job.reclaimable_bytes)).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
-        with self._reading() as session:
-            return session.scalar(query) or 0
+        return self._one(query) or 0
 
     # Jobs ----------------------------------------------------------------------------------------------------------
 
@@ -244,7 +234,6 @@ class Store:
             session.execute(sa.update(Job).where(Job.number == number).values(**values))
 
     def forget(self, number: int) -> None:
-        """Remove a job and its events."""
         with self._write() as session:
             session.execute(sa.delete(Event).where(Event.job == number))
             session.execute(sa.delete(Job).where(Job.number == number))

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.cameras.captures.load import load_views
-from kissgs.evaluation.detail import Detail
 from kissgs.evaluation.evaluate import compare_images, evaluate
+from kissgs.evaluation.results import Detail
 
 SIZE = (100, 70)
 WORSE = damaged()

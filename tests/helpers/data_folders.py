@@ -14,7 +14,7 @@ from helpers.service import ROOT
 from service.core.models import Job, State
 from service.core.settings import ServiceSettings
 from service.http.app import build
-from service.jobs.recovery import recover
+from service.jobs.upkeep import recover
 
 
 @pytest.fixture

@@ -126,14 +126,16 @@ def test_guitar(shared_data):
 GOOD = header_bytes(257, 9)
 
 INVALID = {
-    GOOD.replace(b"element chunk", b"element block"): "is a compressed .ply without element 'chunk'; export it again",
+    GOOD.replace(
+        b"element chunk", b"element block"
+    ): "is a compressed .ply without element 'chunk'; export or download it again",
     GOOD.replace(b"uint packed_scale", b"int packed_scale"): "is a compressed .ply whose element 'vertex' needs a",
     GOOD.replace(b"max_scale_y", b"max_scale_t"): "is a compressed .ply whose element 'chunk' needs a property",
     GOOD.replace(b"max_b", b"max_blue"): "is a compressed .ply whose element 'chunk' needs a property 'max_b' of type",
     GOOD.replace(b"uchar f_rest_8", b"char f_rest_8"): "is a compressed .ply whose element 'sh' needs a property",
     GOOD.replace(b"f_rest_8", b"f_rest_x"): "has 8 f_rest properties; SH degrees 0 to 3 have 0, 9, 24 or 45",
-    header_bytes(257, 9, chunks=1): "has 1 chunks of 256 for 257 Gaussians; export it again",
-    GOOD.replace(b"element sh 257", b"element sh 256"): "has SH of 256 for 257 Gaussians; export it again",
+    header_bytes(257, 9, chunks=1): "has 1 chunks of 256 for 257 Gaussians; export or download it again",
+    GOOD.replace(b"element sh 257", b"element sh 256"): "has SH of 256 for 257 Gaussians; export or download it again",
     GOOD + b"\0" * 143: "is cut short: it declares 2 rows of element 'chunk' but has room for 1; export or download",
     GOOD + b"\0" * (2 * 72 + 257 * 16 - 1): "is cut short: it declares 257 Gaussians but has room for 256; export or",
     GOOD + b"\0" * (2 * 72 + 257 * 25 - 1): "is cut short: it declares 257 rows of element 'sh' but has room for 256;",

@@ -12,8 +12,7 @@ from PIL import Image
 
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.resources import blas_workers
-from kissgs.io.images import decode_plane, encode_plane, probe_webp
-from kissgs.io.planes import compress_images, effort_of
+from kissgs.io.images import compress_images, decode_plane, effort_of, encode_plane, probe_webp
 from kissgs.settings import EncodeSettings
 
 

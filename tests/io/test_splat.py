@@ -53,7 +53,7 @@ def test_splat_within_half_a_step(count, monkeypatch):
 
 @pytest.mark.parametrize("size", [1, 31, 33])
 def test_splat_of_a_wrong_size(size):
-    message = rf"^the data is not a \.splat file or is cut short: its {size} bytes are not a multiple of 32; "
+    message = rf"^the data is no \.splat file or is cut short: its {size} bytes are no multiple of 32; "
     with pytest.raises(InvalidSceneError, match=message):
         read_splat(bytes(size))
 
@@ -124,15 +124,17 @@ DAMAGED = {
     b"": "is cut short: it needs 4,096 bytes but has 0; export or download it again",
     GOOD[:5000]: "is cut short: it needs 5,120 bytes but has 5,000; export or download it again",
     GOOD[:-1]: f"is cut short: it needs {len(GOOD):,} bytes but has {len(GOOD) - 1:,}; export or download it again",
-    overwritten(1, b"\2"): "is not a .ksplat file of version 0.1 but 0.2; export it again",
+    overwritten(1, b"\2"): "is .ksplat of version 0.2; 0.1 is read: export it again",
     overwritten(20, b"\3"): "has compression level 3; levels 0 to 2 are read",
-    overwritten(8, b"\2"): "declares 2 sections with room for 1; export it again",
+    overwritten(8, b"\2"): "declares 2 sections with room for 1; export or download it again",
     overwritten(16, b"\1"): "declares 257 Gaussians, but its sections have 300; export or download it again",
-    overwritten(36, struct.pack("<f", np.inf)): "has a range of SH coefficients that is not finite; export it again",
+    overwritten(
+        36, struct.pack("<f", np.inf)
+    ): "has a range of SH coefficients that is not finite; export or download it again",
     overwritten(4096, b"\xff\xff"): "section 1: it declares 65,535 Gaussians with room for 300; export it again",
     overwritten(4108, b"\xff"): "section 1: its buckets contradict each other; export or download the scene again",
     overwritten(4136, b"\4"): "section 1 has SH degree 4; export it with degree 3 or lower",
-    overwritten(5120, b"\0"): "the buckets of a section hold fewer Gaussians than it; export it again",
+    overwritten(5120, b"\0"): "has a section whose buckets hold fewer Gaussians than it; export or download it again",
 }
 
 

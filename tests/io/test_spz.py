@@ -164,17 +164,19 @@ DAMAGED = {
     gzip.decompress(V3): "is .spz of version 3; versions 1 to 3 in gzip and 4 without are read",
     with_header(12, b"\5"): "has SH degree 5; export it with degree 3 or lower",
     with_header(14, b"\x80"): "holds Spark's levels of detail, coarse Gaussians among the fine ones; export it without",
-    with_header(13, b"\x20"): "declares 32 fractional bits of positions, where 31 is the largest number; it is damaged",
+    with_header(13, b"\x20"): "has 32 fractional bits of positions; 31 are the most; export or",
     V3[:-30]: "is cut short: it unpacks to",
-    V3[:60] + bytes(40) + V3[100:]: "is damaged: gzip cannot unpack it; download it again",
-    with_header(8, b"\x15"): "is cut short: it unpacks to 596 bytes of 625; download it again",
-    with_header(8, b"\0\0\0\1"): "bytes cannot hold what its header declares; download it again",
-    gzip.compress(gzip.decompress(V3) + bytes(1 << 21)): "unpacks to more bytes than its header declares; it is",
+    V3[:60] + bytes(40) + V3[100:]: "is damaged: gzip cannot unpack it; export or download it again",
+    with_header(8, b"\x15"): "is cut short: it unpacks to 596 bytes of 625; export or download it again",
+    with_header(8, b"\0\0\0\1"): "bytes cannot hold what its header declares; export or download it again",
+    gzip.compress(
+        gzip.decompress(V3) + bytes(1 << 21)
+    ): "is damaged: it unpacks to more bytes than its header declares; export or",
     V4[:40]: "is cut short: it needs",
-    V4[:-1]: "is cut short or damaged: its streams do not end at its last byte; download it again",
-    V4[:15] + b"\5" + V4[16:]: "has 5 streams; SH degree 1 needs 6: export it again",
-    V4[:8] + b"\x15" + V4[9:]: "declares 180 bytes of positions for 21 Gaussians; export it again",
-    V4[:16] + b"\xff\xff\xff\xff" + V4[20:]: "has its table of streams at byte 4,294,967,295; it is damaged",
+    V4[:-1]: "is cut short or damaged: its streams do not end at its last byte; export or download it again",
+    V4[:15] + b"\5" + V4[16:]: "has 5 streams, where SH degree 1 needs 6; export or",
+    V4[:8] + b"\x15" + V4[9:]: "declares 180 bytes of positions for 21 Gaussians; export or",
+    V4[:16] + b"\xff\xff\xff\xff" + V4[20:]: "is damaged: its table of streams is at byte 4,294,967,295; export",
     V4[:-300] + bytes(300): "is damaged: zstd cannot unpack it; download the file again",
 }
 

@@ -8,7 +8,7 @@ import pytest
 
 from kissgs import Settings
 from kissgs.core.root_finding import find_root
-from kissgs.evaluation.detail import Detail
+from kissgs.evaluation.results import Detail
 from kissgs.pipeline.curves import LOG2_LAMBDA_RANGE
 from kissgs.pipeline.goal import Attempt, Goal
 

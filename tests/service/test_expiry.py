@@ -11,7 +11,7 @@ from helpers.thread_runner import ThreadRunner
 
 import kissgs
 from service.core.models import State
-from service.jobs.expiry import ExpiryTask
+from service.jobs.upkeep import ExpiryTask
 
 
 @pytest.mark.quick(0)

@@ -16,7 +16,7 @@ from helpers.service import SLOW, SMALL, problem, scene_bytes
 from kissgs.runners import Outcome
 from service.core.models import State
 from service.jobs import container
-from service.jobs.expiry import ExpiryTask
+from service.jobs.upkeep import ExpiryTask
 
 
 def a_file(folder, elsewhere):

@@ -9,7 +9,7 @@ from helpers.data_folders import database, finish_a_job, listing, names, service
 
 from service.core.models import State
 from service.http.routes import facts
-from service.jobs.expiry import ExpiryTask
+from service.jobs.upkeep import ExpiryTask
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 

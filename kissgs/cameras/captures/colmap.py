@@ -22,18 +22,13 @@ from kissgs.cameras.captures.photos import (
     open_file,
     quoted,
 )
-from kissgs.cameras.photographs import (
-    Distortion,
-)
+from kissgs.cameras.photographs import Distortion
 from kissgs.cameras.views import rotation_matrices
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
-MAX_NAME_BYTES = 4096
-"""Maximum bytes of an image's name; no file system has longer paths."""
-
-MAX_LINE_BYTES = 1 << 26
-"""Maximum bytes of a line in a text file; the longest lines hold the points of an image, about 40 MB per million."""
+MAX_NAME_BYTES = 4096  # maximum bytes of an image's name; no file system has longer paths
+MAX_LINE_BYTES = 1 << 26  # of a text file; the points of an image take about 40 MB per million
 
 # Model number: name and number of parameters in a binary file.
 _MODELS = {
@@ -196,7 +191,7 @@ class _Reader:
     """Reader of values from a little-endian file; ``left`` is the number of bytes not yet read."""
 
     path: Path
-    file: io.BufferedReader
+    file: io.BufferedIOBase
     left: int
 
     def unpack(self, form: struct.Struct) -> tuple:
@@ -251,8 +246,7 @@ class _Reader:
 # down, z forward, the centre of the first pixel at (0.5, 0.5). World coordinates are those of the model, which INRIA's
 # trainer keeps too.
 
-MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")
-"""Folders of a capture that may hold the model, in the order in which they are searched."""
+MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")  # of a capture, in the order of the search
 
 _PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -340,15 +334,8 @@ def _intrinsics(camera: CameraRecord, where: str) -> Intrinsics:
         raise InvalidViewsError(f"{where}: {camera.width}x{camera.height} pixels is not a valid image size")
     values = dict(zip(names, camera.parameters, strict=True))
     focal = values.pop("f", None)
-    return Intrinsics(
-        width=camera.width,
-        height=camera.height,
-        fx=values.pop("fx", focal),
-        fy=values.pop("fy", focal),
-        cx=values.pop("cx"),
-        cy=values.pop("cy"),
-        distortion=Distortion(**values),
-    )
+    fx, fy, cx, cy = values.pop("fx", focal), values.pop("fy", focal), values.pop("cx"), values.pop("cy")
+    return Intrinsics(camera.width, camera.height, fx, fy, cx, cy, distortion=Distortion(**values))
 
 
 def _viewmat(record: ImageRecord, where: str) -> Float64[np.ndarray, "4 4"]:

@@ -8,20 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.cameras.captures.colmap import MODEL_FOLDERS, find_colmap, missing_part, read_colmap
-from kissgs.cameras.captures.photos import (
-    Capture,
-    FoundPhoto,
-    PosedImage,
-    find_photos,
-    searched_folders,
-)
+from kissgs.cameras.captures.photos import Capture, FoundPhoto, PosedImage, find_photos, searched_folders
 from kissgs.cameras.captures.transforms_json import read_split_transforms, read_transforms, similarities
-from kissgs.cameras.photographs import (
-    QUARTER_TURNS,
-    full_window,
-    orientation,
-    read_photo_header,
-)
+from kissgs.cameras.photographs import QUARTER_TURNS, full_window, orientation, read_photo_header
 from kissgs.cameras.views import View, Views
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import InvalidViewsError
@@ -31,11 +20,8 @@ DEFAULT_RESOLUTION = 1600
 """Default maximum of the longer side, pixels. For landscape photographs this is the protocol of 3DGS, on which
 published results depend; INRIA's code limits only the width, so that portrait photographs stay larger."""
 
-HOLD_OUT = 8
-"""Every eighth view, starting with the first, is held out: the protocol of 3DGS and Mip-NeRF 360."""
-
-MAX_ASPECT_ERROR = 0.01
-"""Maximum relative difference between the aspect ratios of a photograph and its camera; scaled copies round sides."""
+HOLD_OUT = 8  # every eighth view, starting with the first, is held out: the protocol of 3DGS and Mip-NeRF 360
+MAX_ASPECT_ERROR = 0.01  # relative difference of aspect ratios of photograph and camera; scaled copies round sides
 
 
 def load_views(
@@ -79,7 +65,11 @@ def load_views(
             ratio than their cameras, or an argument is out of range.
         UnsupportedError: a camera has an unsupported model, such as a fisheye.
     """
-    _check_arguments(scale, resolution, hold_out)
+    for name, value, least in (("scale", scale, 1), ("resolution", resolution, 1), ("hold_out", hold_out, 0)):
+        if value is not None and value < least:
+            raise InvalidViewsError(f"{name} must be {least} or more, not {value}")
+    if hold_out == 1:
+        raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
     path = Path(path)
     try:
         capture = _read_capture(path)
@@ -104,14 +94,6 @@ def load_views(
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
     return Views(train, test, background, f"{capture.source}, no photographs", note, moves)
-
-
-def _check_arguments(scale: int | None, resolution: int | None, hold_out: int) -> None:
-    for name, value, least in (("scale", scale, 1), ("resolution", resolution, 1), ("hold_out", hold_out, 0)):
-        if value is not None and value < least:
-            raise InvalidViewsError(f"{name} must be {least} or more, not {value}")
-    if hold_out == 1:
-        raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
 
 
 def _read_capture(path: Path) -> Capture:
@@ -192,11 +174,8 @@ def _fits(size: tuple[int, int], nominal: tuple[int, int]) -> bool:
 
 
 def _reduced(size: tuple[int, int], resolution: int) -> tuple[int, int]:
-    longer = max(size)
-    if longer <= resolution:
-        return size
-    factor = longer / resolution
-    return max(1, int(size[0] / factor)), max(1, int(size[1] / factor))
+    factor = max(size) / resolution
+    return size if factor <= 1 else (max(1, int(size[0] / factor)), max(1, int(size[1] / factor)))
 
 
 def _folders(photos: Sequence[FoundPhoto]) -> str:

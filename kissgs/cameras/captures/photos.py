@@ -20,33 +20,24 @@ from pydantic import ValidationError
 from kissgs.cameras.photographs import EXTENSIONS, NO_DISTORTION, Distortion, Lens
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
+from kissgs.io.files import open_scene_file, reason_of
 
-MAX_JSON_BYTES = 1 << 28
-"""Maximum bytes of a JSON file; ten thousand cameras take about 10 MB."""
+MAX_JSON_BYTES = 1 << 28  # maximum bytes of a JSON file; ten thousand cameras take about 10 MB
 
 
 @contextlib.contextmanager
-def open_file(path: Path) -> Iterator[tuple[io.BufferedReader, int]]:
+def open_file(path: Path) -> Iterator[tuple[io.BufferedIOBase, int]]:
     """Open a regular file for reading; yield it and its size in bytes."""
-    try:
-        if not path.is_file():  # opening a named pipe would wait for its writer
-            reason = "it is a folder or a device" if path.exists() else "there is no such file"
-            raise InvalidViewsError(f"cannot read {path}: {reason}")
-        with path.open("rb") as file:
-            size = file.seek(0, io.SEEK_END)
-            file.seek(0)
-            yield file, size
-    except OSError as error:
-        raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
+    with open_scene_file(path, "", InvalidViewsError) as opened:
+        yield opened.file, opened.size
 
 
 def read_json(path: Path) -> bytes:
     """Return the bytes of a JSON file without a byte order mark, at most :data:`MAX_JSON_BYTES`."""
     with open_file(path) as (file, size):
         if size > MAX_JSON_BYTES:
-            raise InvalidViewsError(
-                f"{path} has {size:,} bytes; at most {MAX_JSON_BYTES:,} are read; is it a camera file?"
-            )
+            most = f"at most {MAX_JSON_BYTES:,} are read"
+            raise InvalidViewsError(f"{path} has {size:,} bytes; {most}; is it a camera file?")
         return file.read().removeprefix(codecs.BOM_UTF8)
 
 
@@ -68,8 +59,7 @@ def composed(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-MAX_SIDE = 1_000_000
-"""Maximum side of a photograph, pixels; the largest stitched panoramas have a few hundred thousand."""
+MAX_SIDE = 1_000_000  # maximum side of a photograph, pixels; the largest stitched panoramas have a few hundred thousand
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,33 +96,23 @@ class Intrinsics:
 class PosedImage:
     """A photograph with its pose and intrinsics."""
 
-    name: str
-    """Unique in most captures."""
-    photo: str
-    """According to the camera file; absolute, or relative to the capture's root."""
-    where: str
-    """Camera file and entry, for error messages."""
-    viewmat: Float64[np.ndarray, "4 4"]
-    """Rigid transform from world to camera, with the axes of ``Camera``."""
+    name: str  # unique in most captures
+    photo: str  # according to the camera file; absolute, or relative to the capture's root
+    where: str  # camera file and entry, for error messages
+    viewmat: Float64[np.ndarray, "4 4"]  # rigid transform from world to camera, with the axes of Camera
     intrinsics: Intrinsics
-    split: Literal["train", "test"] | None = None
-    """None if the capture does not define it."""
+    split: Literal["train", "test"] | None = None  # None if the capture does not define it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
     """All posed images of a capture, in the order of its camera file."""
 
-    images: tuple[PosedImage, ...]
-    """One or more."""
-    root: Path
-    """Folder that paths of photographs are relative to."""
-    source: str
-    """Description of the files that were read, for messages."""
-    white: bool = False
-    """Whether transparent pixels are composited over white."""
-    applied: Float64[np.ndarray, "4 4"] | None = None
-    """Rotation and translation from the coordinates of a former model to those of the poses, if there was one."""
+    images: tuple[PosedImage, ...]  # one or more
+    root: Path  # folder that paths of photographs are relative to
+    source: str  # description of the files that were read, for messages
+    white: bool = False  # whether transparent pixels are composited over white
+    applied: Float64[np.ndarray, "4 4"] | None = None  # rotation and translation from a former model to the poses
 
 
 def _focal(length: float | None, angle: float | None, side: int) -> float | None:
@@ -147,38 +127,24 @@ def _focal(length: float | None, angle: float | None, side: int) -> float | None
 # in folders such as ``images_4`` next to the former ``images``, or only with ``input``, from which INRIA's
 # ``convert.py`` makes ``images``.
 
-MAX_FACTOR = 64
-"""Maximum scale of a folder; a larger number after the underscore, such as a year, is part of the name."""
-
-IMAGES, INPUT = "images", "input"
-"""Usual folder of photographs, and the folder of originals that replaces it if it is missing."""
-
-MAX_LISTED_FOLDERS = 4
-"""Maximum number of folders named in a message."""
+MAX_FACTOR = 64  # maximum scale of a folder; a larger number after the underscore, such as a year, is part of the name
+IMAGES, INPUT = "images", "input"  # usual folder of photographs, and that of originals, which replaces it if missing
+MAX_LISTED_FOLDERS = 4  # maximum number of folders named in a message
 
 
 @dataclass(frozen=True, slots=True)
 class FoundPhoto:
-    """File of a photograph."""
-
     path: Path
-    factor: int
-    """Original size divided by this photograph's size, according to the folder's name."""
-    folder: Path
-    """Folder of photographs that contains the file, perhaps in a subfolder."""
+    factor: int  # original size divided by this photograph's size, according to the folder's name
+    folder: Path  # folder of photographs that contains the file, perhaps in a subfolder
 
 
 @dataclass(frozen=True, slots=True)
 class _SearchFolder:
-    """Folder in which a photograph is searched for."""
-
     folder: Path
-    factor: int
-    """Original size divided by the size of its photographs."""
-    names: tuple[str, ...]
-    """Names to try, in order, relative to the folder."""
-    has_photos: bool
-    """Whether the folder exists and is certainly for photographs, unlike the capture's own folder."""
+    factor: int  # original size divided by the size of its photographs
+    names: tuple[str, ...]  # names to try, in order, relative to the folder
+    has_photos: bool  # whether the folder exists and is certainly for photographs, unlike the capture's own folder
 
 
 def find_photos(
@@ -200,7 +166,10 @@ def find_photos(
             for name in names
         ]
     else:
-        folder = _named_folder(images, root, listing)
+        named = (listing.spelled(images), listing.spelled(root / images))
+        folder = next((folder for folder in named if _is_folder(folder)), None)
+        if folder is None:
+            raise InvalidViewsError(f"there is neither a folder {images} nor {root / images}; check --images")
         searched = [[_within(folder, name)] for name in names]
     found = [listing.find_first(folders) for folders in searched]
     missing = [i for i, photo in enumerate(found) if photo is None]
@@ -307,7 +276,7 @@ def _list(folder: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
     except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a name with a NUL character
         names = []
     except OSError as error:
-        raise InvalidViewsError(f"cannot read {folder}: {(error.strerror or str(error)).lower()}") from error
+        raise InvalidViewsError(f"cannot read {folder}: {reason_of(error)}") from error
     stems: dict[str, list[str]] = {}
     for file in names:
         if Path(file).suffix.lower() in EXTENSIONS:
@@ -334,9 +303,8 @@ def _search_folder(
     if factor not in variants:
         wanted = folder.name if factor == 1 else f"{folder.name}_{factor}"
         existing = ", ".join(variants[known].name for known in sorted(variants))
-        raise InvalidViewsError(
-            f"there is no folder {wanted} in {folder.parent}, only {existing}; choose another --scale"
-        )
+        place = f"in {folder.parent}, only {existing}"
+        raise InvalidViewsError(f"there is no folder {wanted} {place}; choose another --scale")
     # A folder named input may hold something else than photographs, unless the camera file names it.
     has_photos = folder.name == INPUT or variants[factor].name != INPUT
     return _SearchFolder(variants[factor], factor, names, has_photos)
@@ -363,13 +331,6 @@ def _candidates(name: str, root: Path) -> list[tuple[Path, tuple[str, ...]]]:
 def _suffixes(parts: Sequence[str]) -> tuple[str, ...]:
     """Return all suffixes of a path, the longest first."""
     return tuple("/".join(parts[i:]) for i in range(len(parts)))
-
-
-def _named_folder(images: Path, root: Path, listing: _FolderListing) -> Path:
-    for folder in (listing.spelled(images), listing.spelled(root / images)):
-        if _is_folder(folder):
-            return folder
-    raise InvalidViewsError(f"there is neither a folder {images} nor {root / images}; check --images")
 
 
 def _within(folder: Path, name: str) -> _SearchFolder:

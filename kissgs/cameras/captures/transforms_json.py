@@ -83,12 +83,7 @@ def read_cameras(path: Path) -> tuple[View, ...]:
 
 def camera_as_dict(camera: Camera) -> dict[str, object]:
     """Return a camera in the JSON format of kissgs, with all digits; a camera that is read has the usual dilation."""
-    return {
-        "viewmat": camera.viewmat.tolist(),
-        "K": camera.K.tolist(),
-        "width": camera.width,
-        "height": camera.height,
-    }
+    return {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
 
 
 def write_camera(path: Path, camera: Camera, *, overwrite: bool = False) -> None:
@@ -117,7 +112,9 @@ def _view(entry: object, where: str, name: str) -> View:
         if "viewmat" in entry:
             return View(name, _from_kissgs(_KissgsCamera.model_validate(entry)))
         found = _TrainerCamera.model_validate(entry)
-        return View(found.img_name or name, _from_trainer(found))
+        K = np.array([[found.fx, 0, 0.5 * found.width], [0, found.fy, 0.5 * found.height], [0, 0, 1]])
+        viewmat = _to_camera(np.array(found.rotation), np.array(found.position))
+        return View(found.img_name or name, Camera(viewmat, K, found.width, found.height))
     except ValidationError as error:
         raise invalid(where, error) from error
     except InvalidViewsError as error:
@@ -131,11 +128,6 @@ def _from_kissgs(found: _KissgsCamera) -> Camera:
     if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], (0, 0, 0, 0, 1)):
         raise InvalidViewsError("K is not of the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
     return Camera(viewmat, K, found.width, found.height)
-
-
-def _from_trainer(found: _TrainerCamera) -> Camera:
-    K = np.array([[found.fx, 0, 0.5 * found.width], [0, found.fy, 0.5 * found.height], [0, 0, 1]])
-    return Camera(_to_camera(np.array(found.rotation), np.array(found.position)), K, found.width, found.height)
 
 
 def _to_camera(rotation: Float64[np.ndarray, "3 3"], position: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
@@ -201,11 +193,8 @@ def _split(which: str) -> tuple[str, str] | None:
 # ``offset`` are not applied. Scenes may have others, which :func:`similarities` returns: those of the COLMAP model from
 # which nerfstudio converted the poses by ``applied_transform``, or those in which nerfstudio trained.
 
-MAX_SKEW = 0.01
-"""Maximum relative difference between the singular values of a rotation matrix, to accept rounded numbers."""
-
-DATAPARSER_TRANSFORMS = "dataparser_transforms.json"
-"""File of nerfstudio's trainer: from coordinates of the COLMAP model, else of ``transforms.json``, to the scene's."""
+MAX_SKEW = 0.01  # relative difference between the singular values of a rotation, to accept rounded numbers
+DATAPARSER_TRANSFORMS = "dataparser_transforms.json"  # of nerfstudio's trainer: to the coordinates of the scene
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 """Supported values of ``camera_model``; all given distortion coefficients apply, whatever the value."""
@@ -362,22 +351,13 @@ def _intrinsics(document: _Transforms, frame: _Frame, where: str) -> Intrinsics:
             f"{', '.join(PINHOLES)}; undistort the photographs first, for example with 'colmap image_undistorter'"
         )
     if value("k4"):
-        raise UnsupportedError(
-            f"{where}: the distortion coefficient k4 is not supported; undistort the photographs first"
-        )
-    coefficients = {name: value(name) or 0.0 for name in ("k1", "k2", "k3", "p1", "p2")}
-    width, height = value("w"), value("h")
-    return Intrinsics(
-        width=None if width is None else round(width),
-        height=None if height is None else round(height),
-        fx=value("fl_x"),
-        fy=value("fl_y"),
-        cx=value("cx"),
-        cy=value("cy"),
-        angle_x=value("camera_angle_x"),
-        angle_y=value("camera_angle_y"),
-        distortion=Distortion(**coefficients),
-    )
+        problem = "the distortion coefficient k4 is not supported"
+        raise UnsupportedError(f"{where}: {problem}; undistort the photographs first")
+    distortion = Distortion(**{name: value(name) or 0.0 for name in ("k1", "k2", "k3", "p1", "p2")})
+    width, height = (None if side is None else round(side) for side in (value("w"), value("h")))
+    names = ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
+    fx, fy, cx, cy, angle_x, angle_y = (value(name) for name in names)
+    return Intrinsics(width, height, fx, fy, cx, cy, angle_x, angle_y, distortion)
 
 
 def _viewmat(frame: _Frame, where: str) -> Float64[np.ndarray, "4 4"]:
@@ -411,9 +391,8 @@ def _splits(path: Path, document: _Transforms) -> dict[str, Literal["train", "te
     for names, key in ((train, "train_filenames"), (held_out, "test_filenames or val_filenames")):
         unknown = next((name for name in names or () if not _name_set([name]) <= all_names), None)
         if unknown is not None:
-            raise InvalidViewsError(
-                f"{path}: {quoted(unknown)} in {key} is not the file_path of a frame; correct the list"
-            )
+            problem = f"{quoted(unknown)} in {key} is not the file_path of a frame"
+            raise InvalidViewsError(f"{path}: {problem}; correct the list")
     test = _name_set(held_out) if held_out is not None else all_names - _name_set(train)
     training = (all_names if train is None else _name_set(train)) - test
     if not training:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,18 +17,15 @@ from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.constants import NEAR
 from kissgs.rendering.cpu.frame import draw
 
-UP_AXES = (UP, np.array([0.0, 0.0, 1.0]))
-"""Up directions of scene files: COLMAP's y points roughly down, nerfstudio's z up. The first is the default."""
+UP_AXES = (UP, np.array([0.0, 0.0, 1.0]))  # COLMAP's y points down, nerfstudio's z up; the first is the default
 
 
 @dataclass(frozen=True, slots=True)
 class SceneBounds:
     """Position, size and orientation of a scene's densest part."""
 
-    centre: Vec3
-    """Centre of the densest part, world units."""
-    radius: float
-    """Distance from the centre within which half of the opacity of that part lies, world units."""
+    centre: Vec3  # centre of the densest part, world units
+    radius: float  # distance from the centre within which half of the opacity of that part lies, world units
     up: Vec3
 
 
@@ -122,34 +120,19 @@ def _ground_normal(axis: Vec3, normals: Float64[np.ndarray, "N 3"], weights: Flo
 
 # View scores: how useful a camera is, from a thumbnail of what it sees.
 
-PROXY_GAUSSIANS = 30_000
-"""Largest number of Gaussians in the proxy scene that thumbnails show."""
-
-OPAQUE = 0.01
-"""Transmittance at which the list of a thumbnail's pixel ends: what is behind does not change its statistics."""
-
-TOO_NEAR = 0.35
-"""Depth in radii of the scene; anything nearer to the camera counts as an obstruction."""
-
-CENTRE_SCALE = 30.0
-"""Factor by which the mark of central Gaussians is scaled, so that it uses half the range of a colour channel."""
+PROXY_GAUSSIANS = 30_000  # largest number of Gaussians in the proxy scene that thumbnails show
+OPAQUE = 0.01  # transmittance at which the list of a thumbnail's pixel ends
+TOO_NEAR = 0.35  # depth in radii of the scene; anything nearer to the camera counts as an obstruction
+CENTRE_SCALE = 30.0  # of the mark of central Gaussians, to use half the range of a colour channel
 
 
 @dataclass(frozen=True, slots=True)
 class ViewStats:
-    """Statistics of a thumbnail."""
-
-    alpha: float
-    """Mean alpha, 0 to 1."""
-    log_size: float
-    """Median logarithm of the largest scale of the Gaussians, world units. Parts that no photograph shows have
-    large Gaussians."""
-    log_angle: float
-    """Median logarithm of the angle that these scales subtend, radians."""
-    near: float
-    """Mean alpha of what is nearer than :data:`TOO_NEAR`, 0 to 1."""
-    centre: float
-    """Mean alpha of the central Gaussians, those within two radii of the centre, 0 to 1."""
+    alpha: float  # mean alpha, 0 to 1
+    log_size: float  # median logarithm of the largest scale, world units; large where no photograph shows a part
+    log_angle: float  # median logarithm of the angle that these scales subtend, radians
+    near: float  # mean alpha of what is nearer than TOO_NEAR, 0 to 1
+    centre: float  # mean alpha of the central Gaussians, those within two radii of the centre, 0 to 1
 
 
 class ViewScorer:
@@ -177,13 +160,13 @@ class ViewScorer:
         """Render log size, log depth and centrality as the three colours, so that blending averages what is visible."""
         proxy = self._proxy
         log_depth = np.log(np.maximum(proxy.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3], 1e-12))
-        values = self._log_sizes, log_depth, CENTRE_SCALE * self._central
-        colours = np.stack([_to_sh0(value) for value in values], axis=1)
+        values = self._log_sizes, log_depth, CENTRE_SCALE * self._central  # colours from 0 to 1 stand for -30 to 30
+        colours = np.stack([(np.clip(value / 60 + 0.5, 0, 1) - 0.5) / SH_C0 for value in values], axis=1)
         coloured = replace(proxy, sh0=colours.astype(np.float32), shN=np.empty((len(proxy), 0, 3), np.float32))
         with Workers(1) as single:  # cameras are already rendered in parallel
             frame = draw(coloured, camera, black(), single, OPAQUE)
         alpha = 1 - frame.transmittance.astype(np.float64)
-        size, depth, centre = (_from_colour(frame.image[:, :, c] / np.maximum(alpha, 1e-6)) for c in range(3))
+        size, depth, centre = ((frame.image[:, :, c] / np.maximum(alpha, 1e-6) - 0.5) * 60 for c in range(3))
         near = (np.exp(depth) < TOO_NEAR * self.bounds.radius) * alpha
         return ViewStats(
             alpha=float(alpha.mean()),
@@ -194,30 +177,15 @@ class ViewScorer:
         )
 
 
-def _to_sh0(logarithm: np.ndarray) -> np.ndarray:
-    """Return the SH coefficient of a colour from 0 to 1 that stands for logarithms from -30 to 30."""
-    return (np.clip(logarithm / 60 + 0.5, 0, 1) - 0.5) / SH_C0
-
-
-def _from_colour(colour: np.ndarray) -> np.ndarray:
-    """Return the logarithm that a colour from 0 to 1 stands for."""
-    return (colour - 0.5) * 60
-
-
 def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.ndarray, " m"] | None = None) -> Splats:
     """Return evenly selected Gaussians ``among`` some, or all, without SH rest, enlarged to cover the same area."""
     count = len(splats) if among is None else len(among)
     step = max(1, -(-count // max_count))
     chosen = slice(None, None, step) if among is None else among[::step]
-    return replace(
-        splats,
-        means=np.ascontiguousarray(splats.means[chosen]),
-        quats=np.ascontiguousarray(splats.quats[chosen]),
-        scales=splats.scales[chosen] + np.float32(np.log(step) / 2),
-        opacities=np.ascontiguousarray(splats.opacities[chosen]),
-        sh0=np.ascontiguousarray(splats.sh0[chosen]),
-        shN=np.empty((-(-count // step), 0, 3), np.float32),
-    )
+    names = ("means", "quats", "opacities", "sh0")
+    arrays: dict[str, Any] = {name: np.ascontiguousarray(getattr(splats, name)[chosen]) for name in names}
+    scales = splats.scales[chosen] + np.float32(np.log(step) / 2)
+    return replace(splats, **arrays, scales=scales, shN=np.empty((-(-count // step), 0, 3), np.float32))
 
 
 def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[np.ndarray, " n"]:
@@ -230,34 +198,19 @@ def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[
     names = ("alpha", "log_size", "log_angle", "near", "centre")
     alpha, log_size, log_angle, near, centre = (np.array([getattr(view, name) for view in stats]) for name in names)
     enough = alpha >= 0.5 * alpha.max()
-    excess_size, excess_angle = (
-        np.maximum(value - np.quantile(value[enough], 0.1), 0) for value in (log_size, log_angle)
-    )
+    excess_size, excess_angle = (np.maximum(each - np.quantile(each[enough], 0.1), 0) for each in (log_size, log_angle))
     holes = 2 * (1 - alpha) if fills_image else np.maximum(0.5 - alpha / max(alpha.max(), 1e-9), 0)
     off_centre = np.maximum(1 - centre / 0.25, 0) if fills_image else np.zeros(len(stats))
     return np.asarray(1 - holes - 0.4 * excess_size - 0.35 * excess_angle - near - 0.5 * off_centre)
 
 
-FIELD_OF_VIEW = np.radians(60)
-"""Angle of view along the longer side, radians; roughly that of a phone."""
-
-AZIMUTHS = 16
-"""Number of azimuths on each orbit."""
-
-ORBIT_RADII = (0.7, 1.1, 1.7, 2.6)
-"""Radii of the orbits, in radii of the scene."""
-
-ORBIT_ELEVATIONS = (-5, 12, 35)
-"""Elevations of the orbits as seen from the centre, degrees."""
-
-OBJECT_ELEVATIONS = (-10, 12, 35, 60)
-"""Elevations of the cameras around an object, degrees."""
-
-INSIDE_DIRECTIONS = 8
-"""Number of viewing directions from each position inside the scene."""
-
-CLOSE_UP_INTERVAL = 4
-"""One in this many cameras around an object is at half the distance."""
+FIELD_OF_VIEW = np.radians(60)  # angle of view along the longer side, radians; roughly that of a phone
+AZIMUTHS = 16  # number of azimuths on each orbit
+ORBIT_RADII = (0.7, 1.1, 1.7, 2.6)  # radii of the orbits, in radii of the scene
+ORBIT_ELEVATIONS = (-5, 12, 35)  # elevations of the orbits as seen from the centre, degrees
+OBJECT_ELEVATIONS = (-10, 12, 35, 60)  # elevations of the cameras around an object, degrees
+INSIDE_DIRECTIONS = 8  # number of viewing directions from each position inside the scene
+CLOSE_UP_INTERVAL = 4  # one in this many cameras around an object is at half the distance
 
 
 def horizontal_axes(up: Vec3) -> tuple[Vec3, Vec3]:
@@ -323,11 +276,9 @@ def _framing_camera(
 ) -> Camera:
     """Return a camera in ``direction`` that frames 98 % of the weight along each image axis, with a 15 % margin."""
     width, height = size
-    towards = look_at(
-        bounds.centre + direction, bounds.centre, bounds.up, fov=FIELD_OF_VIEW, width=width, height=height
-    )
-    right, down, _ = towards.viewmat[:3, :3]
     target, half_extents = bounds.centre.copy(), []
+    towards = look_at(target + direction, target, bounds.up, fov=FIELD_OF_VIEW, width=width, height=height)
+    right, down, _ = towards.viewmat[:3, :3]
     for axis in (right, down, direction):
         along = (means - bounds.centre) @ axis
         low, high = weighted_quantiles(along, weights, 0.01, 0.99)

@@ -18,13 +18,7 @@ from kissgs.cameras.virtual.candidates import (
     proxy_scene,
     scene_bounds,
 )
-from kissgs.cameras.virtual.select import (
-    ScoredCandidates,
-    score_candidates,
-    select_diverse,
-    split_views,
-    with_size,
-)
+from kissgs.cameras.virtual.select import ScoredCandidates, score_candidates, select_diverse, split_views, with_size
 from kissgs.core.array_types import Bool, Float32, Int
 from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress
 from kissgs.core.resources import Workers
@@ -41,26 +35,13 @@ from kissgs.rendering.sensitivity import Coverage, WeightedCameras, local_scale
 # Gaussians that they do not see, or see too small to resolve, further regions are found: a distant or a much smaller
 # object, the inside of another room.
 
-MAX_FURTHER_REGIONS = 16
-"""Largest number of further regions that are looked for."""
-
-MIN_SHARE = 0.01
-"""Share of the scene's visible opacity that a further region must add, and below which the search ends."""
-
-MIN_UNSEEN_GAUSSIANS = 8
-"""Number of unseen Gaussians below which the search ends."""
-
-CANDIDATES_PER_REGION = 40
-"""Number of candidate cameras around each further region."""
-
-PROBE_CAMERAS = 6
-"""Number of a region's cameras from which coverage is measured."""
-
-PROBE_SIZE = 160
-"""Longer side of the images in which coverage is measured, pixels."""
-
-TYPICAL_SIZE = 384
-"""Longer side of the images that the selected cameras will have, pixels; what they resolve depends on it."""
+MAX_FURTHER_REGIONS = 16  # largest number of further regions that are looked for
+MIN_SHARE = 0.01  # share of the scene's visible opacity that a further region must add, and below which the search ends
+MIN_UNSEEN_GAUSSIANS = 8  # number of unseen Gaussians below which the search ends
+CANDIDATES_PER_REGION = 40  # number of candidate cameras around each further region
+PROBE_CAMERAS = 6  # number of a region's cameras from which coverage is measured
+PROBE_SIZE = 160  # longer side of the images in which coverage is measured, pixels
+TYPICAL_SIZE = 384  # longer side of the images that cameras will have, pixels: what they resolve depends on it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,7 +129,6 @@ def _further_region(splats: Splats, bounds: SceneBounds, like: Camera, pool: Wor
 
 
 def _within(means: Float32[np.ndarray, "N 3"], centre: Vec3, radius: float) -> Bool[np.ndarray, " N"]:
-    """Return which positions are within ``radius`` of ``centre``."""
     found = np.empty(len(means), bool)
     for first in range(0, len(means), BLOCK):
         offsets = means[first : first + BLOCK] - centre
@@ -183,14 +163,9 @@ VIRTUAL_WEIGHT = 0.3
 """Weight of all virtual cameras together, relative to all cameras of a capture. Parts that no photograph shows must not
 fall apart, and the photographed parts lose almost nothing by it."""
 
-WIDE_FOCAL_SCALE = 0.6
-"""Focal length of every other virtual camera, relative to the others: parts just outside their images count too."""
-
-MAX_VIEWS, MIN_VIEWS = 48, 16
-"""Largest and smallest number of cameras that are chosen by the size of the scene."""
-
-FEW_GAUSSIANS = 150_000
-"""Number of Gaussians up to which there are :data:`MAX_VIEWS`."""
+WIDE_FOCAL_SCALE = 0.6  # of every other virtual camera: parts just outside the images count too
+MAX_VIEWS, MIN_VIEWS = 48, 16  # largest and smallest number of cameras that are chosen by the size of the scene
+FEW_GAUSSIANS = 150_000  # number of Gaussians up to which there are MAX_VIEWS
 
 
 def default_view_count(gaussians: int) -> int:
@@ -199,12 +174,7 @@ def default_view_count(gaussians: int) -> int:
 
 
 def sensitivity_cameras(
-    splats: Splats,
-    views: Views | None,
-    context: Context = DEFAULT_CONTEXT,
-    *,
-    count: int,
-    size: int,
+    splats: Splats, views: Views | None, context: Context = DEFAULT_CONTEXT, *, count: int, size: int
 ) -> WeightedCameras:
     """Return the cameras, each with its weight, that measure sensitivity and refit colours.
 
@@ -214,7 +184,11 @@ def sensitivity_cameras(
     if views is None or not views.train:
         side = size * 4 // 5
         virtual = scene_views(splats, context, width=side, height=side, count=count)
-        cameras = [_widened(view.camera) if n % 2 else view.camera for n, view in enumerate(virtual.all)]
+        cameras = [view.camera for view in virtual.all]
+        for n in range(1, len(cameras), 2):  # a wider field of view
+            K = cameras[n].K.copy()
+            K[[0, 1], [0, 1]] *= WIDE_FOCAL_SCALE
+            cameras[n] = Camera(cameras[n].viewmat, K, cameras[n].width, cameras[n].height)
         return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
     captured = [view.camera for view in views.train]
     chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
@@ -227,41 +201,19 @@ def sensitivity_cameras(
     return WeightedCameras(cameras, weights, views.background, captured=len(selected))
 
 
-def _widened(camera: Camera) -> Camera:
-    """Return the camera with a shorter focal length, that is, a wider field of view."""
-    K = camera.K.copy()
-    K[[0, 1], [0, 1]] *= WIDE_FOCAL_SCALE
-    return Camera(camera.viewmat, K, camera.width, camera.height)
-
-
 # Random poses, from where photographs might have been taken, to train or to measure losses with.
 #
 # A scene that is trained from a few cameras that are as good as possible falls apart between and beside them. Random
 # ones are near and far, high and low, around every region; only those with a low view score are left out.
 
-SCORE_MARGIN = 0.5
-"""How much lower than the best candidate a random camera may score; photographs of real captures stay within it."""
-
-FIELDS_OF_VIEW = np.radians((50, 90))
-"""Smallest and largest angle of view along the longer side, radians: from phone to wide-angle lens."""
-
-NEAREST_RADII, FARTHEST_RADII = 0.8, 2.6
-"""Distances from the centre, radii of the scene, in front of a scene with a background."""
-
-MIN_ELEVATION, MAX_ELEVATION = -np.pi / 6, np.pi / 3
-"""Elevations above the ground as seen from the centre, radians, where the scene does not enclose the cameras."""
-
-TARGET_SPREAD = 0.35
-"""Standard deviation of the look-at target around the centre along each axis, radii of the scene."""
-
-MAX_COUNT_FACTOR = 4.0
-"""Largest number of views of a scene with several regions, relative to ``count``."""
-
-MAX_ATTEMPTS = 8
-"""Largest number of poses that are drawn for each camera."""
-
-Pose = tuple[Vec3, Vec3]
-"""Position and look-at target, world units."""
+SCORE_MARGIN = 0.5  # below the best candidate; photographs of real captures stay within it
+FIELDS_OF_VIEW = np.radians((50, 90))  # along the longer side, radians: from phone to wide-angle lens
+NEAREST_RADII, FARTHEST_RADII = 0.8, 2.6  # distances from the centre, where a scene has a background
+MIN_ELEVATION, MAX_ELEVATION = -np.pi / 6, np.pi / 3  # radians, where the scene does not enclose the cameras
+TARGET_SPREAD = 0.35  # standard deviation of the look-at target around the centre along each axis, radii of the scene
+MAX_COUNT_FACTOR = 4.0  # largest number of views of a scene with several regions, relative to count
+MAX_ATTEMPTS = 8  # largest number of poses that are drawn for each camera
+Pose = tuple[Vec3, Vec3]  # position and look-at target, world units
 
 
 def random_poses(splats: Splats, context: Context = DEFAULT_CONTEXT, *, side: int, count: int, seed: int = 0) -> Views:
@@ -353,11 +305,8 @@ class _PoseSampler:
 # Close-ups see what views of whole objects are too far away to resolve: a scene that is pruned without them gets holes
 # behind and between what other cameras see.
 
-PHOTOGRAPH_FIELD_OF_VIEW = np.radians(70)
-"""Angle of view along both sides, radians, where no longer lens is needed."""
-
-OCTAVES = 3.0
-"""Distances are one local scale (:func:`~kissgs.rendering.sensitivity.local_scale`) to this many octaves more."""
+PHOTOGRAPH_FIELD_OF_VIEW = np.radians(70)  # angle of view along both sides, radians, where no longer lens is needed
+OCTAVES = 3.0  # distances are one local scale (local_scale) to this many octaves more
 
 
 def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[Camera]:
@@ -381,11 +330,8 @@ NEAREST, FARTHEST = 10.0, 3.0
 """Smallest distance from the Gaussian in the centre, local scales (:func:`~kissgs.rendering.sensitivity.local_scale`)
 of the proxy scene but at most a radius of the scene, and the largest one, radii."""
 
-ACROSS = 3
-"""One in this many cameras stands beside another Gaussian, and looks across the scene."""
-
-MAX_BESIDE = 8.0
-"""Largest distance of such a camera from the Gaussian beside it, local scales; the smallest one is a local scale."""
+ACROSS = 3  # one in this many cameras stands beside another Gaussian, and looks across the scene
+MAX_BESIDE = 8.0  # largest distance of such a camera from the Gaussian beside it, local scales; one is the smallest
 
 
 def scattered_cameras(splats: Splats, *, side: int, count: int, seed: int = 0, threads: int = 0) -> list[Camera]:

@@ -33,20 +33,11 @@ from kissgs.rendering.camera import Camera, look_at, pinhole
 # Which candidates suit depends on the kind of scene. Inside a room or under a sky, cameras must stay within what
 # encloses them; before a background, the image should be full; an object that stands alone is framed from all sides.
 
-THUMBNAIL_SIZE = 64
-"""Longer side of a thumbnail, pixels."""
-
-FULL_ALPHA = 0.85
-"""An image is full if its mean alpha is above this."""
-
-SCORE_MARGIN = 0.3
-"""How much lower than the best a camera may score to be chosen."""
-
-MAX_REFINEMENTS = 3
-"""Largest number of times that cameras between good ones are added where good ones are few."""
-
-NEIGHBOURS = 4
-"""Number of the nearest good cameras towards each of which a camera is added."""
+THUMBNAIL_SIZE = 64  # longer side of a thumbnail, pixels
+FULL_ALPHA = 0.85  # an image is full if its mean alpha is above this
+SCORE_MARGIN = 0.3  # how much lower than the best a camera may score to be chosen
+MAX_REFINEMENTS = 3  # largest number of times that cameras between good ones are added where good ones are few
+NEIGHBOURS = 4  # number of the nearest good cameras towards each of which a camera is added
 
 SceneKind = Literal["enclosed", "background", "object"]
 """A room or a scene under a sky, seen from inside; a scene before a background; an object that stands alone."""
@@ -56,18 +47,14 @@ SceneKind = Literal["enclosed", "background", "object"]
 class ScoredCandidates:
     """Candidate cameras with what is needed to compare their views."""
 
-    scorer: ViewScorer
-    """Measures further views on the same scale."""
+    scorer: ViewScorer  # measures further views on the same scale
     kind: SceneKind
-    cameras: list[Camera]
-    """One or more, with the size of thumbnails."""
+    cameras: list[Camera]  # one or more, with the size of thumbnails
     stats: list[ViewStats]
-    outside_penalty: Float64[np.ndarray, " n"]
-    """1 for cameras outside of what encloses the scene, else 0."""
+    outside_penalty: Float64[np.ndarray, " n"]  # 1 for cameras outside of what encloses the scene, else 0
 
     @property
     def bounds(self) -> SceneBounds:
-        """Bounds of the scene, or of the region."""
         return self.scorer.bounds
 
     @property
@@ -129,18 +116,14 @@ def score_candidates(splats: Splats, size: tuple[int, int], pool: Workers, progr
     inside, orbits = list(inside_cameras(bounds, thumbnail_size)), list(orbit_cameras(bounds, thumbnail_size))
     cameras = [*inside, *orbits]
     stats = scorer.measure(cameras)
-    if _is_enclosed(stats[: len(inside)]):
+    # Enclosed if images are full in all directions from three or more positions inside the scene.
+    clear = np.reshape([view.alpha - view.near for view in stats[: len(inside)]], (-1, INSIDE_DIRECTIONS)).mean(axis=1)
+    if (clear > FULL_ALPHA).sum() >= 3:
         return ScoredCandidates(scorer, "enclosed", cameras, stats, _outside_penalty(cameras, scorer))
     if _has_background(stats[len(inside) :], thumbnail_size, scorer):
         return ScoredCandidates(scorer, "background", cameras, stats, np.zeros(len(cameras)))
     cameras = list(object_cameras(proxy, bounds, thumbnail_size))
     return ScoredCandidates(scorer, "object", cameras, scorer.measure(cameras), np.zeros(len(cameras)))
-
-
-def _is_enclosed(inside: list[ViewStats]) -> bool:
-    """Whether images are full in all directions from three or more positions inside the scene."""
-    unobstructed = np.reshape([view.alpha - view.near for view in inside], (-1, INSIDE_DIRECTIONS)).mean(axis=1)
-    return bool((unobstructed > FULL_ALPHA).sum() >= 3)
 
 
 def _has_background(orbits: list[ViewStats], size: tuple[int, int], scorer: ViewScorer) -> bool:
@@ -181,14 +164,9 @@ def pose_distances(
 # Candidates are scored by thumbnails. A trained scene is sharp from where it was photographed and dissolves elsewhere,
 # so the good ones lie on the side that was captured. Among these, cameras far from each other are chosen.
 
-HOLD_OUT = 8
-"""One in this many virtual views is held out, starting with the first."""
-
-OVERVIEW_BONUS = 0.5
-"""Score of being e times as far from the centre, where one view or one orbit stands for the whole scene."""
-
-MIN_OVERVIEW_RADII = 0.5
-"""Distance in radii of the scene below which the overview bonus does not fall further."""
+HOLD_OUT = 8  # one in this many virtual views is held out, starting with the first
+OVERVIEW_BONUS = 0.5  # of being e times as far from the centre, where one view or orbit stands for the scene
+MIN_OVERVIEW_RADII = 0.5  # distance in radii of the scene below which the overview bonus does not fall further
 
 
 def virtual_views(

@@ -18,8 +18,7 @@ from ...jobs.container import Owner, Service, ServiceContainer
 from ...jobs.status import job_status
 from ...storage.job_files import JOB
 
-MAX_WAIT_SECONDS = 30.0
-"""Maximum duration of a long poll, shorter than typical idle time-outs of proxies."""
+MAX_WAIT_SECONDS = 30.0  # maximum duration of a long poll, shorter than typical idle time-outs of proxies
 
 NO_STORE = {"Cache-Control": "no-store"}
 
@@ -32,9 +31,8 @@ def problems(*codes: str) -> dict[int | str, dict[str, Any]]:
             PROBLEM_TYPES[code].status,
             {"description": "", "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}},
         )
-        answer["description"] = ". ".join(
-            filter(None, (answer["description"], f"{PROBLEM_TYPES[code].title} (`{code}`)"))
-        )
+        text = f"{PROBLEM_TYPES[code].title} (`{code}`)"
+        answer["description"] = ". ".join(filter(None, (answer["description"], text)))
         if code == "unauthorized":
             answer["headers"] = {"WWW-Authenticate": {"schema": {"type": "string"}, "description": "Bearer"}}
     return dict(sorted(answers.items(), key=lambda item: int(item[0])))

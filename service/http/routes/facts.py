@@ -26,6 +26,12 @@ router = APIRouter()
 
 API_VERSION = "1.0"
 
+_SAME_NAMES = (
+    *("max_upload_bytes", "max_header_bytes", "max_gaussians", "max_queue", "max_uploads"),
+    *("job_seconds", "keep_seconds", "sync_seconds"),
+)
+"""Limits that are settings of the same names."""
+
 
 @router.get("/v1/limits", tags=["facts"], operation_id="limits", summary="Get the limits")
 async def get_limits(context: Service) -> Limits:
@@ -34,18 +40,11 @@ async def get_limits(context: Service) -> Limits:
     return Limits(
         formats=[ending.removeprefix(".") for ending in (*UPLOADS.values(), *DOUBLE_ENDINGS)],
         containers=list(CONTAINER_FILES),
-        max_upload_bytes=settings.max_upload_bytes,
-        max_header_bytes=settings.max_header_bytes,
-        max_gaussians=settings.max_gaussians,
         max_sh_degree=3,
-        max_queue=settings.max_queue,
         max_jobs_per_key=settings.max_jobs_per_key if settings.keys else None,
-        max_uploads=settings.max_uploads,
-        job_seconds=settings.job_seconds,
         job_memory_bytes=settings.job_memory,
-        keep_seconds=settings.keep_seconds,
-        sync_seconds=settings.sync_seconds,
         max_wait_seconds=MAX_WAIT_SECONDS,
+        **{name: getattr(settings, name) for name in _SAME_NAMES},
         keys_required=bool(settings.keys),
         training=can_train(),
     )
@@ -153,8 +152,5 @@ def _disk_problem(context: ServiceContainer) -> str | None:
         free = context.storage.free_bytes()
     except OSError as error:
         return f"the data folder cannot be used: {(error.strerror or str(error)).lower()}"
-    return (
-        None
-        if free >= needed
-        else f"the disk has {free:,} free bytes, fewer than KISSGS_MIN_FREE_BYTES ({needed:,}); free some space"
-    )
+    low = f"the disk has {free:,} free bytes, fewer than KISSGS_MIN_FREE_BYTES ({needed:,}); free some space"
+    return None if free >= needed else low

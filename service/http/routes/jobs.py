@@ -155,9 +155,8 @@ async def compress_now(context: Service, request: Request, job: SubmittedJob) ->
     """
     job = await wait_for_end(context, job, context.settings.sync_seconds, request)
     if job.state == State.SUCCEEDED:
-        result = f"/v1/jobs/{job.id}/result"
         answer = await container(context, job)
-        answer.headers["Content-Location"] = result
+        answer.headers["Content-Location"] = f"/v1/jobs/{job.id}/result"
         answer.headers["Link"] = f'</v1/jobs/{job.id}>; rel="describedby"'
         return answer
     if job.problem is not None:
@@ -197,9 +196,8 @@ async def list_jobs(
     response.headers.update(NO_STORE)
     before = int(cursor) if cursor is not None else None
     jobs = await run_sync(lambda: context.store.listing(owner, limit=limit + 1, before=before, state=state))
-    return JobPage(
-        jobs=await statuses(context, *jobs[:limit]), next=str(jobs[limit - 1].number) if len(jobs) > limit else None
-    )
+    cursor = str(jobs[limit - 1].number) if len(jobs) > limit else None
+    return JobPage(jobs=await statuses(context, *jobs[:limit]), next=cursor)
 
 
 @router.head("/jobs/{id}", include_in_schema=False)

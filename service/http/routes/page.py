@@ -24,8 +24,7 @@ READ = ["GET", "HEAD"]
 
 STATIC = Path(__file__).parents[2] / "static"
 
-REVALIDATE = {"Cache-Control": "no-cache"}
-"""Headers that make browsers revalidate a cached file, so that old and new files do not mix after an upgrade."""
+REVALIDATE = {"Cache-Control": "no-cache"}  # so that old and new files do not mix after an upgrade
 
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'{hashes}; worker-src 'self' blob:; style-src 'self'; "
@@ -105,6 +104,5 @@ def _page() -> Response:
         raise ProblemError("not-found", "this service was installed without its preview page") from error
     maps = re.findall(rb'<script type="importmap">(.*?)</script>', page.replace(b"\r\n", b"\n"), re.DOTALL)
     hashes = "".join(f" 'sha256-{base64.b64encode(hashlib.sha256(text).digest()).decode()}'" for text in maps)
-    return Response(
-        page, media_type="text/html", headers={**REVALIDATE, "Content-Security-Policy": POLICY.format(hashes=hashes)}
-    )
+    headers = {**REVALIDATE, "Content-Security-Policy": POLICY.format(hashes=hashes)}
+    return Response(page, media_type="text/html", headers=headers)

@@ -43,7 +43,9 @@ class StoredFile(FileResponse):
         digest = f"sha-256=:{base64.b64encode(bytes.fromhex(sha256)).decode()}:"
         fixed = {"ETag": f'"{sha256}"', "Content-Digest": digest, "Repr-Digest": digest, **(headers or {})}
         if download is not None:
-            fixed["Content-Disposition"] = _attachment(download)
+            plain = download.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_").replace("\\", "_")
+            extended = quote(download, safe="")  # RFC 6266
+            fixed["Content-Disposition"] = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{extended}"
         try:
             found = path.stat()
         except FileNotFoundError as error:
@@ -74,12 +76,6 @@ class StoredFile(FileResponse):
         await super().__call__(scope, receive, corrected)
 
 
-def _attachment(name: str) -> str:
-    """Format a Content-Disposition header (RFC 6266) with an ASCII fallback of the name."""
-    plain = name.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_").replace("\\", "_")
-    return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"
-
-
 def _names(header: str, etag: str) -> bool:
     tags = [tag.strip().removeprefix("W/") for tag in header.split(",")]
     return header.strip() == "*" or etag in tags
@@ -101,12 +97,10 @@ Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 BINARY = "application/octet-stream"
 _MEDIA_TYPES = {".webp": "image/webp", ".json": "application/json", ".yaml": "application/yaml"}
 
-CONTAINER_TYPES = tuple(file.media_type for file in CONTAINER_FILES.values())
-"""Media types of containers."""
+CONTAINER_TYPES = tuple(file.media_type for file in CONTAINER_FILES.values())  # media types of containers
 
 _PRIVATE = {"Cache-Control": "private, no-cache"}
-_FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
-"""Headers of container files, which never change."""
+_FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}  # headers of container files, which never change
 
 _UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range")
 
@@ -117,14 +111,11 @@ def _file_answers(media_types: str, *codes: str) -> dict[int | str, dict[str, An
         "Repr-Digest": {"schema": {"type": "string"}, "description": "RFC 9530 digest of the whole file."},
         "Accept-Ranges": {"schema": {"type": "string"}, "description": "bytes"},
     }
-    full = {
-        **headers,
-        "Content-Digest": {"schema": {"type": "string"}, "description": "RFC 9530 digest of this response."},
-    }
+    digest = {"schema": {"type": "string"}, "description": "RFC 9530 digest of this response."}
     binary, json = {"type": "string", "format": "binary"}, {"type": "object"}
     content = {name: {"schema": json if name == "application/json" else binary} for name in media_types.split()}
     return {
-        200: {"description": "The file.", "content": content, "headers": full},
+        200: {"description": "The file.", "content": content, "headers": {**headers, "Content-Digest": digest}},
         206: {
             "description": "The requested range.",
             "content": {name: {"schema": binary} for name in content},
