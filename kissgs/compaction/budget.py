@@ -22,17 +22,10 @@ from kissgs.rendering.rasterizer import need_cuda
 from kissgs.settings import CompactSettings
 from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, evaluation_only, supervision_views
 
-START_LOG2, MAX_LOG2 = -2.0, -0.1
-"""log2 of the first share of the Gaussians that a search tries, and of the largest one."""
-
-DROP_PER_HALVING = 0.4
-"""Drop of PSNR, decibels, that a search expects from half as many Gaussians; only for its first steps."""
-
-GRAIN_LOG2 = 1 / 64
-"""Shares are multiples of this, as log2: counts that differ by less than 1 % are not tried both."""
-
-TOLERANCE_DB = 0.02
-"""A search ends once the drop is at most this far below the allowed one, decibels."""
+START_LOG2, MAX_LOG2 = -2.0, -0.1  # log2 of the first share of the Gaussians, and of the largest one
+DROP_PER_HALVING = 0.4  # decibels that a search expects from half as many Gaussians, for its first steps
+GRAIN_LOG2 = 1 / 64  # shares are multiples of this, as log2: counts that differ by less than 1 % are not tried both
+TOLERANCE_DB = 0.02  # a search ends once the drop is at most this far below the allowed one, decibels
 
 NO_CHECKPOINT = "a search for a {} keeps no checkpoint; give a count or a ratio with it"
 
@@ -46,11 +39,9 @@ def compact_scene(
     evaluate: bool = False,
     checkpoint: Path | None = None,
 ) -> Compacted:
-    """Reduce the number of Gaussians to the budget of the settings; no more than that are returned unchanged.
-
-    With a capture, its training views train and score, and its held-out views evaluate. Without one, virtual views
-    train and score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate.
-    """
+    """Reduce the number of Gaussians to the budget of the settings; no more than that are returned unchanged. With a
+    capture, its training views train and score, and its held-out views evaluate. Without one, virtual views train and
+    score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate."""
     if not settings.enabled:
         raise UnsupportedError("missing the number of Gaussians to keep: give count, ratio or max_psnr_drop")
     if settings.auto_count:

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 
 # Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.1).
 
-BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
-"""Learning rates of 3DGS by parameter; that of positions is in units of the extent of the cameras around each."""
+BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}  # of 3DGS
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +57,8 @@ def first_pruning_count(settings: CompactSettings, source_count: int, count: int
 
 
 def training_phases(settings: CompactSettings, source_count: int, count: int) -> list[Phase]:
-    """Return all phases of training: one before each further pruning, then refinement; none if nothing is trained.
-
-    The prunings are spread evenly over ``sparsify_steps``, and each keeps the same share of the Gaussians.
-    """
+    """Return all phases of training: one before each further pruning, then refinement; none if nothing is trained. The
+    prunings are spread evenly over ``sparsify_steps``, and each keeps the same share of the Gaussians."""
     phases = []
     if settings.sparsify_steps:
         rounds = min(settings.prune_rounds, settings.sparsify_steps)
@@ -75,10 +72,8 @@ def training_phases(settings: CompactSettings, source_count: int, count: int) ->
 
 
 def stage_progress(progress: Progress, phases: Sequence[Phase], number: int) -> Progress:
-    """Return a receiver that reports phase ``number`` and the pruning after it as a part of one stage.
-
-    All phases of the same name, and the prunings after them, are one stage of that name.
-    """
+    """Return a receiver that reports phase ``number`` and the pruning after it as a part of one stage. All phases of
+    the same name, and the prunings after them, are one stage of that name."""
     name = phases[number].name
     before = sum(phase.steps for phase in phases[:number] if phase.name == name)
     total = sum(phase.steps for phase in phases if phase.name == name)
@@ -91,11 +86,8 @@ def stage_progress(progress: Progress, phases: Sequence[Phase], number: int) -> 
 
 
 def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> LrSchedule:
-    """Return learning rates: constant while Gaussians are pruned, falling exponentially during refinement.
-
-    3DGS does the latter for positions only. ``target_source`` is that of the training targets: "photos" or
-    "renderings".
-    """
+    """Return learning rates: constant while Gaussians are pruned, falling exponentially during refinement. 3DGS does
+    the latter for positions only. ``target_source`` is that of the training targets: "photos" or "renderings"."""
     from kissgs.training.loop import exponential_lr
 
     base = dict(BASE_LR)
@@ -108,11 +100,8 @@ def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> 
 
 # Checkpoint of a compaction: the status beside the state of the training.
 
-State = Mapping[str, np.ndarray]
-"""Arrays of a checkpoint by name."""
-
-STATUS_ENTRY = "status"
-"""Name of the array that holds the status as JSON; part of the file format."""
+State = Mapping[str, np.ndarray]  # arrays of a checkpoint by name
+STATUS_ENTRY = "status"  # name of the array that holds the status as JSON; part of the file format
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,10 +157,8 @@ class StepLog:
 
 @dataclass(slots=True, eq=False)
 class Popspa:
-    """Compacts one scene by POPSpa.
-
-    On the device "cuda", sums have no fixed order, so that results vary slightly. Scores are computed on the CPU.
-    """
+    """Compacts one scene by POPSpa. On the device "cuda", sums have no fixed order, so that results vary slightly.
+    Scores are computed on the CPU."""
 
     splats: Splats
     settings: CompactSettings  # their budget is ignored
@@ -180,11 +167,9 @@ class Popspa:
     targets: TrainingTargets | None = None  # of these views; loaded or rendered when first needed
 
     def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
-        """Return the scene with exactly ``count`` Gaussians; ``evaluate`` measures every step.
-
-        Training continues from ``checkpoint`` if that exists and belongs to this work, on the CPU with the same result
-        as without an interruption. It stays at the end.
-        """
+        """Return the scene with exactly ``count`` Gaussians; ``evaluate`` measures every step. Training continues from
+        ``checkpoint`` if that exists and belongs to this work, on the CPU with the same result as without an
+        interruption. It stays at the end."""
         if self.settings.trains:
             self.load_targets()
         key = "" if checkpoint is None else self._key(count, evaluate)
@@ -230,12 +215,8 @@ class Popspa:
 
 # ``SceneTraining``: a scene that is pruned and trained in turn, and its state.
 
-MIN_RELATIVE_EXTENT = 1e-4
-"""Extent of the cameras, in radii of the scene, up to which they count as being at one position: a rotating camera,
-whose extent is 0 except for rounding."""
-
-MOST_STEP_PER_SIZE = 0.025
-"""Largest learning rate of a position, in units of the Gaussian's size: the middle one of its three scales."""
+MIN_RELATIVE_EXTENT = 1e-4  # of cameras, in radii of the scene, up to which they count as one rotating camera
+MOST_STEP_PER_SIZE = 0.025  # largest rate of a position over the Gaussian's size, the middle of its scales
 
 MIN_SCORE = {True: 0.05, False: 0.3}
 """Lowest score, in units of the score that an unobstructed camera nearby would find: True with a capture, whose cameras
@@ -318,9 +299,7 @@ class SceneTraining:
         after: Callable[[int], None] = lambda done: None,
     ) -> None:
         """Train for a phase, in fewer steps where the deadline is near; each ``number`` has another order of images.
-
-        The other arguments are those of :func:`kissgs.training.loop.train`.
-        """
+        The other arguments are those of :func:`kissgs.training.loop.train`."""
         from kissgs.training.loop import TrainingPlan, train
 
         settings, targets = self.compactor.settings, self.compactor.load_targets()
@@ -349,11 +328,9 @@ class SceneTraining:
         return extent if extent > MIN_RELATIVE_EXTENT * radius else radius
 
     def _position_extents(self) -> Float32[np.ndarray, " M"]:
-        """Return the unit of the position learning rate of each Gaussian, from its position and size in the source.
-
-        The rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size,
-        and positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes.
-        """
+        """Return the unit of the position learning rate of each Gaussian, from its position and size in the source. The
+        rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size, and
+        positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes."""
         settings, source = self.compactor.settings, self.compactor.splats
         extents = self.compactor.load_targets().local_extents(source.means[self.index], self._camera_extent())
         sizes = np.exp(np.median(source.scales[self.index].astype(np.float64), axis=1))
@@ -473,8 +450,7 @@ class _Run:
 
 # ``TrainingPath``: one training through falling numbers of Gaussians, which can be completed at any of them.
 
-REFINEMENT = 1_000_000
-"""Number of the refinement in seeds: no path has as many points."""
+REFINEMENT = 1_000_000  # number of the refinement in seeds: no path has as many points
 
 POINT_STEPS = {"photos": 3, "renderings": 1}
 """Training steps at a point by the targets, in units of those between two prunings of a compaction to one number.
@@ -500,11 +476,9 @@ class PathPoint:
 
 @dataclass(slots=True, eq=False)
 class TrainingPath:
-    """Prunes and trains a scene in turn, and keeps the scene at every number of Gaussians.
-
-    Learning rates stay high along the path. :meth:`compacted` lets them fall from any of its points, which a compaction
-    to that number alone would do at its end. So several numbers of Gaussians share one training.
-    """
+    """Prunes and trains a scene in turn, and keeps the scene at every number of Gaussians. Learning rates stay high
+    along the path. :meth:`compacted` lets them fall from any of its points, which a compaction to that number alone
+    would do at its end. So several numbers of Gaussians share one training."""
 
     compactor: Popspa
     keep_states: bool = True  # every point, not just the last one, can be refined: that takes three times the memory
@@ -516,21 +490,17 @@ class TrainingPath:
         self.points = [self.whole]
 
     def prune(self, count: int) -> PathPoint:
-        """Prune to ``count`` Gaussians, and return the new point; reports the stages "kernels" and "score".
-
-        If a progress receiver raises here or in :meth:`train`, the path stays as it was.
-        """
+        """Prune to ``count`` Gaussians, and return the new point; reports the stages "kernels" and "score". If a
+        progress receiver raises here or in :meth:`train`, the path stays as it was."""
         load_kernels(self.compactor.context.progress)
         training = self._at(self.points[-1])
         training.prune(count, self.compactor.context)
         return self._add(training, len(self.points), 0)
 
     def train(self, *, passed: bool = False, deadline: Deadline | None = None) -> PathPoint:
-        """Train the last point, and return it; reports "sparsify".
-
-        :data:`POINT_STEPS` times ``sparsify_steps / prune_rounds`` steps are made in all, rounded down, or a single
-        time as many if it is ``passed`` on the way to another; with a deadline, as many of them as fit in.
-        """
+        """Train the last point, and return it; reports "sparsify". :data:`POINT_STEPS` times ``sparsify_steps /
+        prune_rounds`` steps are made in all, rounded down, or a single time as many if it is ``passed`` on the way to
+        another; with a deadline, as many of them as fit in."""
         compactor, point = self.compactor, self.points[-1]
         if compactor.settings.sparsify_steps == 0:
             return point
@@ -549,10 +519,8 @@ class TrainingPath:
         return self._add(training, point.number, made[-1])
 
     def compacted(self, point: PathPoint, *, refine: bool, deadline: Deadline | None = None) -> Compacted:
-        """Return a point as a compacted scene; ``refine`` completes its training with falling learning rates.
-
-        With a ``deadline``, as many of its steps are made as fit in; reports the stage "refine".
-        """
+        """Return a point as a compacted scene; ``refine`` completes its training with falling learning rates. With a
+        ``deadline``, as many of its steps are made as fit in; reports the stage "refine"."""
         compactor, splats = self.compactor, point.splats
         if refine and compactor.settings.refine_steps:
             training = self._at(point)

@@ -17,11 +17,8 @@ from kissgs.evaluation.evaluate import Rendering, compare_images
 from kissgs.evaluation.results import SEARCH_SEED, Evaluation
 from kissgs.training.supervision import SupervisionViews
 
-COUNT, SIDE = 24, 320
-"""Number and side, pixels, of the views without a capture, apart from those drawn over the whole scene."""
-
-KEPT_PIXELS = 2**24
-"""Pixels of all held-out views of a capture up to which the renderings of the original are kept, 0.2 GB."""
+COUNT, SIDE = 24, 320  # number and side, pixels, of the views without a capture, but for those drawn over the scene
+KEPT_PIXELS = 2**24  # of a capture's held-out views up to which renderings of the original are kept, 0.2 GB
 
 
 @dataclass(slots=True, eq=False)

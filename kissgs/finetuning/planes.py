@@ -26,8 +26,7 @@ from kissgs.planning.sh_codebook import COEFFICIENTS
 
 T = TypeVar("T")
 
-PART = 1 << 16
-"""Number of rows that a thread processes at a time; sums of parts are added in order."""
+PART = 1 << 16  # number of rows that a thread processes at a time; sums of parts are added in order
 
 
 def each_part(work: Callable[[int, int], T], rows: int, threads: int) -> list[T]:
@@ -158,14 +157,9 @@ def sum_by_label(
 
 # Levels of a field in training, and the tables whose values are trained.
 
-FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")
-"""Trained fields of an encoding plan."""
-
-TABLES = ("scales", "f_dc", "f_rest_centroids")
-"""Fields whose tables are trained, in a container with tables."""
-
-REACH = 0.45
-"""Largest change of a value of a table, in units of the distance to its neighbour, so that the order stays."""
+FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")  # trained
+TABLES = ("scales", "f_dc", "f_rest_centroids")  # fields whose tables are trained, in a container with tables
+REACH = 0.45  # largest change of a value of a table, in units of the distance to its neighbour, so that the order stays
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,11 +211,9 @@ class _Short(torch.autograd.Function):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
-    """One field: maps latents to levels to values of its table.
-
-    A row uses some of the levels, which are a list. A latent beside each level is in units of the distance to the next
-    level of the list, so it is rounded to the level of the nearest value.
-    """
+    """One field: maps latents to levels to values of its table. A row uses some of the levels, which are a list. A
+    latent beside each level is in units of the distance to the next level of the list, so it is rounded to the level of
+    the nearest value."""
 
     field: Quantized  # levels of the plan; one row per Gaussian, or per entry of the codebook
     base_multiples: Float64[Tensor, "R C"]  # place of each level of the plan in the list of its row
@@ -243,11 +235,9 @@ class Plane:
         usable: tuple[int, int] = (0, SIZE - 1),
         largest_gap: float = np.inf,
     ) -> Plane:
-        """Return the plane of a field whose rows use the levels of the ``lists`` with these ``numbers``.
-
-        No latent crosses a larger distance of values than ``largest_gap``: a step over a wider one, as between the flat
-        and the thick axes of discs, would make a different Gaussian.
-        """
+        """Return the plane of a field whose rows use the levels of the ``lists`` with these ``numbers``. No latent
+        crosses a larger distance of values than ``largest_gap``: a step over a wider one, as between the flat and the
+        thick axes of discs, would make a different Gaussian."""
         starts = np.cumsum([1] + [len(levels) + 2 for levels in lists])
         lowest, highest = np.empty(field.levels.shape, np.int64), np.empty(field.levels.shape, np.int64)
         place = np.empty(field.levels.shape, np.int64)
@@ -262,10 +252,8 @@ class Plane:
 
     @classmethod
     def even(cls, field: Quantized, device: Device, *, freeze_top: bool = False) -> Plane:
-        """Return the plane of a field with even levels, of which a row uses the multiples of its stride.
-
-        A level that is no multiple of its stride starts at the nearest multiple.
-        """
+        """Return the plane of a field with even levels, of which a row uses the multiples of its stride. A level that
+        is no multiple of its stride starts at the nearest multiple."""
         levels, offset = field.levels.astype(np.int64), field.level_offset
         stride = np.asarray(field.level_stride, np.int64)
         stride = np.broadcast_to(stride if stride.ndim == 2 else stride.reshape(-1, 1), levels.shape)
@@ -326,9 +314,7 @@ class Plane:
         factor: float,
     ) -> None:
         """Add ``factor`` times the gradient of the quadratic attraction of each latent to its current level.
-
-        ``weights`` are the curvature of the loss by the values.
-        """
+        ``weights`` are the curvature of the loss by the values."""
         if latents.device.type != "cpu":
             level = (torch.round(self.base_multiples + latents) - self.base_multiples).float()
             gradient += (factor * weights * self.units(latents, table) ** 2).float() * (latents - level)
@@ -416,10 +402,8 @@ def _entries(table: Float64[Tensor, "L _"], levels: Int[Tensor, "R C"]) -> Float
 def _reachable(
     values: Float64[np.ndarray, " levels"], usable: Int[np.ndarray, " 2"], largest_gap: float
 ) -> tuple[Int[np.ndarray, " levels"], Int[np.ndarray, " levels"]]:
-    """Return the first and the last place that each place of a list reaches without a wide gap.
-
-    ``usable`` are the first place that may be used, and the one after the last.
-    """
+    """Return the first and the last place that each place of a list reaches without a wide gap. ``usable`` are the
+    first place that may be used, and the one after the last."""
     wide = np.diff(values) > largest_gap
     part, places = np.concatenate([[0], np.cumsum(wide)]), np.arange(len(values))
     first, last = np.searchsorted(part, part), np.searchsorted(part, part, side="right") - 1

@@ -30,8 +30,7 @@ from kissgs.training.model import PrunableAdam
 
 # The decoders' own functions for training: exact values forward, gradients backward.
 
-SMALLEST_DIVISOR = 0.05
-"""Smallest missing component of a rotation by which its gradient is divided."""
+SMALLEST_DIVISOR = 0.05  # smallest missing component of a rotation by which its gradient is divided
 
 
 class _SignedExp(torch.autograd.Function):
@@ -123,8 +122,7 @@ class _LookUp(torch.autograd.Function):
 # ``level - gradient / curvature``, which is the same point from both levels, and is rounded to the nearer one. The
 # curvature follows from the costs of errors (:class:`kissgs.planning.rd_criterion.Costs`).
 
-ATTRIBUTE_FIELDS = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}
-"""Fields that hold an attribute without transformation, by attribute."""
+ATTRIBUTE_FIELDS = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}  # without transformation
 
 
 class QuantizedScene:
@@ -209,9 +207,7 @@ class QuantizedScene:
 
     def step(self, rates: Mapping[str, float]) -> None:
         """Make an Adam step of the latents, with quadratic attraction, within the levels that the images can hold.
-
-        ``rates`` has learning rates by field and :func:`table_name`, and the factor of the ``"attraction"``, 0 to 1.
-        """
+        ``rates`` has learning rates by field and :func:`table_name`, and the factor of the ``"attraction"``, 0 to 1."""
         rotations = self.latents["quaternions"].detach().clone() if self._omitted is not None else None
         if self._weights and rates["attraction"] > 0:
             self._attract(rates["attraction"])
@@ -284,18 +280,14 @@ def _values(name: str, fields: Mapping[str, Quantized]) -> Float64[np.ndarray, "
 
 # ``CodebookRate``: estimated bits of the SH codebook's image, for fine-tuning.
 
-DIFFERENCE_OFFSET = 0.3
-"""Added to mean differences, levels; it bounds the bits of a level where neighbours are nearly equal."""
+DIFFERENCE_OFFSET = 0.3  # added to mean differences, levels; it bounds the bits where neighbours are equal
 
 
 class CodebookRate:
-    """Bits of the square image of an SH codebook.
-
-    WebP subtracts green from red and blue, predicts each from its neighbours, and codes the rest. So the bits of a
-    level are those of its difference from the entries beside and above it, in Laplace distributions: the mean of both
-    differences, over ln 2 times the mean difference of its colour and coefficient. Only their derivative matters; the
-    constant is left out.
-    """
+    """Bits of the square image of an SH codebook. WebP subtracts green from red and blue, predicts each from its
+    neighbours, and codes the rest. So the bits of a level are those of its difference from the entries beside and above
+    it, in Laplace distributions: the mean of both differences, over ln 2 times the mean difference of its colour and
+    coefficient. Only their derivative matters; the constant is left out."""
 
     table: Float32[np.ndarray, "3 15"]  # mean difference plus DIFFERENCE_OFFSET of red - green, green and blue - green
 
@@ -401,18 +393,15 @@ Entries of the SH codebook are added where they are a list, sorted by frequency:
 In a square they predict each other (:class:`kissgs.finetuning.quantized_scene.CodebookRate`).
 """
 
-RECOUNT_STEPS = 25
-"""Number of steps between two updates of the histograms and of the mean differences."""
+RECOUNT_STEPS = 25  # number of steps between two updates of the histograms and of the mean differences
 
 
 class RateLoss(Regularizer):
-    """Regularizer: estimated bits of all levels.
-
-    The bits are those of an ideal entropy code with one histogram per sensitivity class and channel. WebP's entropy
-    image comes near to it, and RDO quantisation uses it too (:mod:`kissgs.planning.rd_fields`). Between two levels,
-    bits are interpolated linearly, so that the gradient moves latents to the cheaper neighbouring level. Those of a
-    square SH codebook come from differences of neighbouring entries.
-    """
+    """Regularizer: estimated bits of all levels. The bits are those of an ideal entropy code with one histogram per
+    sensitivity class and channel. WebP's entropy image comes near to it, and RDO quantisation uses it too
+    (:mod:`kissgs.planning.rd_fields`). Between two levels, bits are interpolated linearly, so that the gradient moves
+    latents to the cheaper neighbouring level. Those of a square SH codebook come from differences of neighbouring
+    entries."""
 
     def __init__(self, scene: QuantizedScene, weight: float) -> None:
         """Prepare the loss of ``scene``; ``weight`` is the weight of one bit."""
@@ -453,16 +442,13 @@ class RateLoss(Regularizer):
 PAPER_TV_WEIGHTS = {"opacities": 1e-4, "scales": 1e-4, "means": 1e-4, "f_dc": 1e-4, "quaternions": 1e-2}
 """Weights of total variation by field (KISS-GS, appendix); for positions, of each of the two byte images."""
 
-TV_RAMP = (0.35, 0.6)
-"""Fractions of the steps between which these weights grow linearly from 0 (KISS-GS, appendix)."""
+TV_RAMP = (0.35, 0.6)  # fractions of the steps between which these weights grow linearly from 0 (KISS-GS, appendix)
 
 
 class TotalVariationLoss(Regularizer):
-    """Regularizer: masked L1 total variation of the images, the paper's term for small files.
-
-    For each image it is the mean absolute difference of levels over all pairs of neighbouring cells that hold Gaussians
-    and over channels. The paper does not state the unit; here it is levels.
-    """
+    """Regularizer: masked L1 total variation of the images, the paper's term for small files. For each image it is the
+    mean absolute difference of levels over all pairs of neighbouring cells that hold Gaussians and over channels. The
+    paper does not state the unit; here it is levels."""
 
     def __init__(self, scene: QuantizedScene, weight: float, pace: Pace) -> None:
         """Prepare the loss."""

@@ -35,20 +35,11 @@ from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
 from kissgs.training.supervision import SupervisionViews, TrainingTargets
 
-SENSITIVITY_VIEWS = 64
-"""Approximate number of training cameras from which costs are measured, if the plan has none."""
-
-VIEW_UNCERTAINTY = 0.1
-"""View uncertainty of these costs, see :class:`kissgs.Sensitivity`."""
-
-LOSS_VIEWS = 16
-"""Largest number of targets from which the loss before training is estimated."""
-
-ATTRACTION_START = 0.5
-"""Fraction of the steps after which quadratic attraction starts; it grows linearly to 1 at the last step."""
-
-TABLE_LR = 1.0
-"""Learning rate of tables in units of that of the levels: an error of a value is one of everything that uses it."""
+SENSITIVITY_VIEWS = 64  # approximate number of training cameras from which costs are measured, if the plan has none
+VIEW_UNCERTAINTY = 0.1  # view uncertainty of these costs, see Sensitivity
+LOSS_VIEWS = 16  # largest number of targets from which the loss before training is estimated
+ATTRACTION_START = 0.5  # fraction of the steps after which attraction starts; it grows linearly to 1
+TABLE_LR = 1.0  # of tables, in units of that of levels: an error of a value is one of all that uses it
 
 NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
 
@@ -58,12 +49,10 @@ MOST_STEPS = {"photos": 1, "renderings": 2}
 """Most steps before a deadline, in units of the usual number, by the targets: more steps fit the photographs that train
 better, and those that are held out worse."""
 
-Write = Callable[[EncodingPlan, int, Context], Encoded]
-"""Writes a plan that was fine-tuned in a number of steps."""
+Write = Callable[[EncodingPlan, int, Context], Encoded]  # writes a plan that was fine-tuned in a number of steps
 
 
-Decode = Callable[..., Splats]
-"""Decoder of a container: takes its files, ``ReadOptions`` and ``threads``."""
+Decode = Callable[..., Splats]  # decoder of a container: takes its files, ReadOptions and threads
 
 
 @dataclass(slots=True, eq=False)
@@ -88,10 +77,8 @@ class Tuner:
         checkpoint: Path | None = None,
     ) -> tuple[Encoded, FinetuneReport]:
         """Fine-tune from ``start``, and return the better container with a report: the tuned one, or that of ``plan``.
-
         Without ``plan``, the training is part of that of the scene, and no container is made before it. If the file
-        ``checkpoint`` exists and belongs to this work, training continues from it.
-        """
+        ``checkpoint`` exists and belongs to this work, training continues from it."""
         started = time.perf_counter()
         as_finetune = self.context.stage("finetune")
         before, first, rd_lambda = None, None, start.rd_lambda
@@ -195,11 +182,8 @@ class Tuner:
         return scene.plan(), checkpoint_note
 
     def _loss_per_error(self, scene: QuantizedScene) -> float:
-        """Estimate the derivative of the loss with respect to the mean squared image error.
-
-        All of the loss but the error itself is taken as proportional to the root of the error, as for errors on top of
-        those to photographs.
-        """
+        """Estimate the derivative of the loss with respect to the mean squared image error. All of the loss but the
+        error itself is taken as proportional to the root of the error, as for errors on top of those to photographs."""
         settings, losses, errors = self.settings, [], []
         with torch.no_grad(), torch_threads(1):  # the sums depend on the number of threads
             parameters = scene.gaussians()

@@ -1,7 +1,5 @@
 """Curves through the plane of number of Gaussians and lambda, along which a search finds the root of a goal's margin.
-
-One curve changes lambda alone, the other removes Gaussians and raises lambda together.
-"""
+One curve changes lambda alone, the other removes Gaussians and raises lambda together."""
 
 from __future__ import annotations
 
@@ -132,9 +130,7 @@ class LambdaCurve:
 
     def _settled(self, inside: float, outside: float) -> bool:
         """Whether the size jumps between two values of log2(lambda), the last that fits and the next that does not.
-
-        Only for sizes: for a PSNR or a drop, the codebook that belongs to the finer lambda is the better one.
-        """
+        Only for sizes: for a PSNR or a drop, the codebook that belongs to the finer lambda is the better one."""
         sides = {self.found[x].made.encoded.codebook_side for x in (inside, outside)}
         gap = abs(inside - outside)
         return self.goal.by_size and (gap < MIN_STEP_LOG2 or (gap < JUMP_LOG2 and len(sides) > 1 and not self.tuned))
@@ -188,12 +184,10 @@ def last_number(count: int) -> int:
 
 
 def first_point(goal: Goal, number: int, offset_db: float, *, may_step: bool) -> tuple[int, float]:
-    """Return the point of the first container, and the decibels added to ``quality_offset_db`` there.
-
-    ``number`` and ``offset_db`` are those for a loss of 0.1 dB. A goal that allows more gets fewer Gaussians if it
-    ``may_step``. With fewer Gaussians, lambda at equal quality is larger by about :data:`LAMBDA_SHARE` of the step
-    already, so the decibels only make up for the rounding to whole points.
-    """
+    """Return the point of the first container, and the decibels added to ``quality_offset_db`` there. ``number`` and
+    ``offset_db`` are those for a loss of 0.1 dB. A goal that allows more gets fewer Gaussians if it ``may_step``. With
+    fewer Gaussians, lambda at equal quality is larger by about :data:`LAMBDA_SHARE` of the step already, so the
+    decibels only make up for the rounding to whole points."""
     step = min(goal.allowed_log2, MAX_STEP if may_step else 0.0)
     points = round((1 - LAMBDA_SHARE) * step * POINTS_PER_HALVING)
     rest = (1 - LAMBDA_SHARE) * step - points / POINTS_PER_HALVING

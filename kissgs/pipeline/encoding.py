@@ -36,10 +36,8 @@ if TYPE_CHECKING:
 
 
 def read_sensitivity(path: Path, key: str) -> Sensitivity | None:
-    """Read what :func:`write_sensitivity` has written with ``key``; None if the file is missing or has another key.
-
-    Any other file is refused, because it would be replaced.
-    """
+    """Read what :func:`write_sensitivity` has written with ``key``; None if the file is missing or has another key. Any
+    other file is refused, because it would be replaced."""
     refuse_existing(path, overwrite=True)  # before the measurement, whose result is written there
     try:
         if not path.exists():
@@ -66,14 +64,9 @@ def write_sensitivity(path: Path, sensitivity: Sensitivity, key: str) -> None:
 
 # One encoding of a scene: measure sensitivity, plan, fine-tune, write.
 
-VIEW_UNCERTAINTY = {True: 0.1, False: 0.55}
-"""Default of the setting ``view_uncertainty``: True with the cameras of a capture, False with virtual cameras only."""
-
-SENSITIVITY_VERSION = 5
-"""Version of the measurement of sensitivity; a cache file of another version is measured again and replaced."""
-
-REFIT_SIZE = 320
-"""Largest longer side of the images that colours are refitted to, pixels."""
+VIEW_UNCERTAINTY = {True: 0.1, False: 0.55}  # by default: True with a capture's cameras
+SENSITIVITY_VERSION = 5  # of its measurement; a cache file of another version is measured again
+REFIT_SIZE = 320  # largest longer side of the images that colours are refitted to, pixels
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -172,10 +165,8 @@ def encode(
     checkpoint: Path | None = None,
     completes: bool = False,
 ) -> Container:
-    """Plan a scene, fine-tune its levels if there is a tuner, and write the files.
-
-    If fine-tuning ``completes`` the training of the scene, no container is made without it.
-    """
+    """Plan a scene, fine-tune its levels if there is a tuner, and write the files. If fine-tuning ``completes`` the
+    training of the scene, no container is made without it."""
     compacted = len(work.original) - len(scene.splats)
     pruned = settings if tuner is None else _pruned_for_finetune(settings, work.settings.finetune)
     chosen = plan(work, scene, pruned if completes else settings, work.context)

@@ -173,11 +173,9 @@ class Limit:
         return (digits or form.format)(found) + unit
 
     def margin(self, attempt: Attempt) -> float:
-        """Return by how much an attempt stays within the limit: at least 0 where it is met.
-
-        The unit is log2 of a ratio for sizes and drops, and decibels for a PSNR. Infinite where nothing is lost at all:
-        then the distance to the limit is unknown. -∞ where the figure is unknown or not a number.
-        """
+        """Return by how much an attempt stays within the limit: at least 0 where it is met. The unit is log2 of a ratio
+        for sizes and drops, and decibels for a PSNR. Infinite where nothing is lost at all: then the distance to the
+        limit is unknown. -∞ where the figure is unknown or not a number."""
         found = self.figure(attempt)
         if found is None or math.isnan(found):
             return -math.inf
@@ -216,11 +214,8 @@ class Goal:
 
     @classmethod
     def of(cls, settings: EncodeSettings) -> Goal:
-        """Return the goal of these settings.
-
-        Near is 3 % of a size, 0.1 dB of a PSNR, 0.02 dB of a drop of PSNR and 5 % of a drop of SSIM, for which a
-        container takes some 3 % of bytes.
-        """
+        """Return the goal of these settings. Near is 3 % of a size, 0.1 dB of a PSNR, 0.02 dB of a drop of PSNR and 5 %
+        of a drop of SSIM, for which a container takes some 3 % of bytes."""
         limits, size, quality = list[Limit](), settings.target_size, QUALITIES.get(settings.quality or "")
         name, of_psnr, of_ssim = settings.quality or "", "", ""
         psnr_drop, ssim_drop = settings.max_psnr_drop, settings.max_ssim_drop
@@ -269,10 +264,8 @@ class Goal:
 
     @property
     def allowed_log2(self) -> float:
-        """How often the limits on losses typically allow to halve a quarter of the Gaussians, a fraction.
-
-        Below 0 if more than a quarter are needed; 0 if the goal limits no loss.
-        """
+        """How often the limits on losses typically allow to halve a quarter of the Gaussians, a fraction. Below 0 if
+        more than a quarter are needed; 0 if the goal limits no loss."""
         known = [(limit, limit.quarter_loss) for limit in self.limits if limit.quarter_loss is not None]
         return min(((limit.value - expected) / limit.per_halving for limit, expected in known), default=0.0)
 

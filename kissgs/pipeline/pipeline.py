@@ -416,10 +416,8 @@ def _search(work: Work, *, time_only: bool) -> tuple[Container, tuple[Attempt, .
 
 
 def _encode_once(work: Work, checkpoint: Path | None, *, disposable: bool) -> Container:
-    """Plan, fine-tune if the settings say so, and write the files.
-
-    A disposable scene that is not fine-tuned is forgotten once it is planned, so that its memory is free for the files.
-    """
+    """Plan, fine-tune if the settings say so, and write the files. A disposable scene that is not fine-tuned is
+    forgotten once it is planned, so that its memory is free for the files."""
     from kissgs.pipeline.encoding import encode, make_tuner, measure, plan, write
     from kissgs.pipeline.goal import Container
 

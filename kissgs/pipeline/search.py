@@ -46,12 +46,8 @@ if TYPE_CHECKING:
     from kissgs.finetuning.result import FinetuneReport
     from kissgs.finetuning.tune import Tuner
 
-MAX_OFFSET_DB = 30.0
-"""Largest value of the setting ``quality_offset_db``."""
-
-TUNED_CONTAINERS, ENCODES = 3, 6
-"""Largest number of containers of all Gaussians that are fine-tuned, and of those without training before others that
-are trained."""
+MAX_OFFSET_DB = 30.0  # largest value of the setting quality_offset_db
+TUNED_CONTAINERS, ENCODES = 3, 6  # most containers fine-tuned, and of those before trained ones
 
 COMPLETING = {"steps": 1.2, "lr": 2.5, "codebook_lr": 2.0}
 """Factors on settings of fine-tuning that completes the training of the path too.
@@ -59,13 +55,8 @@ COMPLETING = {"steps": 1.2, "lr": 2.5, "codebook_lr": 2.0}
 A refinement of the scene before its encoding would take more steps for the same quality.
 """
 
-PRUNABLE_POINTS, PRUNABLE_DROP = 3, 1.0
-"""Last point that is pruned without training where there are photographs, half of the Gaussians, unless one before it
-loses more than so many decibels."""
-
-RENDERED_POINTS = 5
-"""Last point that is pruned without training where renderings of the scene are the targets, from which training along
-the path departs."""
+PRUNABLE_POINTS, PRUNABLE_DROP = 3, 1.0  # last one pruned without training; most decibels that others lose
+RENDERED_POINTS = 5  # last point pruned without training on renderings, from which training departs
 
 RECOVERABLE_DB = 1.5
 """Loss of PSNR at the end of a short training path, decibels beyond the one that is allowed, from which fine-tuning
@@ -75,18 +66,14 @@ BYTES_PER_GAUSSIAN, BYTES_OF_SH, OVERHEAD_BYTES = 8.6, 4.0, 4000
 """Bytes of a trained container per Gaussian that are expected at first, those of view-dependent colour in addition, and
 those that are no images before the first container shows how many these are."""
 
-SIZE_BY_COUNT = 0.6
-"""Exponent of the number of Gaussians to which the size of a container grows at equal lambda."""
-
-HALF_LEFT = 1.0
-"""Margin of a point before any encoding that leaves half of the allowed loss to the encoder."""
+SIZE_BY_COUNT = 0.6  # exponent of the number of Gaussians to which the size of a container grows at equal lambda
+HALF_LEFT = 1.0  # margin of a point before any encoding that leaves half of the allowed loss to the encoder
 
 NEAR_LOG2, NEAR_IN_TIME = 0.09, 0.06
 """Margin, as log2 of the number of Gaussians, below which a container that meets the goal ends the search: 0.03 dB.
 Another one would save some 3 % of its bytes, or 1 to 2 %, which is worth a time that the user has given."""
 
-UNKNOWN_DROP = 1e6
-"""Larger than any finite drop of PSNR, decibels."""
+UNKNOWN_DROP = 1e6  # larger than any finite drop of PSNR, decibels
 
 NOT_FINETUNED = "no fine-tuned container meets the goal better: this one is not fine-tuned"
 
@@ -307,10 +294,8 @@ class Search:
 
     def _first_that_fails(self, path: TrainingPath, number: int) -> int:
         """Train along the path from point ``number`` on, up to the first that misses the goal before any encoding.
-
         Photographs may show more than the scene does: training then makes it better than it was, and a container of
-        point ``number`` would use up little of what may be lost.
-        """
+        point ``number`` would use up little of what may be lost."""
         last = last_number(len(path.whole))
         while number < last:
             for passed in (True, False):  # a few steps show whether the scene is far from the limit
@@ -325,9 +310,7 @@ class Search:
 
     def _recovers(self, path: TrainingPath) -> bool:
         """Train up to the first point, and return whether fine-tuning can be expected to recover what is still lost.
-
-        The larger and the more detailed a scene is, the less is recovered in a time.
-        """
+        The larger and the more detailed a scene is, the less is recovered in a time."""
         allowed = self.goal.psnr_drop
         if allowed is None:  # PSNR does not tell what becomes of other goals
             return True
@@ -336,10 +319,8 @@ class Search:
 
     def _search_without_photographs(self, path: TrainingPath) -> None:
         """Encode all Gaussians, then as few of them as pruning alone serves the goal with, trained if settings say so.
-
         For a size, pruning without training loses more than it saves, unless all Gaussians miss it. A scene whose
-        Gaussians are all needed keeps them.
-        """
+        Gaussians are all needed keeps them."""
         trains, most = self.trains and self.plan.containers > 0, self.encode_settings.max_encodes
         self._search_all_gaussians(tunes=False, most=min(ENCODES, most) if trains else most)
         whole, fits = self.best, self.goal.by_size and self.attempts[0].bytes <= self.target_size
@@ -368,10 +349,8 @@ class Search:
 
     def _encode_latest(self, path: TrainingPath) -> None:
         """Encode the latest point of the path without further training, or all Gaussians, where a search was stopped.
-
         For a quality it is the latest trained point that leaves at least half of the error to the encoder: most do not,
-        as they are still to be fine-tuned.
-        """
+        as they are still to be fine-tuned."""
         latest, self.stopped = len(path.points) - 1, False
         self._progress.progress = ignore_stop_search(self._progress.progress)
         if not self.goal.by_size and path.points[latest].trained and latest not in self._margins:
@@ -598,10 +577,8 @@ class Search:
         return evaluated
 
     def _loss(self, made: Container) -> float:
-        """Return the drop of PSNR of a container, decibels; infinite if a rendering failed.
-
-        If the photographs equal the scene's renderings, every drop is infinite. It is then a large number minus PSNR.
-        """
+        """Return the drop of PSNR of a container, decibels; infinite if a rendering failed. If the photographs equal
+        the scene's renderings, every drop is infinite. It is then a large number minus PSNR."""
         evaluation = self._evaluate(made)
         drop, psnr = drop_of(evaluation), evaluation.mean.candidate.psnr
         if math.isnan(drop) or math.isnan(psnr):

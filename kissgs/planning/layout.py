@@ -28,8 +28,7 @@ from kissgs.settings import EncodeSettings
 MIN_BLOCK = 8
 MIN_CONFIGURATIONS = 4
 CHANNELS_PER_TASK = 4
-CONVERGED = 1e-4
-"""Share of its squared distance by which a pass must reduce a block's, or be its last."""
+CONVERGED = 1e-4  # share of its squared distance by which a pass must reduce a block's, or be its last
 
 
 def plas(
@@ -121,8 +120,7 @@ def box_blur(image: Float32[np.ndarray, "H W C"], radius: int, pool: Workers) ->
 # and the fourth the column. Four sorts take milliseconds where PLAS, which moves
 # vectors until neighbours are as similar as possible, takes seconds.
 
-BLOCK = 8
-"""Side of a block, cells; sides of codebooks are multiples of it."""
+BLOCK = 8  # side of a block, cells; sides of codebooks are multiples of it
 
 
 def principal_axes(vectors: Float32[np.ndarray, "N D"], number: int) -> Float32[np.ndarray, "N axes"]:
@@ -152,11 +150,8 @@ def axes_order(coordinates: Float32[np.ndarray, "cells axes"]) -> Int[np.ndarray
 # through space, planes are smaller than with any two-dimensional arrangement that was measured. The grid is described
 # in docs/reference/format.md.
 
-PLAS_HIGH, PLAS_LOW = 1.0, 0.2
-"""Weights of the high and the low position bytes in PLAS, as in the paper's public encoder."""
-
-CURVE_BITS = 48
-"""Bits of a position along the Hilbert curve."""
+PLAS_HIGH, PLAS_LOW = 1.0, 0.2  # weights of high and low position bytes, as in the paper's public encoder
+CURVE_BITS = 48  # bits of a position along the Hilbert curve
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,11 +185,9 @@ def layout_grid(
     classes: Integer[np.ndarray, " M"] | None = None,
     groups: UInt16[np.ndarray, " N"] | None = None,
 ) -> Grid:
-    """Assign a cell to every Gaussian of ``kept``.
-
-    With ``classes`` and the Hilbert order, the Gaussians of class 0 come first, then those of class 1 and so on, each
-    class along its own curve. With ``groups``, all this is done for group 0, then for group 1 and so on.
-    """
+    """Assign a cell to every Gaussian of ``kept``. With ``classes`` and the Hilbert order, the Gaussians of class 0
+    come first, then those of class 1 and so on, each class along its own curve. With ``groups``, all this is done for
+    group 0, then for group 1 and so on."""
     side = grid_side(len(kept))
     if len(kept) == 0:
         nothing = np.zeros(side * side, dtype=np.int32)

@@ -46,34 +46,19 @@ from kissgs.settings import EncodeSettings
 # WebP codes the differences of a pixel from the one on its left, which then take fewer bits for what resembles that of
 # neighbours: high bytes of positions and base colours.
 
-BLOCK, SMALLEST = 1 << 13, 64
-"""Largest and smallest number of Gaussians that are reordered together: reversals in larger blocks take longer, and
-smaller ones have too few differences to count."""
-
-ROUNDS, PASSES = 2, 2
-"""Number of times that bits are counted and near Gaussians found, each time in blocks that begin elsewhere, and the
-largest number of passes of the local search in each."""
-
-NEAR, REACH = 8, 16
-"""Number of Gaussians that each one may be joined to, and places on the curves among which they are found."""
-
-CURVES = ((0, 1, 2, 0), (1, 2, 0, 21845), (2, 0, 1, 43690))
-"""Axes and shift of the Hilbert curves on which near Gaussians are found: where one has a gap, another has none."""
-
-SMOOTHING = ((-2, 1 / 9), (-1, 2 / 9), (0, 3 / 9), (1, 2 / 9), (2, 1 / 9))
-"""Shifts and weights of the average of the counts of similar differences."""
-
-UNIT = 256
-"""Fractions of a bit that the local search counts in, so that no rounding of a machine changes the order."""
+BLOCK, SMALLEST = 1 << 13, 64  # Gaussians reordered together; fewer have too few differences to count
+ROUNDS, PASSES = 2, 2  # rounds of counting bits, in blocks that begin elsewhere, and most passes in each
+NEAR, REACH = 8, 16  # Gaussians that each may be joined to, and places on the curves where they are found
+CURVES = ((0, 1, 2, 0), (1, 2, 0, 21845), (2, 0, 1, 43690))  # axes and shift: where one has a gap, another has none
+SMOOTHING = ((-2, 1 / 9), (-1, 2 / 9), (0, 3 / 9), (1, 2 / 9), (2, 1 / 9))  # average of counts: shifts, weights
+UNIT = 256  # fractions of a bit that the local search counts in, so that no rounding of a machine changes the order
 
 
 def refine_order(
     plan: EncodingPlan, groups: UInt16[np.ndarray, " N"] | None, pool: Workers, progress: Progress
 ) -> EncodingPlan:
     """Reorder a plan along the Hilbert curve within each class, and within each of ``groups``; reports "reorder".
-
-    Padding, at the end, repeats the last Gaussian, which stays.
-    """
+    Padding, at the end, repeats the last Gaussian, which stays."""
     count = len(plan.classes)
     if count == 0:
         return plan
@@ -100,11 +85,8 @@ def refined_order(
     pool: Workers,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Int32[np.ndarray, " M"]:
-    """Return the index of the Gaussian for every place.
-
-    Gaussians at the same position keep their order, because renderers blend them in it. The first and the last Gaussian
-    of a run stay.
-    """
+    """Return the index of the Gaussian for every place. Gaussians at the same position keep their order, because
+    renderers blend them in it. The first and the last Gaussian of a run stay."""
     pixels, order = _pixels(means, colors), np.arange(len(means), dtype=np.int32)
     ends = np.concatenate([np.flatnonzero(np.diff(runs)) + 1, [len(runs)]]).tolist()
 
@@ -129,10 +111,8 @@ def _pixels(means: UInt16[np.ndarray, "M 3"], colors: UInt8[np.ndarray, "M 3"]) 
 
 
 def _blocks(ends: list[int], first_size: int) -> list[slice]:
-    """Return blocks of runs with these ends: in each run, one of at most ``first_size`` places, then larger ones.
-
-    What is left of a run may be too small to count differences in, and is no block.
-    """
+    """Return blocks of runs with these ends: in each run, one of at most ``first_size`` places, then larger ones. What
+    is left of a run may be too small to count differences in, and is no block."""
     blocks = []
     for start, end in pairwise([0, *ends]):
         edges = [start, *range(start + first_size, end, BLOCK), end]
@@ -154,10 +134,8 @@ def _block_order(means: UInt16[np.ndarray, "B 3"], pixels: UInt8[np.ndarray, "B 
 
 
 def _difference_bits(pixels: UInt8[np.ndarray, "B C"]) -> Int32[np.ndarray, "C 256"]:
-    """Return the bits of each difference of a channel from the pixel before, modulo 256, by how often it occurs.
-
-    The counts of differences that are alike are averaged. A difference and its negative take the same bits.
-    """
+    """Return the bits of each difference of a channel from the pixel before, modulo 256, by how often it occurs. The
+    counts of differences that are alike are averaged. A difference and its negative take the same bits."""
     counts = np.stack([np.bincount(channel, minlength=256) for channel in np.diff(pixels, axis=0).T]).astype(np.float64)
     counts += counts[:, -np.arange(256)]
     counts = (counts + sum(weight * np.roll(counts, shift, axis=1) for shift, weight in SMOOTHING)) / 2 + 1
@@ -181,11 +159,8 @@ def _with_equal_positions_in_order(
 
 # Uniform planning: the steps of the settings for all Gaussians, without rendering the scene.
 
-FINEST = 1e-4
-"""Step of values that may take all levels of a table."""
-
-PAPER_TOPS = {"opacities": 255, "scales": 255, "quaternions": 99, "f_dc": 255}
-"""Largest level of each field in the paper, in every channel."""
+FINEST = 1e-4  # step of values that may take all levels of a table
+PAPER_TOPS = {"opacities": 255, "scales": 255, "quaternions": 99, "f_dc": 255}  # largest levels in the paper
 
 
 def plan_uniform(
@@ -275,14 +250,9 @@ def _neutral(sh_degree: int) -> Splats:
     )
 
 
-INVISIBLE_LOGIT = -5.5373
-"""Logit of opacity 1/255, rounded up; no renderer draws Gaussians of this opacity or less."""
-
-SAMPLED = 1 << 18
-"""Number of Gaussians whose sizes are compared with the steps of positions."""
-
-MAX_GROUPS = 1 << 14
-"""Largest number of groups of Gaussians in a container: group and class of steps together are a number of 16 bits."""
+INVISIBLE_LOGIT = -5.5373  # logit of opacity 1/255, rounded up; no renderer draws Gaussians of this opacity or less
+SAMPLED = 1 << 18  # number of Gaussians whose sizes are compared with the steps of positions
+MAX_GROUPS = 1 << 14  # in a container: group and class of steps together are a number of 16 bits
 
 
 def plan_encoding(
@@ -296,11 +266,9 @@ def plan_encoding(
     keep_costs: bool = True,
     groups: UInt16[np.ndarray, " N"] | None = None,
 ) -> EncodingPlan:
-    """Choose order, rotation forms, codebook and levels for a clean scene.
-
-    Without sensitivity, or if no camera saw any Gaussian, planning is uniform, with the steps of the settings. With
-    ``groups``, the Gaussians of each follow one another in the container, the groups in ascending order.
-    """
+    """Choose order, rotation forms, codebook and levels for a clean scene. Without sensitivity, or if no camera saw any
+    Gaussian, planning is uniform, with the steps of the settings. With ``groups``, the Gaussians of each follow one
+    another in the container, the groups in ascending order."""
     if groups is not None and settings.order == "plas":
         raise UnsupportedError("a container with groups of Gaussians needs order=hilbert or order=refined")
     if groups is not None and int(groups.max(initial=0)) >= MAX_GROUPS:

@@ -32,32 +32,23 @@ from kissgs.settings import EncodeSettings
 
 # Estimate of a scene's error by lambda, before it is planned, and the lambda for a given error.
 
-DIMENSIONS = 14
-"""Rounded degrees of freedom per Gaussian: opacity, scales, rotation, base colour, position."""
+DIMENSIONS = 14  # rounded degrees of freedom per Gaussian: opacity, scales, rotation, base colour, position
 
 GROWTH = 2.2
 """Measured ratio of the rounding error to H d²/12: above 1 because RDO quantisation prefers levels of few bits, and the
 errors of several Gaussians add up in a pixel."""
 
-PAPER_RATIO = 8
-"""Gaussians per codebook entry of the paper."""
-
-PAPER_SH_GROWTH = 2.0
-"""Measured factor on uncompensated shN errors, which add up in pixels."""
+PAPER_RATIO = 8  # Gaussians per codebook entry of the paper
+PAPER_SH_GROWTH = 2.0  # measured factor on uncompensated shN errors, which add up in pixels
 
 OTHER_VIEWS_DB = 9.5
 """Decibels per unit of view uncertainty by which errors in other views exceed those in the measured views, where
 planning hides them. It does not apply to shN: its codebook hardly adapts to the measured views once sensitivity is
 shrunk towards the prior."""
 
-MIN_ERROR_RATIO = 1.1
-"""Smallest error to aim at, in units of the smallest possible one: the last 0.4 dB would cost far too many bits."""
-
-SH_UNCOMPENSATED, SH_UNCOMPENSATED_GROWTH = 0.14, 1.9
-"""Measured share of shN errors that base colours cannot compensate, and its growth per unit of view uncertainty."""
-
-REFIT_GAIN = 0.17
-"""PSNR gain per iteration of the colour refit, decibels: below the measured mean, so that it holds for most scenes."""
+MIN_ERROR_RATIO = 1.1  # smallest error to aim at over the smallest possible: the last 0.4 dB cost too many bits
+SH_UNCOMPENSATED, SH_UNCOMPENSATED_GROWTH = 0.14, 1.9  # measured share, and growth per unit of view uncertainty
+REFIT_GAIN = 0.17  # PSNR gain per iteration of the colour refit, decibels: less than the measured mean
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,9 +73,7 @@ class ErrorModel:
 
     def lambda_for(self, error: float) -> float:
         """Return the lambda at which the mean squared error is about ``error``, or 1.1 times the smallest possible one.
-
-        At any lambda, the error of the largest codebook remains.
-        """
+        At any lambda, the error of the largest codebook remains."""
         low, high = np.log(1e-22), np.log(1e-2)
         error = max(error, MIN_ERROR_RATIO * self.error_at(1e-22))
         for _ in range(60):
@@ -110,10 +99,8 @@ def choose_lambda(usual: float, model: ErrorModel, settings: EncodeSettings, ref
 
 def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_model: CodebookErrorModel) -> float:
     """Estimate the mean squared error of the default quality: the smaller one of the presets ``paper`` and ``fast``.
-
     The paper's 100 levels for rotations, 256 for the rest and 65,536 for positions are spread from each channel's
-    smallest to its largest value, so that a single outlier makes them coarse; the steps of ``fast`` are absolute.
-    """
+    smallest to its largest value, so that a single outlier makes them coarse; the steps of ``fast`` are absolute."""
     scene = {"opacities": splats.opacities[:, None], "scales": splats.scales, "sh0": splats.sh0, "means": splats.means}
     ends = {name: row_range(selected(values, kept)) for name, values in scene.items()}
     spans = [np.ptp(np.array(ends[name], np.float64), axis=0) for name in ("opacities", "scales", "sh0")]
@@ -137,13 +124,11 @@ def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_
 
 
 def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs, sh_model: CodebookErrorModel) -> float:
-    """Estimate the mean squared error of rounding to such steps of opacity, scale, rotation, colour and position.
-
-    A Gaussian's error is at most twice that of its removal: one copy too few, and one where there should be none. The
+    """Estimate the mean squared error of rounding to such steps of opacity, scale, rotation, colour and position. A
+    Gaussian's error is at most twice that of its removal: one copy too few, and one where there should be none. The
     Hessian alone overestimates the rotation of long, thin Gaussians, a few of which would then decide. The share of
-    positions is bounded by that of as many other numbers: far from the origin, even 16 bits are coarse, at
-    any lambda.
-    """
+    positions is bounded by that of as many other numbers: far from the origin, even 16 bits are coarse, at any
+    lambda."""
     each = (costs.opacity, costs.scale, costs.rotation, costs.color, costs.position)
     squares = [float(np.sum(np.square(step, dtype=np.float64))) for step in steps]
 
@@ -165,11 +150,8 @@ def implied_lambda(error: float, count: int) -> float:
 ColorRefit = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
 """Function that returns better base colours for the decoded Gaussians and their indices in the scene."""
 
-MAX_COMPENSATION = np.float32(0.5 / SH_C0)
-"""Largest change of a base colour that compensates lost SH coefficients: half of a colour's range."""
-
-MANY_PRUNED = 0.2
-"""Share of pruned Gaussians above which the report explains why they were pruned."""
+MAX_COMPENSATION = np.float32(0.5 / SH_C0)  # of lost SH coefficients by a base colour: half of a colour's range
+MANY_PRUNED = 0.2  # share of pruned Gaussians above which the report explains why they were pruned
 
 
 def plan_rate_distortion(

@@ -55,18 +55,15 @@ for larger errors. A Gaussian smaller than a pixel has no derivative by its size
 nearby, so scales may grow less than they may shrink (``growth``).
 """
 
-STEP_GROWTH_POWER = 1 / 3
-"""Exponent with which these bounds grow with ``step_growth``, measured with cameras that the encoder did not use."""
+STEP_GROWTH_POWER = 1 / 3  # of step_growth, by which these bounds grow; measured with other cameras
 
 
 def largest_changes(
     coverage: Float[np.ndarray, " M"], captured: Float[np.ndarray, " M"], step_growth: float
 ) -> dict[str, Computed]:
-    """Return the largest change by rounding of each attribute of each Gaussian, rows of float64.
-
-    Optimal steps grow as the root of lambda. These bounds grow more slowly: they protect views in which a change is
-    more visible than in the measured ones, where pruning or coarser colours would be the smaller loss.
-    """
+    """Return the largest change by rounding of each attribute of each Gaussian, rows of float64. Optimal steps grow as
+    the root of lambda. These bounds grow more slowly: they protect views in which a change is more visible than in the
+    measured ones, where pruning or coarser colours would be the smaller loss."""
 
     def change(name: str, rows: slice) -> Float64[np.ndarray, " n"]:
         seen, by_capture = coverage[rows].astype(np.float64), captured[rows].astype(np.float64)
@@ -77,14 +74,9 @@ def largest_changes(
     return {name: Computed(len(coverage), partial(change, name)) for name in CAPTURED}
 
 
-UNUSED_COUNT = 0.05
-"""Count that an unused level has in the estimate of its bits."""
-
-ROUNDS = 3
-"""Number of iterations of counting levels and choosing by the counts."""
-
-CHUNK = 1 << 14
-"""Gaussians per task."""
+UNUSED_COUNT = 0.05  # count that an unused level has in the estimate of its bits
+ROUNDS = 3  # number of iterations of counting levels and choosing by the counts
+CHUNK = 1 << 14  # Gaussians per task
 
 
 def quantize_by_steps(
@@ -126,10 +118,8 @@ def rdo_quantize(
     pool: Workers,
     tables: ByteTables | None = None,
 ) -> dict[str, Quantized]:
-    """Choose the levels of opacities, scales and quaternions jointly by squared error plus lambda · bits.
-
-    With ``tables``, the values of the scales' table move to the mean of what they stand for.
-    """
+    """Choose the levels of opacities, scales and quaternions jointly by squared error plus lambda · bits. With
+    ``tables``, the values of the scales' table move to the mean of what they stand for."""
     from kissgs.planning import rdo_kernels
 
     classes = criterion.classes
@@ -225,10 +215,8 @@ def level_bits(
 
 
 def stored_values(values: Float64[np.ndarray, "M 8"], tables: ByteTables) -> Float64[np.ndarray, "M 8"]:
-    """Return opacity logits, log-scales and quaternions in the form in which they are quantised.
-
-    Logits are clipped to those of the levels that may be used; beyond, opacities differ by less than 1/255.
-    """
+    """Return opacity logits, log-scales and quaternions in the form in which they are quantised. Logits are clipped to
+    those of the levels that may be used; beyond, opacities differ by less than 1/255."""
     lowest, highest = tables.opacity_logits[[tables.first_drawn, tables.last_drawn]]
     opacities = np.clip(values[:, :1], lowest, highest)
     return np.concatenate([opacities, values[:, 1:4], shape_quats(values[:, 4:])], axis=1)
@@ -240,10 +228,8 @@ def rounded_shapes(
     steps: Mapping[str, Float64[np.ndarray, " M"]],
     tables: ByteTables,
 ) -> dict[str, Quantized]:
-    """Round opacity, log-scales and quaternion of :func:`stored_values` to steps of each Gaussian's own.
-
-    ``weights`` are squared image errors per squared unit of the log-scales.
-    """
+    """Round opacity, log-scales and quaternion of :func:`stored_values` to steps of each Gaussian's own. ``weights``
+    are squared image errors per squared unit of the log-scales."""
     quats = values[:, 4:]
     opacities = nearest_levels(tables.opacity_logits, _on_lattice(values[:, :1], steps["opacities"]))
     finest = float(steps["scales"].min())
@@ -287,10 +273,8 @@ def color_field(
 
 
 def means_field(means: Float32[np.ndarray, "M 3"], steps: float | Float64[np.ndarray, " M"]) -> Quantized:
-    """Return 16-bit levels of the positions' signed logarithms, with a range per axis.
-
-    Levels are multiples of a power of two, up to 256, of about the step of each Gaussian, so that low bytes compress.
-    """
+    """Return 16-bit levels of the positions' signed logarithms, with a range per axis. Levels are multiples of a power
+    of two, up to 256, of about the step of each Gaussian, so that low bytes compress."""
     logs = signed_log(means)
     low, high = (_as_text(end.astype(np.float32)) for end in (logs.min(axis=0), logs.max(axis=0)))
     table = even_table(low, high, MEANS_TOP)
@@ -327,8 +311,7 @@ def _on_lattice(values: Float64[np.ndarray, "M C"], steps: Float[np.ndarray, " M
 
 # Levels of every attribute at one lambda, in the values that the container can hold.
 
-OUTLIERS = 1e-4
-"""Share of base colours, at either end of a channel, that may be clipped so that the step of the others stays small."""
+OUTLIERS = 1e-4  # share of base colours at either end of a channel that may be clipped, for a smaller step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -362,10 +345,8 @@ class RdFields:
         return fields if tables is None else finished_shapes(fields, logits, tables)
 
     def means(self, splats: Splats, order: Int[np.ndarray, " M"], coarser: Int[np.ndarray, " M"]) -> Quantized:
-        """Quantise the positions of the Gaussians ``order``, with the bits that lambda asks for in each class.
-
-        A Gaussian has at most ``coarser`` bits less than :func:`means_bits` gives for ``means_tolerance``.
-        """
+        """Quantise the positions of the Gaussians ``order``, with the bits that lambda asks for in each class. A
+        Gaussian has at most ``coarser`` bits less than :func:`means_bits` gives for ``means_tolerance``."""
         means, criterion, pool = selected(splats.means, order), self.criterion, self.planning.pool
         usual = means_bits(splats, order, self.planning.settings.means_tolerance, pool)
         most = np.clip(16 - usual + coarser, 0, 8)

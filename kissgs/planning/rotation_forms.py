@@ -15,13 +15,11 @@ from kissgs.planning.quantize import Computed, Planning, for_each_block, selecte
 
 # Rotations as three components of a quaternion, a byte each; the fourth, not negative, follows from the length 1.
 
-TABLE = (np.arange(256) / 255 - 0.5) * np.sqrt(2)
-"""Value of each level; 0 lies between the levels 127 and 128."""
+TABLE = (np.arange(256) / 255 - 0.5) * np.sqrt(2)  # value of each level; 0 lies between the levels 127 and 128
 
 STEP = float(TABLE[1] - TABLE[0])
 
-KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""The three stored components, by the index of the missing one in w, x, y, z."""
+KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # by the index of the missing one in w, x, y, z
 
 
 def omitted_components(quats: Float64[np.ndarray, "N 4"]) -> UInt8[np.ndarray, " N"]:
@@ -99,8 +97,7 @@ PERMUTATIONS = np.repeat([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1),
 
 CHUNK = 1 << 16
 
-SHAPE_COLUMNS = {"opacities": slice(0, 1), "scales": slice(1, 4), "quaternions": slice(4, 8)}
-"""Columns of opacity logit, log-scales and quaternion, by field of the container."""
+SHAPE_COLUMNS = {"opacities": slice(0, 1), "scales": slice(1, 4), "quaternions": slice(4, 8)}  # by field
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,11 +135,9 @@ class StoredShapes:
 def choose_forms(
     splats: Splats, cells: Int[np.ndarray, " cells"], side: int, planning: Planning
 ) -> tuple[StoredShapes, float]:
-    """Choose the form of rotation and log-scales of the Gaussian in each of ``cells``, as the settings say.
-
-    Where the container stores whole quaternions, which decoders normalise, those of canonical forms have w = 1: x, y
-    and z hold the whole rotation, and w takes no bits.
-    """
+    """Choose the form of rotation and log-scales of the Gaussian in each of ``cells``, as the settings say. Where the
+    container stores whole quaternions, which decoders normalise, those of canonical forms have w = 1: x, y and z hold
+    the whole rotation, and w takes no bits."""
     settings, pool, report = planning.settings, planning.pool, planning.report("forms")
     if settings.rotation_form == "canonical":
         forms = np.empty(len(cells), np.uint8)
@@ -184,10 +179,8 @@ def apply_forms(
 
 
 def canonical_forms(quats: Float64[np.ndarray, "N 4"]) -> UInt8[np.ndarray, " N"]:
-    """Return the form of largest w, which has the smallest rotation angle; among equals, the first of the table.
-
-    All rotations are then within 63° of the identity: w is at least 0.85 and x, y, z use 40 % of their range.
-    """
+    """Return the form of largest w, which has the smallest rotation angle; among equals, the first of the table. All
+    rotations are then within 63° of the identity: w is at least 0.85 and x, y, z use 40 % of their range."""
     from kissgs.planning import kernels
 
     forms = np.empty(len(quats), np.uint8)
@@ -204,11 +197,9 @@ def pras_forms(
     decay: float,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> UInt8[np.ndarray, " N"]:
-    """Choose forms that make neighbours on the grid similar: the closest to 8-bit proxies, blurred less and less.
-
-    One proxy range serves the scales of all three axes, so that permuting them changes no proxy. All forms are those of
-    the input, not of an intermediate form, so that rounding errors do not add up.
-    """
+    """Choose forms that make neighbours on the grid similar: the closest to 8-bit proxies, blurred less and less. One
+    proxy range serves the scales of all three axes, so that permuting them changes no proxy. All forms are those of the
+    input, not of an intermediate form, so that rounding errors do not add up."""
     from kissgs.planning import kernels
 
     count = len(quats)

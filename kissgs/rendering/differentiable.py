@@ -24,8 +24,7 @@ try:
 except ModuleNotFoundError as error:
     raise UnsupportedError("gradients need torch, which is not installed: pip install 'kissgs[train]'") from error
 
-Parameters = Mapping[str, Tensor]
-"""Stored parameters of a scene, by the names in :class:`kissgs.core.splats.Splats`."""
+Parameters = Mapping[str, Tensor]  # stored parameters of a scene, by the names in Splats
 
 
 def rasterize(
@@ -41,13 +40,11 @@ def rasterize(
     threads: int = 0,
     receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Render images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``, with gradients by all parameters.
-
-    On the CPU by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``), both with the image model of
+    """Render images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``, with gradients by all parameters. On the
+    CPU by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``), both with the image model of
     :mod:`kissgs.rendering.constants`. Cameras ``(C, 4, 4)`` and ``(C, 3, 3)``, and backgrounds ``(C, 3)``, have no
     gradient. ``receive`` is called in the backward pass on the CPU with the gradients of each image, in place of
-    autograd: most Gaussians have none, and arrays for all of them take longer to fill than to compute.
-    """
+    autograd: most Gaussians have none, and arrays for all of them take longer to fill than to compute."""
     tensors, device = [parameters[name] for name in ATTRIBUTES], parameters["means"].device
     if backgrounds is None:
         backgrounds = torch.zeros((len(viewmats), 3))
@@ -207,10 +204,8 @@ def plain_photometric_loss(
 
 
 def _blur(maps: torch.Tensor) -> torch.Tensor:
-    """Blur each channel of ``(V, C, H, W)`` with the window of SSIM.
-
-    Contiguous depthwise convolutions, because torch computes those in full float32 on a GPU, others perhaps in TF32.
-    """
+    """Blur each channel of ``(V, C, H, W)`` with the window of SSIM. Contiguous depthwise convolutions, because torch
+    computes those in full float32 on a GPU, others perhaps in TF32."""
     channels = maps.shape[1]
     offsets = torch.arange(-5, 6, dtype=maps.dtype, device=maps.device)
     window = torch.softmax(-offsets.square() / 4.5, dim=0).expand(channels, 1, 11)

@@ -22,11 +22,8 @@ if TYPE_CHECKING:
 
 # The rasteriser on CUDA: gsplat in its modes "classic" and "antialiased", with :mod:`kissgs.rendering.constants`.
 
-RenderedImage = tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]
-"""Colours and alphas of an image."""
-
-ImageRenderer = Callable[[Camera, Sequence[float]], RenderedImage]
-"""Function of a camera and a background (RGB) that renders an image of a scene."""
+RenderedImage = tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]  # colours and alphas of an image
+ImageRenderer = Callable[[Camera, Sequence[float]], RenderedImage]  # of a camera and a background, RGB
 
 GSPLAT_MISSING = "rendering on CUDA needs gsplat, which is not installed: pip install 'kissgs[cuda]'"
 
@@ -172,11 +169,9 @@ def removal_scores(
     *,
     background: Colour = BLACK,
 ) -> Float64[np.ndarray, " N"]:
-    """Return, for each Gaussian, the squared image error that its removal alone would cause.
-
-    The score of GaussianPOP, section 3, exact except for Gaussians behind the end of a pixel's list. A sum over images,
-    pixels and RGB in [0, 1]; 0 for a Gaussian that no camera sees.
-    """
+    """Return, for each Gaussian, the squared image error that its removal alone would cause. The score of GaussianPOP,
+    section 3, exact except for Gaussians behind the end of a pixel's list. A sum over images, pixels and RGB in [0, 1];
+    0 for a Gaussian that no camera sees."""
     from kissgs.rendering.cpu.frame import draw
     from kissgs.rendering.cpu.frame import removal_scores as frame_scores
 

@@ -14,8 +14,7 @@ import numpy as np
 from kissgs.core.errors import OutputError
 from kissgs.io.files import atomic_file, reason_of, refuse_existing
 
-SAVE_INTERVAL = 30.0
-"""Shortest time between two saves, seconds."""
+SAVE_INTERVAL = 30.0  # shortest time between two saves, seconds
 
 
 class Checkpoint:

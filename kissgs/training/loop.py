@@ -24,11 +24,8 @@ try:
 except ModuleNotFoundError as error:
     raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
 
-SMOOTHING = 0.98
-"""Weight of the former value in the running means of loss and squared error."""
-
-LrSchedule = Callable[[float], Mapping[str, float]]
-"""Function from the fraction of steps done, 0 to 1, to the learning rates by parameter."""
+SMOOTHING = 0.98  # weight of the former value in the running means of loss and squared error
+LrSchedule = Callable[[float], Mapping[str, float]]  # learning rates by parameter, from the fraction of steps
 
 
 class TrainableScene(Protocol):
@@ -86,11 +83,9 @@ def train(
     first: int = 0,
     after: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Fit a scene to target images, from step ``first`` on; ``after`` receives the number of steps done.
-
-    On the CPU, the result depends on the seed but not on the number of threads; on a GPU it is not reproducible. If
-    the receiver of progress raises, the scene is in the state after the last completed step.
-    """
+    """Fit a scene to target images, from step ``first`` on; ``after`` receives the number of steps done. On the CPU,
+    the result depends on the seed but not on the number of threads; on a GPU it is not reproducible. If the receiver of
+    progress raises, the scene is in the state after the last completed step."""
     order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
     with torch_threads(context.threads), keep_free_memory():
         step, pace = first, plan.pace
@@ -138,10 +133,8 @@ def image_loss(
     threads: int,
     receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, float]:
-    """Render target ``n``; return the photometric loss, differentiable, and the mean squared error.
-
-    ``antialiased`` and ``receive`` are as in :func:`kissgs.rendering.differentiable.rasterize`.
-    """
+    """Render target ``n``; return the photometric loss, differentiable, and the mean squared error. ``antialiased`` and
+    ``receive`` are as in :func:`kissgs.rendering.differentiable.rasterize`."""
     camera = targets.cameras[n]
     target = targets.image(n)
     image, _ = rasterize(

@@ -79,11 +79,9 @@ def adam(
     constants: np.ndarray,
 ) -> None:
     """Make a step with the rows ``first`` to ``last`` (exclusive) of a parameter of ``width`` numbers; all are flat.
-
     ``gradient`` is that of ``rows``, which ascend; ``everywhere``, if not empty, is added for all rows; ``factors`` of
     the learning rate may be empty for 1. ``constants``: learning rate / (1 - beta1^t); 1 / sqrt(1 - beta2^t); the
-    absolute value to which gradients are clamped; the smallest and the largest value that a step may reach.
-    """
+    absolute value to which gradients are clamped; the smallest and the largest value that a step may reach."""
     rate, correction, most, smallest, largest = constants[0], constants[1], constants[2], constants[3], constants[4]
     zero, finite = np.float32(0), np.float32(3.4028234e38)
     keep1, keep2, add1, add2 = np.float32(0.9), np.float32(0.999), np.float32(0.1), np.float32(0.001)
@@ -111,22 +109,14 @@ def adam(
             here[i] = min(max(here[i] - slopes[i], smallest), largest)
 
 
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
-"""Constants of Adam; the kernel has the same."""
-
-MAX_GRADIENT = 1e15
-"""Largest absolute value of a gradient: its square is still a finite float32."""
-
-MAX_RATE = 1e30
-"""Largest learning rate: the product with a step of Adam is still a finite float32."""
-
-PART = 1 << 19
-"""Approximate number of numbers that a thread updates at a time."""
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # constants of Adam; the kernel has the same
+MAX_GRADIENT = 1e15  # largest absolute value of a gradient: its square is still a finite float32
+MAX_RATE = 1e30  # largest learning rate: the product with a step of Adam is still a finite float32
+PART = 1 << 19  # approximate number of numbers that a thread updates at a time
 
 NONE = np.empty(0, np.float32)
 
-RowGradients = tuple[Int32[np.ndarray, " R"], Mapping[str, Float32[np.ndarray, "R ..."]]]
-"""Rows, ascending, and the gradients of these rows by the name of the parameter."""
+RowGradients = tuple[Int32[np.ndarray, " R"], Mapping[str, Float32[np.ndarray, "R ..."]]]  # rows ascend
 
 
 @dataclass(slots=True, eq=False)
@@ -159,11 +149,9 @@ class PrunableAdam:
         return {name: leaf.value for name, leaf in self._leaves.items()}
 
     def step(self, rates: Mapping[str, float], rows: RowGradients | None = None) -> None:
-        """Make an Adam step at these learning rates, and clear the gradients.
-
-        Parameters without any gradient stay. NaN and infinite gradients count as 0, others are clamped to
-        :data:`MAX_GRADIENT`. On the CPU, torch's number of threads is used; the result does not depend on it.
-        """
+        """Make an Adam step at these learning rates, and clear the gradients. Parameters without any gradient stay. NaN
+        and infinite gradients count as 0, others are clamped to :data:`MAX_GRADIENT`. On the CPU, torch's number of
+        threads is used; the result does not depend on it."""
         index, of_rows = (np.empty(0, np.int32), {}) if rows is None else rows
         parts: list[Callable[[], None]] = []
         for name, leaf in self._leaves.items():
@@ -335,10 +323,8 @@ class GaussianModel:
         return len(self.parameters["means"])
 
     def step(self, rates: Mapping[str, float]) -> None:
-        """Make an Adam step at these learning rates, and clear the gradients.
-
-        Values are clamped to :data:`BOUNDS`; NaN and infinite gradients count as 0.
-        """
+        """Make an Adam step at these learning rates, and clear the gradients. Values are clamped to :data:`BOUNDS`; NaN
+        and infinite gradients count as 0."""
         if self._received:
             found = Gradients.sum(self._received)
             of_rows = {name: getattr(found, name) for name in ATTRIBUTES}

@@ -28,8 +28,7 @@ from kissgs.rendering.cpu.tiles import (
     sort_into_tiles,
 )
 
-BAND = 1 << 19
-"""Number of members of tiles whose moments are in memory at once."""
+BAND = 1 << 19  # number of members of tiles whose moments are in memory at once
 
 
 def draw(
@@ -40,9 +39,7 @@ def draw(
     end: float = constants.TRANSMITTANCE_MIN,
 ) -> Frame:
     """Render an image of a finite scene (:func:`kissgs.clean`) by the image model of :mod:`kissgs.rendering.constants`.
-
-    Beyond the transmittance ``end``, the background is shown instead of what is behind.
-    """
+    Beyond the transmittance ``end``, the background is shown instead of what is behind."""
     colour = np.array(background, np.float32, order="C")
     if colour.shape != (3,) or not np.isfinite(colour).all():
         raise InvalidViewsError("a background must be three finite numbers: red, green and blue, from 0 to 1")
@@ -104,11 +101,9 @@ def add_sensitivities(
     frame: Frame, weight: float, spread: float, into: Sensitivity, pool: Workers
 ) -> Float32[np.ndarray, " N"]:
     """Add the sensitivity in this image to ``into``, and return the sum of (alpha T)² over its pixels by footprint.
-
     ``weight`` is that of a single value's squared error, ``spread`` the standard deviation of the background.
     ``shape_hessian`` receives moments, which :func:`sensitivity.moments_to_hessians` converts in the end; harmonics are
-    weighted by (alpha T)², and to be divided by ``color_weight``.
-    """
+    weighted by (alpha T)², and to be divided by ``color_weight``."""
     seen = np.empty(len(frame.footprints.records), np.float32)
     for first, last in frame.parts:
         seen[first:last] = 0
@@ -142,8 +137,7 @@ def for_kernels(splats: Splats) -> Splats:
 class Gradients:
     """Gradients of a loss by the stored parameters of the R Gaussians that have any; those of all others are 0."""
 
-    gaussians: Int32[np.ndarray, " R"]
-    """Indices of these Gaussians, ascending."""
+    gaussians: Int32[np.ndarray, " R"]  # indices of these Gaussians, ascending
     means: Float32[np.ndarray, "R 3"]
     quats: Float32[np.ndarray, "R 4"]
     scales: Float32[np.ndarray, "R 3"]
@@ -173,10 +167,8 @@ class Gradients:
 def differentiate(
     frame: Frame, v_image: Float32[np.ndarray, "H W 3"], v_alpha: Float32[np.ndarray, "H W"], pool: Workers
 ) -> Gradients:
-    """Return the gradients of a loss by the stored parameters, given those by the image and by its alpha.
-
-    Only Gaussians that contribute to the image have any: of many Gaussians, most lie outside it, or behind others.
-    """
+    """Return the gradients of a loss by the stored parameters, given those by the image and by its alpha. Only
+    Gaussians that contribute to the image have any: of many Gaussians, most lie outside it, or behind others."""
     slots = number_slots(frame.lists, len(frame.footprints.records))
     v_slots, changed = np.zeros((len(slots.of), 9), np.float32), np.empty_like(slots.rows)
     _each_tile(blending.blend_backward, frame, slots, pool, v_image, v_alpha, v_slots)
