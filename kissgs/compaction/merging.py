@@ -430,10 +430,7 @@ class _Clusters:
         pairs = pairs[: unique_pairs(near, pairs)]
         added = np.empty(len(pairs))
         gaussians = self.means, self.covariances, self.alphas, self.colors, weights, spacing
-        self._each(
-            len(pairs),
-            lambda a, b: pair_errors(*gaussians, self.errors, BLUR, CONTRAST, pairs, a, b, added),
-        )
+        self._each(len(pairs), lambda a, b: pair_errors(*gaussians, self.errors, BLUR, CONTRAST, pairs, a, b, added))
         chosen = np.empty(count, np.int64)
         order = np.argsort(added, kind="stable")
         chosen = chosen[: choose(order, pairs, len(self.means), chosen)]

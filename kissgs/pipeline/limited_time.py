@@ -122,12 +122,7 @@ WITH_GOAL = (
 )
 """Plans where the goal must be met: a single container needs a reserve, two can come near it."""
 
-RENDERED = (
-    (15.0, SearchPlan(0)),
-    (30.0, SearchPlan(1)),
-    (60.0, SearchPlan(2)),
-    (math.inf, SearchPlan(3)),
-)
+RENDERED = ((15.0, SearchPlan(0)), (30.0, SearchPlan(1)), (60.0, SearchPlan(2)), (math.inf, SearchPlan(3)))
 """Plans where renderings of the scene are the targets: number and lambda follow from a search of the encoder."""
 
 

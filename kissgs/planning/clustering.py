@@ -64,10 +64,7 @@ class Clustering:
 
         self.sort_members()
         arrays = self._arrays()
-        pool.map(
-            lambda part: kernels.means(*arrays, *part, self.centroids, self.totals, self.errors),
-            self.parts(),
-        )
+        pool.map(lambda part: kernels.means(*arrays, *part, self.centroids, self.totals, self.errors), self.parts())
 
     def sort_members(self) -> None:
         """Sort the vectors by label again, after labels have changed."""

@@ -62,10 +62,7 @@ def means(
                 centroids[k, d] = total[d] / weight
 
 
-@compiled(
-    "void(float32[:, ::1], uint16[:, ::1], int64, int64, int64, uint16[:, ::1])",
-    fastmath=_FAST,
-)
+@compiled("void(float32[:, ::1], uint16[:, ::1], int64, int64, int64, uint16[:, ::1])", fastmath=_FAST)
 def find_near(
     centroids: Float32[np.ndarray, "K D"],
     near: UInt16[np.ndarray, "K k"],
@@ -173,8 +170,7 @@ def assign_near(
 
 
 @compiled(
-    "void(float32[:, ::1], int32[::1], int64[::1], float32[:, ::1], uint16[:, ::1], int64, int32[::1])",
-    fastmath=_FAST,
+    "void(float32[:, ::1], int32[::1], int64[::1], float32[:, ::1], uint16[:, ::1], int64, int32[::1])", fastmath=_FAST
 )
 def assign_by_form(
     vectors: Float32[np.ndarray, "n P+D"],  # upper triangle of the form of each, row by row, and the form times it

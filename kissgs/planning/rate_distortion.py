@@ -241,11 +241,7 @@ def _ranks(order: Int[np.ndarray, " M"], kept: Int[np.ndarray, " M"], count: int
 
 
 def _codebook(
-    splats: Splats,
-    order: Int[np.ndarray, " M"],
-    sensitivity: Sensitivity,
-    size: int,
-    planning: Planning,
+    splats: Splats, order: Int[np.ndarray, " M"], sensitivity: Sensitivity, size: int, planning: Planning
 ) -> Codebook:
     """Return the SH codebook of about ``size`` entries, fitted to what cameras see of each colour."""
     weights = sensitivity_weights(sensitivity, order, splats)

@@ -80,9 +80,7 @@ CHUNK = 1 << 14  # Gaussians per task
 
 
 def quantize_by_steps(
-    values: Float[np.ndarray, "M C"] | Rows,
-    steps: Float64[np.ndarray, " M"] | Rows,
-    pool: Workers | None = None,
+    values: Float[np.ndarray, "M C"] | Rows, steps: Float64[np.ndarray, " M"] | Rows, pool: Workers | None = None
 ) -> Quantized:
     """Round to the nearest multiples of each Gaussian's own step, the same for all its channels."""
     smallest, largest = row_range(values, pool)
@@ -193,9 +191,7 @@ def _bounds(
 
 
 def level_bits(
-    levels: Integer[np.ndarray, "M C"],
-    classes: Integer[np.ndarray, " M"],
-    pool: Workers | None = None,
+    levels: Integer[np.ndarray, "M C"], classes: Integer[np.ndarray, " M"], pool: Workers | None = None
 ) -> Float64[np.ndarray, "classes C 256"]:
     """Estimate the bits of every level of every channel in every class from the counts of ``levels``."""
     number = int(classes.max()) + 1

@@ -110,10 +110,7 @@ def codebook_side(size: float) -> int:
 
 
 def _sort(
-    entries: Float32[np.ndarray, "cells D"],
-    settings: EncodeSettings,
-    pool: Workers,
-    report: Callable[[float], None],
+    entries: Float32[np.ndarray, "cells D"], settings: EncodeSettings, pool: Workers, report: Callable[[float], None]
 ) -> Int[np.ndarray, " cells"]:
     """Return the entry of each pixel of a tile, sorted so that neighbours are similar and the image compresses."""
     if (entries == entries[0]).all():

@@ -162,11 +162,7 @@ class _Photometric(torch.autograd.Function):
 
 
 def _photometric(
-    image: torch.Tensor,
-    target: torch.Tensor,
-    weights: tuple[float, float],
-    threads: int,
-    gradient: torch.Tensor | None,
+    image: torch.Tensor, target: torch.Tensor, weights: tuple[float, float], threads: int, gradient: torch.Tensor | None
 ) -> torch.Tensor:
     """Return the loss with ``weights`` of SSIM and of the squares; write its gradient into ``gradient`` if given."""
     count, (ssim_weight, mse_weight) = image.numel(), weights
@@ -183,10 +179,7 @@ def _views(images: torch.Tensor) -> np.ndarray:
 
 
 def plain_photometric_loss(
-    image: Float[torch.Tensor, "..."],
-    target: Float[torch.Tensor, "..."],
-    ssim_weight: float,
-    mse_weight: float = 0.0,
+    image: Float[torch.Tensor, "..."], target: Float[torch.Tensor, "..."], ssim_weight: float, mse_weight: float = 0.0
 ) -> Float[torch.Tensor, ""]:
     """Return the loss of :func:`photometric_loss` by plain torch operations, on any device and in any dtype."""
     x, y = (images.reshape(-1, *images.shape[-3:]).clamp(-1e9, 1e9) for images in (image, target))

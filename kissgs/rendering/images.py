@@ -22,11 +22,7 @@ MAX_PIXEL_BYTES = 4 << 30  # largest size of the pixels of all images together, 
 
 
 def render_all(
-    splats: Splats,
-    cameras: Sequence[Camera],
-    context: Context = DEFAULT_CONTEXT,
-    *,
-    background: Colour = BLACK,
+    splats: Splats, cameras: Sequence[Camera], context: Context = DEFAULT_CONTEXT, *, background: Colour = BLACK
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
     """Render an image for each camera, with 8 bits per channel; a repeated camera object gives the same array."""
     if 3 * sum(camera.width * camera.height for camera in cameras) > MAX_PIXEL_BYTES:

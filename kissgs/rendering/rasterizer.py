@@ -163,11 +163,7 @@ def drawn_opacities(splats: Splats) -> Float64[np.ndarray, " N"]:
 
 
 def removal_scores(
-    splats: Splats,
-    cameras: Sequence[Camera],
-    context: Context = DEFAULT_CONTEXT,
-    *,
-    background: Colour = BLACK,
+    splats: Splats, cameras: Sequence[Camera], context: Context = DEFAULT_CONTEXT, *, background: Colour = BLACK
 ) -> Float64[np.ndarray, " N"]:
     """Return, for each Gaussian, the squared image error that its removal alone would cause. The score of GaussianPOP,
     section 3, exact except for Gaussians behind the end of a pixel's list. A sum over images, pixels and RGB in [0, 1];

@@ -255,9 +255,7 @@ class TrainingTargets:
 
 
 def training_targets(
-    reference: Splats,
-    supervision: SupervisionViews,
-    context: Context = DEFAULT_CONTEXT,
+    reference: Splats, supervision: SupervisionViews, context: Context = DEFAULT_CONTEXT
 ) -> TrainingTargets:
     """Load the photographs of the training views, and render ``reference`` for those that have none."""
     views, background = supervision.train, supervision.background

@@ -91,12 +91,7 @@ def _rows(span: np.uint32, half: int) -> tuple[np.uint64, np.uint64]:
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 def _alpha(
-    x: np.float32,
-    y: np.float32,
-    drawn: bool,
-    place: Place,
-    opacity: np.float32,
-    limits: tuple[np.float32, np.float32],
+    x: np.float32, y: np.float32, drawn: bool, place: Place, opacity: np.float32, limits: tuple[np.float32, np.float32]
 ) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Return u, v, alpha before it is clamped, and alpha, 0 where it is not ``drawn``, at a pixel centre. It takes no
     array: an array that is passed to an inlined function prevents vectorisation."""
@@ -290,18 +285,9 @@ def _backward(
     sums[6], sums[7], sums[8] = vr, vg, vb
 
 
-@compiled(
-    void(FRAME, SLOTS, int64, int64, float32[:, :, ::1], float32[:, ::1], float32[:, ::1]),
-    fastmath=_FAST,
-)
+@compiled(void(FRAME, SLOTS, int64, int64, float32[:, :, ::1], float32[:, ::1], float32[:, ::1]), fastmath=_FAST)
 def blend_backward(
-    frame: Frame,
-    slots: Slots,
-    first: int,
-    last: int,
-    v_image: np.ndarray,
-    v_alpha: np.ndarray,
-    v_slots: np.ndarray,
+    frame: Frame, slots: Slots, first: int, last: int, v_image: np.ndarray, v_alpha: np.ndarray, v_slots: np.ndarray
 ) -> None:
     """Compute the gradients of tiles ``first`` to ``last`` (exclusive), given those by the image and by its alpha.
     ``v_slots``, ``(slots, 9)``, 0 before, receives the sums over the tile's pixels of the gradient by the exponent

@@ -18,15 +18,7 @@ from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending, sensitivity
 from kissgs.rendering.cpu.projection import add_colors, project_backward, shade_backward
 from kissgs.rendering.cpu.records import Blended, Frame, Gaussians, Projection, Slots
-from kissgs.rendering.cpu.tiles import (
-    Part,
-    each_part,
-    even,
-    even_tiles,
-    find_footprints,
-    number_slots,
-    sort_into_tiles,
-)
+from kissgs.rendering.cpu.tiles import Part, each_part, even, even_tiles, find_footprints, number_slots, sort_into_tiles
 
 BAND = 1 << 19  # number of members of tiles whose moments are in memory at once
 
@@ -108,12 +100,7 @@ def add_sensitivities(
     for first, last in frame.parts:
         seen[first:last] = 0
     sums = sensitivity.Sums(
-        into.position_hessian,
-        into.shape_hessian,
-        into.color_weight,
-        into.mean_harmonics,
-        into.higher_harmonics,
-        seen,
+        into.position_hessian, into.shape_hessian, into.color_weight, into.mean_harmonics, into.higher_harmonics, seen
     )
     starts = frame.lists.starts
     edges = np.searchsorted(starts, np.arange(0, starts[-1], BAND))

@@ -187,10 +187,7 @@ def _applied(m: Matrix, a: Vector) -> Vector:
 
 @_helper
 def _pose(viewmat: np.ndarray) -> tuple[Matrix, Vector]:
-    return (
-        (_load(viewmat, 0), _load(viewmat, 1), _load(viewmat, 2)),
-        (viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]),
-    )
+    return ((_load(viewmat, 0), _load(viewmat, 1), _load(viewmat, 2)), (viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]))
 
 
 @_helper

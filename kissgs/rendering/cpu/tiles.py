@@ -264,10 +264,7 @@ def number_slots(lists: TileLists, rows: int, tiles: Part | None = None) -> Slot
     first, last = tiles or (0, len(lists.starts) - 1)
     begin, end = int(lists.starts[first]), int(lists.starts[last])
     slots = Slots(
-        begin,
-        np.empty(end - begin, np.int32),
-        np.empty(min(end - begin, rows), np.int32),
-        np.empty(rows + 1, np.int32),
+        begin, np.empty(end - begin, np.int32), np.empty(min(end - begin, rows), np.int32), np.empty(rows + 1, np.int32)
     )
     found = fill_slots(lists.members[begin:end], slots)
     return slots._replace(rows=slots.rows[:found])
