@@ -41,29 +41,19 @@ def codebook_limited(settings: EncodeSettings, sh_degree: int) -> bool:
 
 @dataclass(slots=True, eq=False)
 class LambdaCurve:
-    """Containers of one scene with several values of lambda.
-
-    Lambda alone may not meet a goal: to save time, the codebook has a limit, ``gaussians_per_codebook_entry``, and its
-    side is a multiple of 8. So the goal may lie beyond that limit, or between the containers of two sides.
-
-    Attributes:
-        goal: the goal.
-        encode: makes a container with settings.
-        settings: settings of the containers, but for lambda.
-        most: largest number of containers.
-        tuned: whether the levels are fine-tuned: then a container less near the goal ends the search, the finest or
-            coarsest one is not tried where all others missed the goal, and the codebook stays.
-        sh_degree: of the scene.
-        found: attempts by log2(lambda), of those that can be compared.
-    """
+    """Containers of one scene with several values of lambda. Lambda alone may not meet a goal: to save time, the
+    codebook has a limit, ``gaussians_per_codebook_entry``, and its side is a multiple of 8. So the goal may lie beyond
+    that limit, or between the containers of two sides."""
 
     goal: Goal
     encode: Callable[[EncodeSettings], Attempt]
-    settings: EncodeSettings
-    most: int
+    settings: EncodeSettings  # of the containers, but for lambda
+    most: int  # containers
+    # Fine-tuned: then a container less near the goal ends the search, the finest or coarsest one is not tried where all
+    # others missed the goal, and the codebook stays.
     tuned: bool = False
     sh_degree: int = 0
-    found: dict[float, Attempt] = field(default_factory=dict)
+    found: dict[float, Attempt] = field(default_factory=dict)  # by log2(lambda), those that can be compared
     _made: int = field(init=False, default=0)
     _slope: float = field(init=False, default=0.0)
 
@@ -197,16 +187,9 @@ def first_point(goal: Goal, number: int, offset_db: float, *, may_step: bool) ->
 def along_path(
     goal: Goal, encode: Callable[[int, float | None], Attempt], first: int, last: int, most: int, near: float
 ) -> None:
-    """Make up to ``most`` containers at points of the path, the first one at point ``first`` as its settings say.
-
-    Args:
-        goal: the goal; no PSNR.
-        encode: makes the container of a point at a value of log2(lambda).
-        first: number of the first point.
-        last: largest number of a point.
-        most: largest number of containers.
-        near: margin, log2 of the number of Gaussians, below which a container that meets the goal ends the search.
-    """
+    """Make up to ``most`` containers at points of the path up to ``last``, the first one at point ``first`` as its
+    settings say, for a goal that is no PSNR; ``encode`` makes that of a point at a value of log2(lambda). A margin
+    below ``near``, log2 of the number of Gaussians, ends the search."""
     first, begin = min(max(first, 1), last), math.nan
 
     def margin(step: float) -> float:

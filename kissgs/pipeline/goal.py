@@ -34,35 +34,21 @@ class Container:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One container, or a scene before any encoding (0 bytes).
+    """One container, or a scene before any encoding (0 bytes)."""
 
-    Attributes:
-        count: Gaussians of the scene that was encoded.
-        rd_lambda: squared error per bit; None if no Gaussian is visible, so that there was no rate-distortion planning.
-        bytes: size of the zip, or of all files in the folder.
-        psnr: PSNR of its renderings to those of the scene as goals count it, decibels
-            (:func:`kissgs.evaluation.results.psnr_of`); without a capture in other views than ``drop``, in those of
-            ``worst`` and ``fifth_percentile``. None, as all that follow, where the goal is a size, but for the kept one.
-        drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.results.drop_of`).
-        ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.results.ssim_drop_of`).
-        detail: losses of SSIM in patches, in the views of ``drop``.
-        worst: PSNR of the worst view, decibels.
-        fifth_percentile: fifth percentile of the views' PSNR, decibels.
-        against: what ``drop`` is a loss against: "photos", or "renderings", from which it is estimated.
-        container: the container itself; None in reports.
-    """
-
-    count: int
-    rd_lambda: float | None
-    bytes: int
-    psnr: float | None = None
-    drop: float | None = None
+    count: int  # Gaussians of the scene that was encoded
+    rd_lambda: float | None  # squared error per bit; None if no Gaussian is visible
+    bytes: int  # of the zip, or of all files in the folder
+    # Where the goal is a size, figures of quality are known of the kept one only. PSNR is to renderings of the scene,
+    # as goals count it: without a capture in the views of worst and fifth_percentile, others than those of the drops.
+    psnr: float | None = None  # decibels, as all but those of SSIM
+    drop: float | None = None  # of PSNR, see kissgs.evaluation.results.drop_of
     ssim_drop: float | None = None
-    detail: Detail | None = None
-    worst: float | None = None
-    fifth_percentile: float | None = None
-    against: str | None = None
-    container: Container | None = field(default=None, repr=False, compare=False)
+    detail: Detail | None = None  # losses of SSIM in patches, in the views of drop
+    worst: float | None = None  # PSNR of the worst view
+    fifth_percentile: float | None = None  # of the views' PSNR
+    against: str | None = None  # of drop: "photos", or "renderings", from which it is estimated
+    container: Container | None = field(default=None, repr=False, compare=False)  # None in reports
 
     @property
     def made(self) -> Container:
@@ -202,15 +188,10 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A goal for a container: a size, or the quality that the smallest container must have.
+    """A goal for a container: a size, or the quality that the smallest container must have."""
 
-    Attributes:
-        limits: what the container must meet: its size, or a PSNR, a drop of PSNR, one of SSIM, or several of these.
-        most_bytes: for a quality: bytes that the smallest container with it may have at most; None for any number.
-    """
-
-    limits: tuple[Limit, ...]
-    most_bytes: int | None = None
+    limits: tuple[Limit, ...]  # its size, or a PSNR, a drop of PSNR, losses of SSIM, or several of these
+    most_bytes: int | None = None  # for a quality: of the smallest container with it
 
     @classmethod
     def of(cls, settings: EncodeSettings) -> Goal:
@@ -285,23 +266,19 @@ class Goal:
             missed = {first: missed[first]}
         wanted = " and ".join(dict.fromkeys(limit.wanted for limit in missed))
         found = [math.nan if figure is None else figure for figure in missed.values()]
+        failed = f"{wanted} cannot be met: "
         if any(map(math.isnan, found)):
-            return (
-                f"{wanted} cannot be met: a rendering of the finest container found failed, so its quality is unknown"
-            )
+            return f"{failed}a rendering of the finest container found failed, so its quality is unknown"
         if math.inf in found:
-            return (
-                f"{wanted} cannot be met: the scene's renderings equal the photographs, so any loss of PSNR is infinite"
-            )
+            return f"{failed}the scene's renderings equal the photographs, so any loss of PSNR is infinite"
         if first.name == "psnr":
             highest, limit = math.floor(100 * found[0]) / 100, first.value
-            return f"{wanted} cannot be met: the finest container found has {highest:.2f} dB; ask for at most that" + (
-                f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if limit > MAX_VIEW_PSNR else ""
-            )
+            most = f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if limit > MAX_VIEW_PSNR else ""
+            return f"{failed}the finest container found has {highest:.2f} dB; ask for at most that{most}"
         losses = " and ".join(limit.loss(finest, _rounded_up) for limit in missed)
         of_quality = all(limit.quality for limit in missed)
         lower = "choose a lower quality, or give max_psnr_drop" if of_quality else "allow at least that"
-        return f"{wanted} cannot be met: the finest container found loses {losses}; {lower}"
+        return f"{failed}the finest container found loses {losses}; {lower}"
 
 
 def _rounded_up(value: float) -> str:

@@ -7,17 +7,12 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from kissgs.core.context import Deadline
 from kissgs.core.errors import OutputError
 from kissgs.core.resources import processors
 from kissgs.io.files import atomic_file, reason_of
 from kissgs.settings import Preset
-
-if TYPE_CHECKING:
-    pass
-
 
 # Expected time of an encoding on this machine, from its speed as ``kissgs warmup`` has measured it.
 
@@ -48,11 +43,7 @@ def _reference_seconds(preset: Preset, count: int) -> float:
 
 
 def save_speed(seconds: float, preset: Preset, count: int) -> None:
-    """Save the speed of this machine, which encoded ``count`` Gaussians in ``seconds`` with all its processors.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Save the speed of this machine, which encoded ``count`` Gaussians in ``seconds`` with all its processors."""
     speed = _reference_seconds(preset, count) / seconds
     try:
         path = _speed_file()
@@ -86,9 +77,8 @@ CONTAINER_SHARE, LAST_CONTAINER_SHARE = 2.0, 4.0  # to fine-tune one; a point's 
 ENDING_SHARE = 0.38  # time to write a fine-tuned container and to evaluate it in small images
 LEAST_FOR_CONTAINER, CAPTURE_TIME = 2.0, 1.5  # to begin a trained one; an encoding with a capture and refits
 
+# Time to score in one view, share of the time that all scoring shall take, and views that score in any case.
 SCORE_SHARE, SCORING_SHARE, LEAST_SCORING_VIEWS = 0.004, 0.15, 16
-"""Time to score the Gaussians in one view, the share of the time that all scoring shall take, and the number of views
-that score in any case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,15 +118,8 @@ RENDERED = ((15.0, SearchPlan(0)), (30.0, SearchPlan(1)), (60.0, SearchPlan(2)),
 
 @dataclass(frozen=True, slots=True)
 class SearchTime:
-    """The time of a search.
-
-    Attributes:
-        deadline: time until which the best container shall be ready.
-        encode_seconds: expected seconds of an encoding of the whole scene without training.
-    """
-
-    deadline: Deadline
-    encode_seconds: float
+    deadline: Deadline  # until which the best container shall be ready
+    encode_seconds: float  # expected of an encoding of the whole scene without training
 
     def expected(self, longest: float, *, trained: bool) -> float:
         """Return the expected seconds of another container; ``longest`` is the longest one without training so far."""

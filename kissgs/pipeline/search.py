@@ -18,7 +18,8 @@ from kissgs.compaction.search_evaluation import SearchEvaluation
 from kissgs.core.context import Context, SearchNote, ignore_stop_search
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.splats import Splats
-from kissgs.evaluation.results import ESTIMATED_DROP, drop_of
+from kissgs.evaluation.results import ESTIMATED_DROP, Evaluation, drop_of
+from kissgs.finetuning.result import FinetuneReport
 from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline.choice import has_photographs
 from kissgs.pipeline.curves import (
@@ -42,41 +43,27 @@ from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
-    from kissgs.evaluation.results import Evaluation
-    from kissgs.finetuning.result import FinetuneReport
     from kissgs.finetuning.tune import Tuner
 
 MAX_OFFSET_DB = 30.0  # largest value of the setting quality_offset_db
 TUNED_CONTAINERS, ENCODES = 3, 6  # most containers fine-tuned, and of those before trained ones
-
+# Factors on settings of fine-tuning that completes the training of the path too: a refinement would take more steps.
 COMPLETING = {"steps": 1.2, "lr": 2.5, "codebook_lr": 2.0}
-"""Factors on settings of fine-tuning that completes the training of the path too.
-
-A refinement of the scene before its encoding would take more steps for the same quality.
-"""
-
 PRUNABLE_POINTS, PRUNABLE_DROP = 3, 1.0  # last one pruned without training; most decibels that others lose
 RENDERED_POINTS = 5  # last point pruned without training on renderings, from which training departs
-
+# Largest loss after a short training path, decibels beyond the allowed one, that fine-tuning is expected to recover
+# (docs/method/research-log.md, "Large scenes in a limited time").
 RECOVERABLE_DB = 1.5
-"""Loss of PSNR at the end of a short training path, decibels beyond the one that is allowed, from which fine-tuning
-is not expected to recover (docs/method/research-log.md, "Large scenes in a limited time")."""
-
+# Expected of a trained container, before the first one is made: bytes per Gaussian, those of view-dependent colour in
+# addition, and those that are no images.
 BYTES_PER_GAUSSIAN, BYTES_OF_SH, OVERHEAD_BYTES = 8.6, 4.0, 4000
-"""Bytes of a trained container per Gaussian that are expected at first, those of view-dependent colour in addition, and
-those that are no images before the first container shows how many these are."""
-
 SIZE_BY_COUNT = 0.6  # exponent of the number of Gaussians to which the size of a container grows at equal lambda
 HALF_LEFT = 1.0  # margin of a point before any encoding that leaves half of the allowed loss to the encoder
-
+# Margin that ends a search, as log2 of the number of Gaussians, some 3 % of the bytes; less in a time that is given.
 NEAR_LOG2, NEAR_IN_TIME = 0.09, 0.06
-"""Margin, as log2 of the number of Gaussians, below which a container that meets the goal ends the search: 0.03 dB.
-Another one would save some 3 % of its bytes, or 1 to 2 %, which is worth a time that the user has given."""
-
 UNKNOWN_DROP = 1e6  # larger than any finite drop of PSNR, decibels
 
 NOT_FINETUNED = "no fine-tuned container meets the goal better: this one is not fine-tuned"
-
 BEYOND_PHOTOGRAPHS = (
     "trained for what the photographs show: beyond them it changes more (--evaluate measures how much; --compact 100% "
     "--finetune 0 keeps it)"
@@ -92,41 +79,23 @@ class Scene:
     compacted: Compacted | None = None  # None for all Gaussians
     trained: bool = False  # by fine-tuning that completes its training
 
-    def __len__(self) -> int:
-        return len(self.measured.splats)
-
 
 @dataclass(slots=True, eq=False)
 class Search:
-    """A search for the container that serves the goal of the settings best.
-
-    Attributes:
-        work: what all encodings share.
-        time_only: whether only the time is limited: if no container meets the usual loss, the closest one is kept.
-        goal: the goal.
-        compare: compares a decoded container with the original scene.
-        plan: number of trained containers, and the first of them.
-        compactor: compaction of the scene if fewer Gaussians may serve the goal; None to keep all of them.
-        path: its training path.
-        attempts: all attempts, in order, without their containers.
-        tried: scenes that were evaluated before any encoding.
-        best: the attempt that serves the goal best; None if none meets it.
-        closest: of those that miss it, the one with the least distance to it.
-        stopped: whether the search was stopped from outside (:class:`kissgs.StopSearch`).
-    """
+    """A search for the container that serves the goal of the settings best."""
 
     work: Work
-    time_only: bool = False
-    compactor: Popspa | None = field(init=False, default=None)
+    time_only: bool = False  # only the time is limited: if no container meets the usual loss, the closest one is kept
+    compactor: Popspa | None = field(init=False, default=None)  # if fewer Gaussians may serve the goal
     goal: Goal = field(init=False)
     compare: SearchEvaluation = field(init=False)
     plan: SearchPlan = field(init=False)
-    path: TrainingPath | None = field(init=False, default=None)
-    attempts: list[Attempt] = field(init=False, default_factory=list)
-    tried: list[CountTrial] = field(init=False, default_factory=list)
-    best: Attempt | None = field(init=False, default=None)
-    closest: Attempt | None = field(init=False, default=None)
-    stopped: bool = field(init=False, default=False)
+    path: TrainingPath | None = field(init=False, default=None)  # of the compactor
+    attempts: list[Attempt] = field(init=False, default_factory=list)  # in order, without their containers
+    tried: list[CountTrial] = field(init=False, default_factory=list)  # scenes evaluated before any encoding
+    best: Attempt | None = field(init=False, default=None)  # of those that meet the goal
+    closest: Attempt | None = field(init=False, default=None)  # of those that miss it
+    stopped: bool = field(init=False, default=False)  # from outside, by StopSearch
     _progress: SearchNote = field(init=False)  # the receiver of the work's context
     _pruned: list[Attempt] = field(init=False, default_factory=list)  # losses at points 1, 2 and so on
     _whole: Scene | None = field(init=False, default=None)
@@ -163,12 +132,10 @@ class Search:
 
     @property
     def encode_settings(self) -> EncodeSettings:
-        """Settings of the encoder, with the goal."""
         return self.work.settings.encode
 
     @property
     def tunes(self) -> bool:
-        """Whether the settings ask for fine-tuning."""
         return bool(self.work.settings.finetune.enabled)
 
     @property
@@ -211,17 +178,11 @@ class Search:
     def whole(self) -> Scene:
         """The scene with all its Gaussians, whose sensitivity is measured once."""
         if self._whole is None:
-            settings = self.encode_settings
-            self._whole = Scene(measure(self.work, self.work.splats, settings), settings)
+            self._whole = Scene(measure(self.work, self.work.splats, self.encode_settings), self.encode_settings)
         return self._whole
 
     def run(self) -> Attempt:
-        """Search, and return the best attempt.
-
-        Raises:
-            StopSearch: the search was stopped before any container met the goal.
-            UnsupportedError: no container meets the goal.
-        """
+        """Search, and return the best attempt; raise StopSearch or UnsupportedError if no container met the goal."""
         try:
             if self.path is None:
                 self._search_all_gaussians()
@@ -275,7 +236,8 @@ class Search:
             self._search_all_gaussians()
             return
         if limited is None:
-            self._prune_while(path, is_prunable, PRUNABLE_POINTS)
+            # Not beyond a scene whose rendering failed.
+            self._prune_while(path, lambda scene: (scene.drop or 0.0) <= PRUNABLE_DROP, PRUNABLE_POINTS)
         else:  # what each point loses is not worth the time to measure it
             self._prune_to(path, min(first - 1, PRUNABLE_POINTS))
         if limited is not None and not self._recovers(path):
@@ -403,8 +365,8 @@ class Search:
 
     def _train(self, path: TrainingPath, number: int, *, passed: bool) -> None:
         """Train the last point of the path, on the way to point ``number``."""
-        limited, points = self.work.time, number + 2 - len(path.points)
-        points += 2 * passed  # the last one takes three times as many steps
+        # The last point takes three times as many steps.
+        limited, points = self.work.time, number + 2 - len(path.points) + 2 * passed
         deadline = None if limited is None else limited.for_point(points, self._containers_left)
         path.train(passed=passed, deadline=deadline)
 
@@ -444,10 +406,9 @@ class Search:
         changes = {name: factor * getattr(finetune, name) for name, factor in COMPLETING.items()}
         changes["steps"] = max(1, round(changes["steps"]))
         tuner = make_tuner(self.work, finetune.model_copy(update=changes), compactor)
-        if self.work.time is None:
-            return tuner
-        seconds = self.compare.seconds if compactor.supervision.captured else 0.0
-        tuner.ending_seconds = self.work.time.ending_seconds + seconds  # it evaluates in the same images of a capture
+        if self.work.time is not None:  # it evaluates in the same images of a capture
+            seconds = self.compare.seconds if compactor.supervision.captured else 0.0
+            tuner.ending_seconds = self.work.time.ending_seconds + seconds
         return tuner
 
     @property
@@ -500,12 +461,7 @@ class Search:
             self._along_lambda(self._untrained(path, path.points[-1]), most=self.encode_settings.max_encodes)
 
     def _attempt(self, scene: Scene, settings: EncodeSettings, tuner: Tuner | None) -> Attempt:
-        """Make a container, evaluate it, and keep it if it serves the goal best so far.
-
-        Raises:
-            NoFurtherError: there is no time for another one.
-            StopSearch: the search was stopped.
-        """
+        """Make a container, evaluate it, and keep it if it serves the goal best so far, unless there is no time."""
         if self.stopped:
             raise StopSearch
         self._check_time(trained=tuner is not None)
@@ -515,7 +471,7 @@ class Search:
         size = stored_sizes(made.encoded.files, packed=self.work.packed)[0]
         images = (len(data) for name, data in made.encoded.files.items() if name.endswith(".webp"))
         self._overhead = size - sum(images)
-        attempt = Attempt(len(scene), made.encoded.rd_lambda, size, container=made)
+        attempt = Attempt(len(scene.measured.splats), made.encoded.rd_lambda, size, container=made)
         if not self.goal.by_size:
             attempt = attempt.with_evaluation(self._evaluate(made))
         if tuner is None:
@@ -565,8 +521,7 @@ class Search:
             self.work.context.progress("evaluate", 0.0)
         except StopSearch:
             self.stopped = True
-        most = ReadOptions.allowing(len(self.work.original))
-        threads = self.work.context.threads
+        most, threads = ReadOptions.allowing(len(self.work.original)), self.work.context.threads
         return self.compare(read_scene(made.encoded.files, most, threads=threads), Context(threads))
 
     def _evaluated(self, best: Attempt) -> Attempt:
@@ -641,8 +596,3 @@ class Search:
         if self.plan.containers == 0:
             return "and there was too little time to train a smaller number"
         return "and a smaller number would serve the goal less"
-
-
-def is_prunable(scene: Attempt) -> bool:
-    """Whether a scene may be pruned further without training."""
-    return (scene.drop or 0.0) <= PRUNABLE_DROP  # false where a rendering failed
