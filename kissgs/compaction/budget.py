@@ -63,9 +63,7 @@ def unchanged(splats: Splats, reason: str) -> Compacted:
     """Return the scene with all its Gaussians and a report whose note gives the reason."""
     count = f"{len(splats):,} Gaussian{'' if len(splats) == 1 else 's'}"
     note = f"the scene has {count}, {reason}: it is unchanged"
-    report = CompactionReport(
-        source_count=len(splats), count=len(splats), target_source="nothing", source="", steps=(), note=note
-    )
+    report = CompactionReport(source_count=len(splats), count=len(splats), note=note)
     return Compacted(splats, np.arange(len(splats)), report)
 
 
@@ -81,14 +79,8 @@ def _merge(compactor: Popspa, count: int, *, evaluate: bool) -> Compacted:
     merged, index = merge_gaussians(compactor.splats, count, compactor.context)
     log.record("merge", merged)
     uses_views = evaluate or compactor.settings.max_psnr_drop is not None
-    report = CompactionReport(
-        source_count=len(compactor.splats),
-        count=count,
-        target_source="nothing",
-        source="",
-        steps=tuple(log.steps),
-        note=compactor.supervision.note if uses_views else "",
-    )
+    note, total = compactor.supervision.note if uses_views else "", len(compactor.splats)
+    report = CompactionReport(source_count=total, count=count, steps=tuple(log.steps), note=note)
     return Compacted(merged, index, report)
 
 

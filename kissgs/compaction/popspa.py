@@ -90,9 +90,8 @@ def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> 
     the latter for positions only. ``target_source`` is that of the training targets: "photos" or "renderings"."""
     from kissgs.training.loop import exponential_lr
 
-    base = dict(BASE_LR)
-    if target_source == "renderings":
-        base = {name: rate * settings.synthetic_lr_scale for name, rate in base.items()}
+    scale = settings.synthetic_lr_scale if target_source == "renderings" else 1.0
+    base = {name: rate * scale for name, rate in BASE_LR.items()}
     begin = {name: settings.means_lr_scale if name == "means" else settings.lr_scale for name in base}
     end = {name: settings.final_means_lr_scale if name == "means" else settings.final_lr_scale for name in base}
     return exponential_lr(base, begin, end if phase.name == "refine" else begin)
@@ -114,12 +113,10 @@ class Status:
     steps: Sequence[CompactionStep]
 
     def as_state(self) -> State:
-        """Return the status as an array for the checkpoint, see :meth:`from_state`."""
         return {STATUS_ENTRY: np.frombuffer(json.dumps(asdict(self)).encode(), np.uint8)}
 
     @classmethod
     def from_state(cls, state: State) -> Status:
-        """Return the status in a checkpoint."""
         values = json.loads(state[STATUS_ENTRY].tobytes())
         return cls(**{**values, "steps": [CompactionStep(**step) for step in values["steps"]]})
 
@@ -174,7 +171,8 @@ class Popspa:
             self.load_targets()
         key = "" if checkpoint is None else self._key(count, evaluate)
         log = StepLog(self.evaluate if evaluate else None)
-        compacted = _Run(self, count, Checkpoint(checkpoint, key), log).run()
+        training = SceneTraining(self, np.arange(len(self.splats)))
+        compacted = _Run(self, count, Checkpoint(checkpoint, key), log, training).run()
         return replace(compacted, checkpoint=checkpoint) if self.settings.trains else compacted
 
     def evaluate(self, scene: Splats) -> tuple[ImageMetrics, int]:
@@ -218,9 +216,8 @@ class Popspa:
 MIN_RELATIVE_EXTENT = 1e-4  # of cameras, in radii of the scene, up to which they count as one rotating camera
 MOST_STEP_PER_SIZE = 0.025  # largest rate of a position over the Gaussian's size, the middle of its scales
 
+# Lowest score, in units of what an unobstructed camera nearby would find: True with a capture.
 MIN_SCORE = {True: 0.05, False: 0.3}
-"""Lowest score, in units of the score that an unobstructed camera nearby would find: True with a capture, whose cameras
-show what matters, False for virtual views."""
 
 
 @dataclass(slots=True, eq=False)
@@ -228,11 +225,8 @@ class SceneTraining:
     """Prunes and trains the scene of a compactor, step by step."""
 
     compactor: Popspa
-    index: Int[np.ndarray, " M"] = field(init=False)  # in that scene, of each Gaussian that is left, ascending
+    index: Int[np.ndarray, " M"]  # in that scene, of each Gaussian that is left, ascending
     _model: GaussianModel | None = field(init=False, default=None)
-
-    def __post_init__(self) -> None:
-        self.index = np.arange(len(self.compactor.splats))
 
     def __len__(self) -> int:
         return len(self.index)
@@ -243,15 +237,9 @@ class SceneTraining:
         assert self._model is not None  # noqa: S101  callers begin first
         return self._model
 
-    @property
-    def begun(self) -> bool:
-        """Whether the scene is trainable."""
-        return self._model is not None
-
     def splats(self) -> Splats:
-        """Return the current scene."""
         if self._model is not None:
-            return self.trained.splats()
+            return self._model.splats()
         source = self.compactor.splats
         return source if len(self) == len(source) else source.select(self.index)
 
@@ -284,9 +272,9 @@ class SceneTraining:
         self.index, device = index, self.compactor.context.device
         self._model = GaussianModel.restored(state, self.compactor.splats, device, self._position_extents())
 
-    def state(self) -> State:
-        """Return a copy of the state of the training, see :meth:`restore`."""
-        return {name: array.copy() for name, array in self.trained.state().items()}
+    def state(self) -> State | None:
+        """Return a copy of the state of the training, see :meth:`restore`; None before it."""
+        return None if self._model is None else {name: each.copy() for name, each in self._model.state().items()}
 
     def train(
         self,
@@ -300,9 +288,13 @@ class SceneTraining:
     ) -> None:
         """Train for a phase, in fewer steps where the deadline is near; each ``number`` has another order of images.
         The other arguments are those of :func:`kissgs.training.loop.train`."""
+        from kissgs.compaction.regularizers import ShapeRegularizer
         from kissgs.training.loop import TrainingPlan, train
 
         settings, targets = self.compactor.settings, self.compactor.load_targets()
+        if settings.erank_weight or settings.min_scale_weight:
+            shapes = ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent())
+            regularizers = (shapes, *regularizers)
         plan = TrainingPlan(
             stage=phase.name,
             pace=Pace(phase.steps, context.deadline),
@@ -310,17 +302,9 @@ class SceneTraining:
             ssim_weight=settings.ssim_weight,
             mse_weight=settings.mse_weight,
             seed=(settings.seed, number),
-            regularizers=(*self._shape_regularizers(), *regularizers),
+            regularizers=regularizers,
         )
         train(self.trained, targets, plan, context, first=first, after=after)
-
-    def _shape_regularizers(self) -> tuple[Regularizer, ...]:
-        settings = self.compactor.settings
-        if not (settings.erank_weight or settings.min_scale_weight):
-            return ()
-        from kissgs.compaction.regularizers import ShapeRegularizer
-
-        return (ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent()),)
 
     def _camera_extent(self) -> float:
         """Return the extent of the cameras, world units; the scene's radius if they are nearly at one position."""
@@ -346,11 +330,8 @@ class _Run:
     count: int
     checkpoint: Checkpoint
     log: StepLog
-    training: SceneTraining = field(init=False)
+    training: SceneTraining
     checkpoint_note: str = field(init=False, default="")
-
-    def __post_init__(self) -> None:
-        self.training = SceneTraining(self.compactor)
 
     def run(self) -> Compacted:
         """Do all steps, or those that remain after the checkpoint."""
@@ -369,8 +350,7 @@ class _Run:
 
     def _start(self) -> tuple[int, int, State]:
         """Do the first pruning, or load the checkpoint; return the current phase, its steps done, and the state."""
-        compactor = self.compactor
-        state = self.checkpoint.load()
+        compactor, state = self.compactor, self.checkpoint.load()
         if state is not None:
             status = Status.from_state(state)
             self.training.restore(state, state["index"])
@@ -382,7 +362,6 @@ class _Run:
         return 0, 0, {}
 
     def _first_pruning(self, count: int) -> None:
-        """Prune the input to ``count`` Gaussians."""
         self.log.record("input", self.compactor.splats)
         self.training.prune(count, self.compactor.context)
         self.log.record("prune", self.training.splats())
@@ -398,14 +377,8 @@ class _Run:
 
         progress = stage_progress(self.compactor.context.progress, phases, number)
         context = replace(self.compactor.context, progress=progress, deadline=None)  # a given count takes all steps
-        training.train(
-            phase,
-            number,
-            context,
-            regularizers=() if sparsifier is None else (sparsifier,),
-            first=done,
-            after=save_if_due,
-        )
+        regularizers = () if sparsifier is None else (sparsifier,)
+        training.train(phase, number, context, regularizers=regularizers, first=done, after=save_if_due)
         self.log.record(phase.name, training.splats())
         if len(training) > phase.count:
             training.prune(phase.count, context)
@@ -425,8 +398,7 @@ class _Run:
 
     def _save(self, number: int, done: int, sparsifier_state: State) -> None:
         """Save the state in phase ``number`` after ``done`` of its steps."""
-        status = Status(number, done, self.log.seconds, self.log.steps)
-        training = self.training
+        status, training = Status(number, done, self.log.seconds, self.log.steps), self.training
         state = {**training.trained.state(), **sparsifier_state, "index": training.index, **status.as_state()}
         try:
             self.checkpoint.save(state)
@@ -452,11 +424,9 @@ class _Run:
 
 REFINEMENT = 1_000_000  # number of the refinement in seeds: no path has as many points
 
+# Training steps at a point by the targets, in units of those between two prunings of a compaction to one number. At
+# points that are passed on the way to another, one unit serves (docs/method/research-log.md, "More training").
 POINT_STEPS = {"photos": 3, "renderings": 1}
-"""Training steps at a point by the targets, in units of those between two prunings of a compaction to one number.
-
-At points that are passed on the way to another, one unit serves (docs/method/research-log.md, "More training").
-"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -534,22 +504,21 @@ class TrainingPath:
             count=len(splats),
             target_source=compactor.load_targets().target_source if point.trained or refine else "nothing",
             source=compactor.supervision.source,
-            steps=(),
             note=compactor.supervision.note,
         )
         return Compacted(splats, point.index, report)
 
     def _at(self, point: PathPoint) -> SceneTraining:
-        training = SceneTraining(self.compactor)
-        training.index = point.index
+        training = SceneTraining(self.compactor, point.index)
         if point.state is not None:
             training.restore(point.state, point.index)
         return training
 
     def _add(self, training: SceneTraining, number: int, steps: int) -> PathPoint:
         """Add the state of a training as the last point."""
-        state = training.state() if training.begun else None
+        state = training.state()
         if self.points and not self.keep_states:
             self.points[-1] = replace(self.points[-1], state=None)
-        self.points.append(PathPoint(number, training.splats(), training.index, training.begun, steps, state))
+        trained = state is not None
+        self.points.append(PathPoint(number, training.splats(), training.index, trained, steps, state))
         return self.points[-1]

@@ -64,9 +64,9 @@ class CompactionReport:
 
     source_count: int
     count: int
-    target_source: str
-    source: str
-    steps: tuple[CompactionStep, ...]
+    target_source: str = "nothing"
+    source: str = ""
+    steps: tuple[CompactionStep, ...] = ()
     trials: tuple[CountTrial, ...] = ()
     cleaned: Cleaned = NOTHING_CLEANED
     cpu_seconds: float = 0.0

@@ -198,7 +198,6 @@ class QuantizedScene:
 
     @property
     def antialiased(self) -> bool:
-        """See :class:`kissgs.Splats`."""
         return self._plan.scene.antialiased
 
     @property
@@ -261,11 +260,9 @@ class QuantizedScene:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the state of the training, see :meth:`restore`."""
         return self._adam.state()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from a :meth:`state` of a scene with an equal plan."""
         self._adam.restore(state)
 
 
@@ -320,8 +317,6 @@ class CodebookRate:
 
 
 class _LevelRate:
-    """Rate of the levels of one field."""
-
     table: Float32[np.ndarray, "classes channels symbols"]  # bits of each level; the last entry is repeated
 
     def __init__(self, plane: Plane, classes: Int[np.ndarray, " M"], channels: Int[np.ndarray, " C"]) -> None:
@@ -430,11 +425,9 @@ class RateLoss(Regularizer):
         return self._weight * sum((rate.bits(latents[name]) for name, rate in self._rates.items()), torch.tensor(0.0))
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the rate tables by field, see :meth:`restore`."""
         return {f"{name}.bits": rate.table for name, rate in self._rates.items()}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from a :meth:`state`."""
         for name, rate in self._rates.items():
             rate.table = state[f"{name}.bits"]
 
@@ -451,7 +444,6 @@ class TotalVariationLoss(Regularizer):
     paper does not state the unit; here it is levels."""
 
     def __init__(self, scene: QuantizedScene, weight: float, pace: Pace) -> None:
-        """Prepare the loss."""
         self._scene, self._weight, self._pace = scene, weight, pace
         device = scene.latents["means"].device
         self._one, self._other = (torch.from_numpy(side).to(device) for side in _neighbours(scene.grid))

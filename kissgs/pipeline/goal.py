@@ -117,8 +117,6 @@ LOSSES = {
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A limit of one figure."""
-
     name: str  # of the setting; "detail" or "patch" for losses that a quality alone limits
     value: float  # bytes, decibels, or a difference of SSIM
     slope: float  # typical change of the margin per doubling of lambda
@@ -228,7 +226,6 @@ class Goal:
 
     @property
     def psnr_drop(self) -> float | None:
-        """The largest drop of PSNR, decibels; None if it is not limited."""
         return next((limit.value for limit in self.limits if limit.name == "max_psnr_drop"), None)
 
     def decisive(self, attempt: Attempt) -> Limit:

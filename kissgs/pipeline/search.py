@@ -21,20 +21,9 @@ from kissgs.core.splats import Splats
 from kissgs.evaluation.results import ESTIMATED_DROP, Evaluation, drop_of
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline import curves
 from kissgs.pipeline.choice import has_photographs
-from kissgs.pipeline.curves import (
-    KEEP,
-    LOG2_LAMBDA_RANGE,
-    SMALL_SCENE,
-    LambdaCurve,
-    NoFurtherError,
-    along_path,
-    at_lambda,
-    codebook_limited,
-    count_at,
-    first_point,
-    last_number,
-)
+from kissgs.pipeline.curves import LambdaCurve, NoFurtherError, at_lambda, count_at, last_number
 from kissgs.pipeline.encoding import Measured, Work, encode, make_tuner, measure
 from kissgs.pipeline.goal import Attempt, Container, Goal
 from kissgs.pipeline.limited_time import SearchPlan
@@ -163,15 +152,15 @@ class Search:
             return 0
         expected = (BYTES_PER_GAUSSIAN + BYTES_OF_SH * (splats.sh_degree > 0)) * len(splats)
         share = max((self.target_size - self._overhead) / expected, 1 / len(splats))
-        return max(0, round(math.log(share) / math.log(KEEP)))
+        return max(0, round(math.log(share) / math.log(curves.KEEP)))
 
     @property
     def first(self) -> tuple[int, float]:
         """Point of the first trained container, and decibels added to ``quality_offset_db`` there."""
         if self.goal.by_size:
             return self.number_for_size, self.plan.offset_db
-        may_step = self.plan.containers > 1 and len(self.work.splats) >= SMALL_SCENE
-        number, offset_db = first_point(self.goal, self.plan.number, self.plan.offset_db, may_step=may_step)
+        may_step = self.plan.containers > 1 and len(self.work.splats) >= curves.SMALL_SCENE
+        number, offset_db = curves.first_point(self.goal, self.plan.number, self.plan.offset_db, may_step=may_step)
         return min(number, last_number(len(self.work.splats))), offset_db
 
     @property
@@ -304,7 +293,7 @@ class Search:
 
     def _lambda_for_size(self, number: int) -> float:
         """Return the lambda at which a point should have the target size, by containers of all Gaussians."""
-        wanted = self.target_size / KEEP ** (SIZE_BY_COUNT * number)
+        wanted = self.target_size / curves.KEEP ** (SIZE_BY_COUNT * number)
         made = sorted((attempt.bytes, attempt.rd_lambda) for attempt in self.attempts if attempt.rd_lambda is not None)
         sizes, lambdas = np.log2([size for size, _ in made]), np.log2([rd_lambda for _, rd_lambda in made])
         return float(2.0 ** np.interp(math.log2(wanted), sizes, lambdas))
@@ -456,7 +445,7 @@ class Search:
         if self.plan.containers == 0:  # there is no time for training
             self._prune_to(path, max(first, 1))
         with suppress(NoFurtherError):
-            along_path(self.goal, encode_at, first, last, self.plan.containers, near)
+            curves.along_path(self.goal, encode_at, first, last, self.plan.containers, near)
         if self.goal.by_size and self.best is None and len(path.points) > 1:  # lambda alone makes it small enough
             self._along_lambda(self._untrained(path, path.points[-1]), most=self.encode_settings.max_encodes)
 
@@ -565,8 +554,8 @@ class Search:
         if self.goal.psnr_drop is not None and best.against == "renderings":
             return ESTIMATED_DROP
         margin, target = self.goal.margin(best), self.target_size
-        finest = best.rd_lambda == 2.0 ** LOG2_LAMBDA_RANGE[0]
-        limited = codebook_limited(best.made.settings, self.work.splats.sh_degree)
+        finest = best.rd_lambda == 2.0 ** curves.LOG2_LAMBDA_RANGE[0]
+        limited = curves.codebook_limited(best.made.settings, self.work.splats.sh_degree)
         if not target or not finest or limited or margin <= self.goal.limits[0].near:
             return ""
         return f"target_size {target:,} bytes is above the finest container of this scene: {best.bytes:,} bytes"

@@ -63,7 +63,6 @@ class Encoded:
 
     @classmethod
     def of(cls, plan: EncodingPlan, files: dict[str, bytes]) -> Encoded:
-        """Return the files of a plan with the plan's figures."""
         scene = plan.scene
         return cls(
             files=files,

@@ -317,7 +317,6 @@ def sort_keys(
 
 @njit(nogil=True, error_model="numpy")
 def _bits_between(pixels: np.ndarray, bits: np.ndarray, a: int, b: int) -> int:
-    """Return the bits of pixel ``a`` beside pixel ``b``."""
     total = 0
     for channel in range(pixels.shape[1]):
         total += bits[channel, np.uint8(pixels[a, channel] - pixels[b, channel])]

@@ -15,26 +15,10 @@ from kissgs.core.positions import coarse_note
 from kissgs.core.resources import Workers, blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS, Splats
-from kissgs.planning import rd_fields
+from kissgs.planning import quantize, rd_fields
 from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import hilbert_order, layout_grid
-from kissgs.planning.quantize import (
-    EVEN_LEVELS,
-    MEANS_TOP,
-    ByteTables,
-    ContainerModel,
-    Planning,
-    Quantized,
-    Rows,
-    clip_outliers,
-    half_steps,
-    log_extent,
-    means_bits,
-    quantize,
-    quantize_means,
-    selected,
-    sorted_order,
-)
+from kissgs.planning.quantize import EVEN_LEVELS, ByteTables, ContainerModel, Planning, Quantized, Rows, selected
 from kissgs.planning.rate_distortion import ColorRefit, plan_rate_distortion
 from kissgs.planning.rd_fields import OUTLIERS, largest_errors
 from kissgs.planning.rotation_forms import SHAPE_COLUMNS, choose_forms
@@ -148,7 +132,7 @@ def _with_equal_positions_in_order(
     """Return an order in which Gaussians of equal position have ascending indices."""
     x, y, z = means[order].T
     keys = x | y.astype(np.uint64) << np.uint64(16) | z.astype(np.uint64) << np.uint64(32)
-    places = sorted_order(keys, 48)
+    places = quantize.sorted_order(keys, 48)
     group = np.cumsum(np.diff(keys, prepend=keys[:1]) > 0)
     shared = np.bincount(group, minlength=1)[group] > 1
     places, group = places[shared], group[shared]
@@ -169,13 +153,14 @@ def plan_uniform(
     """Plan the Gaussians ``kept``, which may be none, for a container."""
     settings, container, pool = planning.settings, planning.container, planning.pool
     most = 16 if container.tables is None else 32
-    bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance, pool, most=most)
+    bits = settings.means_bits or quantize.means_bits(splats, kept, settings.means_tolerance, pool, most=most)
     grid = layout_grid(splats.means, kept, min(bits, 16), settings, pool, planning.report("order"), None, groups)
     grid = grid.with_padding_last() if container.padding_last else grid
     # Padding repeats Gaussians of the scene; in a scene without any, padding is a neutral Gaussian.
     source, cells = (splats, grid.cells) if len(kept) else (_neutral(splats.sh_degree), grid.cells * 0)
-    clips = settings.shared_step_size and container.tables is None
-    sh0 = clip_outliers(source.sh0, step=settings.sh0_step, share=OUTLIERS) if clips else source.sh0
+    shared, sh0 = settings.shared_step_size, source.sh0
+    if shared and container.tables is None:
+        sh0 = quantize.clip_outliers(sh0, step=settings.sh0_step, share=OUTLIERS)
     shapes, form_error = choose_forms(source, cells, grid.side, planning)
     chosen = cells[grid.mask]
     weights = np.ones(len(chosen), np.float32)
@@ -191,19 +176,19 @@ def plan_uniform(
         "f_dc": settings.sh0_step,
     }
     if container.tables is not None:
-        if not settings.shared_step_size:
+        if not shared:
             steps = dict.fromkeys(steps, FINEST)
         means, colors = source.means[cells], source.sh0[cells]
         fields, errors = _table_fields(means, colors, shapes[:], bits, steps, container.tables)
     else:
         rows: dict[str, Rows] = {name: shapes.field(name) for name in SHAPE_COLUMNS}
         rows["f_dc"] = selected(sh0, cells)
-        fields = {"means": quantize_means(selected(source.means, cells), bits=bits, pool=pool)}
+        fields = {"means": quantize.quantize_means(selected(source.means, cells), bits=bits, pool=pool)}
         for name, step in steps.items():
-            top = 255 if settings.shared_step_size else PAPER_TOPS[name]
-            fields[name] = quantize(rows[name], step=step, shared=settings.shared_step_size, max_top=top, pool=pool)
-        errors = {name: half_steps(field) for name, field in fields.items()}
-        errors["means"] = half_steps(fields["means"], 1 << (16 - bits))
+            top = 255 if shared else PAPER_TOPS[name]
+            fields[name] = quantize.quantize(rows[name], step=step, shared=shared, max_top=top, pool=pool)
+        errors = {name: quantize.half_steps(field) for name, field in fields.items()}
+        errors["means"] = quantize.half_steps(fields["means"], 1 << (16 - bits))
     return EncodingPlan(
         scene=PlannedScene(len(splats), len(kept), splats.sh_degree, splats.origin, splats.antialiased),
         grid=grid,
@@ -227,7 +212,7 @@ def _table_fields(
     """Return the levels by field, and the largest errors, for a container with tables."""
     equal = np.ones(len(means))
     each = {name: step * equal for name, step in steps.items()}
-    unit = log_extent(means) / MEANS_TOP
+    unit = quantize.log_extent(means) / quantize.MEANS_TOP
     wanted = rd_fields.stored_values(values, tables)
     shapes = rd_fields.rounded_shapes(wanted, equal, each, tables)
     fields = {

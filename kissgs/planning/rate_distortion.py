@@ -12,6 +12,7 @@ from kissgs.core.positions import signed_log
 from kissgs.core.resources import Workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_C0, Splats
+from kissgs.planning import sh_codebook
 from kissgs.planning.clustering import ShMetric
 from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import layout_grid
@@ -19,15 +20,7 @@ from kissgs.planning.quantize import Planning, Quantized, for_each_block, means_
 from kissgs.planning.rd_criterion import SEEN, Costs, RdCriterion
 from kissgs.planning.rd_fields import RdFields, decoded_entries, decoded_scene, largest_changes, largest_errors
 from kissgs.planning.rotation_forms import choose_forms
-from kissgs.planning.sh_codebook import (
-    SH_SHRINK,
-    Codebook,
-    CodebookErrorModel,
-    codebook_error_model,
-    fit_codebook,
-    nearest_square,
-    sensitivity_weights,
-)
+from kissgs.planning.sh_codebook import Codebook, CodebookErrorModel
 from kissgs.settings import EncodeSettings
 
 # Estimate of a scene's error by lambda, before it is planned, and the lambda for a given error.
@@ -62,7 +55,6 @@ class ErrorModel:
     view_uncertainty: float
 
     def error_at(self, rd_lambda: float) -> float:
-        """Estimate the mean squared error of the scene planned with ``rd_lambda``."""
         costs, count = self.costs, len(self.costs.color)
         pruned = costs.removal[costs.pruned_by_rd(rd_lambda, self.prune_bits)]
         rounding = GROWTH * DIMENSIONS * (count - len(pruned)) * rd_lambda / (2 * np.log(2))
@@ -139,7 +131,7 @@ def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs,
     total = sum(for_each_block(len(costs.color), bounded))
     total += min(float(costs.position.sum()) * squares[-1] / 12, total * 3 / (DIMENSIONS - 3))
     entries = max(len(costs.color) / ratio, 1)
-    return total + PAPER_SH_GROWTH * sh_model.unweighted * (sh_model.entries / entries) ** SH_SHRINK
+    return total + PAPER_SH_GROWTH * sh_model.unweighted * (sh_model.entries / entries) ** sh_codebook.SH_SHRINK
 
 
 def implied_lambda(error: float, count: int) -> float:
@@ -171,7 +163,7 @@ def plan_rate_distortion(
     costs = Costs.of(sensitivity, splats, pool)
     return_free_memory()
     costs = costs.keep(kept) if len(kept) < len(splats) else costs
-    sh_model = codebook_error_model(splats, kept, sensitivity, settings, pool)
+    sh_model = sh_codebook.codebook_error_model(splats, kept, sensitivity, settings, pool)
     refits = settings.color_refit_iterations if recolor is not None else 0
     prune_bits = settings.prune_threshold_bits * (1 - uncertainty)
     model = ErrorModel(costs, sh_model, prune_bits, settings.gaussians_per_codebook_entry, uncertainty)
@@ -244,10 +236,10 @@ def _codebook(
     splats: Splats, order: Int[np.ndarray, " M"], sensitivity: Sensitivity, size: int, planning: Planning
 ) -> Codebook:
     """Return the SH codebook of about ``size`` entries, fitted to what cameras see of each colour."""
-    weights = sensitivity_weights(sensitivity, order, splats)
+    weights = sh_codebook.sensitivity_weights(sensitivity, order, splats)
     metric = ShMetric.of(sensitivity, splats.sh_degree)
-    most = nearest_square(size) if planning.container.tables is None else size
-    return fit_codebook(splats, order, weights, most, planning, metric=metric)
+    most = sh_codebook.nearest_square(size) if planning.container.tables is None else size
+    return sh_codebook.fit_codebook(splats, order, weights, most, planning, metric=metric)
 
 
 def _base_colors(

@@ -13,29 +13,8 @@ from kissgs.core.array_types import Float, Float32, Float64, Int, Integer, UInt8
 from kissgs.core.positions import signed_exp, signed_log
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.planning import rotation_forms
-from kissgs.planning.quantize import (
-    MEANS_TOP,
-    SIZE,
-    ByteTables,
-    Computed,
-    Planning,
-    Quantized,
-    Rows,
-    clip_outliers,
-    even_table,
-    fit_table,
-    for_each_block,
-    log_extent,
-    means_bits,
-    nearest_levels,
-    quantize_means,
-    refit_table,
-    row_range,
-    selected,
-    table_field,
-    without_unused,
-)
+from kissgs.planning import quantize, rotation_forms
+from kissgs.planning.quantize import ByteTables, Computed, Planning, Quantized, Rows, for_each_block, selected
 from kissgs.planning.rd_criterion import RdCriterion
 from kissgs.planning.rotation_forms import KEPT, PERMUTATIONS, SHAPE_COLUMNS, StoredShapes
 from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook
@@ -83,7 +62,7 @@ def quantize_by_steps(
     values: Float[np.ndarray, "M C"] | Rows, steps: Float64[np.ndarray, " M"] | Rows, pool: Workers | None = None
 ) -> Quantized:
     """Round to the nearest multiples of each Gaussian's own step, the same for all its channels."""
-    smallest, largest = row_range(values, pool)
+    smallest, largest = quantize.row_range(values, pool)
     low32 = smallest.astype(np.float32) + np.float32(0)
     low = low32.astype(np.float64)
     extent = largest.astype(np.float64) - low
@@ -103,7 +82,7 @@ def quantize_by_steps(
 
     for_each_block(count, round_to_levels, pool)
     high = np.where(extent > 0, low + top * finest, low).astype(np.float32)
-    return Quantized(levels, even_table(low32, high, top), stride)
+    return Quantized(levels, quantize.even_table(low32, high, top), stride)
 
 
 def rdo_quantize(
@@ -160,7 +139,7 @@ def rdo_quantize(
         if criterion.costs is not None and tables is not None:
             bounds = largest["scales"][:], largest["growth"][:]
             table = parts["scales"].table[:, 0].astype(np.float32)
-            moved = refit_table(table, levels[:, 1:4], values[:][:, 1:4], criterion.costs.scale, bounds)
+            moved = quantize.refit_table(table, levels[:, 1:4], values[:][:, 1:4], criterion.costs.scale, bounds)
             parts = {**parts, "scales": replace(parts["scales"], table=moved.astype(np.float64)[:, None])}
     chosen = np.split(levels, [1, 4], axis=1)
     found = {name: replace(parts[name], levels=own) for name, own in zip(SHAPE_COLUMNS, chosen, strict=True)}
@@ -173,7 +152,7 @@ def _values_of_levels(fields: list[Quantized]) -> tuple[Float64[np.ndarray, "C 2
     for field in fields:
         for column in range(field.levels.shape[1]):
             table = field.table[:, column % field.table.shape[1]]
-            values.append(np.pad(table, (0, SIZE - len(table)), mode="edge"))
+            values.append(np.pad(table, (0, quantize.SIZE - len(table)), mode="edge"))
             ends.append((0, field.top if table[-1] > table[0] else 0))
     return np.stack(values), np.array(ends)
 
@@ -227,17 +206,17 @@ def rounded_shapes(
     """Round opacity, log-scales and quaternion of :func:`stored_values` to steps of each Gaussian's own. ``weights``
     are squared image errors per squared unit of the log-scales."""
     quats = values[:, 4:]
-    opacities = nearest_levels(tables.opacity_logits, _on_lattice(values[:, :1], steps["opacities"]))
+    opacities = quantize.nearest_levels(tables.opacity_logits, _on_lattice(values[:, :1], steps["opacities"]))
     finest = float(steps["scales"].min())
     scales = _on_lattice(values[:, 1:4], np.clip(np.rint(steps["scales"] / finest), 1, 255) * finest)
-    scale_table = fit_table(scales.ravel(), np.repeat(weights, 3), finest)
+    scale_table = quantize.fit_table(scales.ravel(), np.repeat(weights, 3), finest)
     omitted = rotation_forms.omitted_components(quats)
     small = rotation_forms.stored_components(quats, omitted)
     return {
         "opacities": Quantized(
             np.clip(opacities, tables.first_drawn, tables.last_drawn), tables.opacity_logits[:, None]
         ),
-        "scales": Quantized(nearest_levels(scale_table, scales), scale_table.astype(np.float64)[:, None]),
+        "scales": Quantized(quantize.nearest_levels(scale_table, scales), scale_table.astype(np.float64)[:, None]),
         "quaternions": Quantized(
             rotation_forms.lattice_levels(small, rotation_forms.strides(steps["quaternions"])),
             rotation_forms.TABLE[:, None],
@@ -254,8 +233,8 @@ def finished_shapes(
     hidden = logits <= tables.opacity_logits[1]
     opacities[hidden, 0] = np.rint(255 / (1 + np.exp(-logits[hidden])))
     scales = fields["scales"]
-    used = without_unused(scales.table[:, 0].astype(np.float32), scales.levels)
-    return {**fields, "opacities": replace(fields["opacities"], levels=opacities), "scales": table_field(*used)}
+    used = quantize.table_field(*quantize.without_unused(scales.table[:, 0].astype(np.float32), scales.levels))
+    return {**fields, "opacities": replace(fields["opacities"], levels=opacities), "scales": used}
 
 
 def color_field(
@@ -264,8 +243,8 @@ def color_field(
     """Return the levels of base colours, each Gaussian's rounded to a step of its own."""
     finest = float(steps.min())
     rounded = _on_lattice(base, np.clip(np.rint(steps / finest), 1, 255) * finest)
-    table = fit_table(rounded.ravel(), np.repeat(weights, 3), finest)
-    return table_field(*without_unused(table, nearest_levels(table, rounded)))
+    table = quantize.fit_table(rounded.ravel(), np.repeat(weights, 3), finest)
+    return quantize.table_field(*quantize.without_unused(table, quantize.nearest_levels(table, rounded)))
 
 
 def means_field(means: Float32[np.ndarray, "M 3"], steps: float | Float64[np.ndarray, " M"]) -> Quantized:
@@ -273,12 +252,12 @@ def means_field(means: Float32[np.ndarray, "M 3"], steps: float | Float64[np.nda
     of two, up to 256, of about the step of each Gaussian, so that low bytes compress."""
     logs = signed_log(means)
     low, high = (_as_text(end.astype(np.float32)) for end in (logs.min(axis=0), logs.max(axis=0)))
-    table = even_table(low, high, MEANS_TOP)
+    table = quantize.even_table(low, high, quantize.MEANS_TOP)
     extent = high.astype(np.float32).astype(np.float64) - low.astype(np.float32)
-    unit = np.where(extent > 0, extent, np.inf) / MEANS_TOP
+    unit = np.where(extent > 0, extent, np.inf) / quantize.MEANS_TOP
     exponents = np.log2(np.maximum(np.reshape(steps, (-1, 1)) / unit, 1))
     every = np.exp2(np.clip(np.floor(exponents + 0.5), 0, 8))
-    levels = np.clip(np.rint((logs - low.astype(np.float32)) / unit / every) * every, 0, MEANS_TOP)
+    levels = np.clip(np.rint((logs - low.astype(np.float32)) / unit / every) * every, 0, quantize.MEANS_TOP)
     stride = np.broadcast_to(every, levels.shape).astype(np.int64)
     return Quantized(levels.astype(np.uint16), table, stride)
 
@@ -319,7 +298,6 @@ class RdFields:
     largest: Mapping[str, Rows]  # see largest_changes
 
     def shapes(self, values: StoredShapes, hessians: Rows) -> dict[str, Quantized]:
-        """Quantise opacity, log-scales and rotation."""
         criterion, tables, pool = self.criterion, self.planning.container.tables, self.planning.pool
         wanted: StoredShapes | Float64[np.ndarray, "M 8"] = values
         steps = {
@@ -344,15 +322,15 @@ class RdFields:
         """Quantise the positions of the Gaussians ``order``, with the bits that lambda asks for in each class. A
         Gaussian has at most ``coarser`` bits less than :func:`means_bits` gives for ``means_tolerance``."""
         means, criterion, pool = selected(splats.means, order), self.criterion, self.planning.pool
-        usual = means_bits(splats, order, self.planning.settings.means_tolerance, pool)
+        usual = quantize.means_bits(splats, order, self.planning.settings.means_tolerance, pool)
         most = np.clip(16 - usual + coarser, 0, 8)
-        unit = max(log_extent(means, pool), 1e-30) / MEANS_TOP
+        unit = max(quantize.log_extent(means, pool), 1e-30) / quantize.MEANS_TOP
         steps = criterion.steps["position"]
         if self.planning.container.tables is not None:
             each = np.array(steps)[criterion.classes]
             return means_field(means[:], np.minimum(each, unit * 2.0**most / np.sqrt(2)))
         coarse = np.array([min(max(np.floor(np.log2(step / unit) + 0.5), 0), 8) for step in steps]).astype(np.int8)
-        return quantize_means(means, bits=16 - np.minimum(coarse[criterion.classes], most), pool=pool)
+        return quantize.quantize_means(means, bits=16 - np.minimum(coarse[criterion.classes], most), pool=pool)
 
     def colors(self, base: Float32[np.ndarray, "M 3"]) -> tuple[Quantized, int]:
         """Quantise base colours; return them and the number of clipped outliers."""
@@ -360,7 +338,7 @@ class RdFields:
         steps = criterion.each_step("color", self.largest["f_dc"])
         if self.planning.container.tables is not None and criterion.costs is not None:
             return color_field(base.astype(np.float64), steps[:], criterion.costs.color), 0
-        clipped = clip_outliers(base, step=min(criterion.steps["color"]), share=OUTLIERS)
+        clipped = quantize.clip_outliers(base, step=min(criterion.steps["color"]), share=OUTLIERS)
         levels = quantize_by_steps(clipped, steps, self.planning.pool)
         return levels, 0 if clipped is base else int((clipped != base).any(axis=1).sum())
 
@@ -381,7 +359,6 @@ def decoded_entries(codebook: Codebook, coefficients: int) -> Float32[np.ndarray
 def decoded_scene(
     fields: dict[str, Quantized], sh0: Float32[np.ndarray, "M 3"], shN: Float32[np.ndarray, "M K 3"]
 ) -> Splats:
-    """Return the decoded scene."""
     quats = decoded_quats(fields)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     return Splats(

@@ -139,7 +139,6 @@ class PrunableAdam:
         bounds: Mapping[str, tuple[float, float]] | None = None,
         factors: Mapping[str, Tensor] | None = None,
     ) -> None:
-        """Copy the parameters."""
         self._bounds, factors = bounds or {}, factors or {}
         self._leaves = {name: _leaf(value.detach().clone(), factors.get(name)) for name, value in values.items()}
 
@@ -289,7 +288,6 @@ class GaussianModel:
     def __init__(
         self, splats: Splats, device: Device = "cpu", extents: Float32[np.ndarray, " N"] | None = None
     ) -> None:
-        """Copy a scene."""
         extents = np.ones(len(splats), np.float32) if extents is None else extents
         self._adam = PrunableAdam(tensors_of(splats, device), BOUNDS, {"means": torch.from_numpy(extents)})
         self._rest = splats.select(slice(0))
@@ -308,7 +306,6 @@ class GaussianModel:
 
     @property
     def antialiased(self) -> bool:
-        """See :class:`kissgs.Splats`."""
         return self._rest.antialiased
 
     def add_gradients(self, gradients: Gradients) -> None:
@@ -316,7 +313,6 @@ class GaussianModel:
         self._received.append(gradients)
 
     def gaussians(self) -> dict[str, Tensor]:
-        """Return the parameters themselves."""
         return self.parameters
 
     def __len__(self) -> int:
@@ -334,7 +330,6 @@ class GaussianModel:
             self._adam.step(rates)
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
-        """Keep only the Gaussians at ``index``, with their Adam moments."""
         self._adam.keep(index)
 
     def splats(self) -> Splats:

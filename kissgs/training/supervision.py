@@ -53,7 +53,6 @@ class SupervisionViews:
 
     @property
     def eval_views(self) -> Views:
-        """Evaluation views, for :func:`kissgs.evaluate`."""
         return Views((), self.test, self.background, self.source)
 
 

@@ -46,7 +46,6 @@ class Projection(NamedTuple):
 
     @classmethod
     def of(cls, splats: Splats, camera: Camera) -> Projection:
-        """Return the projection of a scene into the image of a camera."""
         return cls(
             camera.viewmat,
             camera.K,
