@@ -56,7 +56,8 @@ def compact_scene(
     compactor = Popspa(splats, settings, chosen_views(splats, settings, views, context), context)
     if settings.max_psnr_drop is None:
         return _compacted(compactor, count, evaluate=evaluate, checkpoint=checkpoint)
-    return _search_drop(compactor, SearchEvaluation.of(splats, views, compactor.supervision), settings.max_psnr_drop)
+    compare = SearchEvaluation(splats, None if views is None else compactor.supervision.eval_views)
+    return _search_drop(compactor, compare, settings.max_psnr_drop)
 
 
 def unchanged(splats: Splats, reason: str) -> Compacted:

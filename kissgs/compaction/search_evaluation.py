@@ -14,7 +14,6 @@ from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import BACKGROUNDS, evaluation_views
 from kissgs.evaluation.evaluate import Rendering, compare_images
 from kissgs.evaluation.results import SEARCH_SEED, Evaluation
-from kissgs.training.supervision import SupervisionViews
 
 COUNT, SIDE = 24, 320  # number and side, pixels, of the views without a capture, but for those drawn over the scene
 KEPT_PIXELS = 2**24  # of a capture's held-out views up to which renderings of the original are kept, 0.2 GB
@@ -35,11 +34,6 @@ class SearchEvaluation:
     _drawn: Views | None = field(init=False, default=None)
     _images: dict[int, Rendering] = field(init=False, default_factory=dict)
     _drawn_images: dict[int, Rendering] = field(init=False, default_factory=dict)
-
-    @classmethod
-    def of(cls, original: Splats, views: Views | None, supervision: SupervisionViews) -> SearchEvaluation:
-        """Return the evaluation for a compaction: with a capture in the views that it holds out."""
-        return cls(original, None if views is None else supervision.eval_views)
 
     def __call__(self, candidate: Splats, context: Context = DEFAULT_CONTEXT) -> Evaluation:
         """Evaluate a candidate, always on the CPU; reports the stages "cameras", "kernels" and "evaluate"."""

@@ -29,9 +29,9 @@ T = TypeVar("T")
 PART = 1 << 16  # number of rows that a thread processes at a time; sums of parts are added in order
 
 
-def each_part(work: Callable[[int, int], T], rows: int, threads: int) -> list[T]:
+def each_part(work: Callable[[int, int], T], rows: int) -> list[T]:
     """Call ``work`` with the first row of each part and the end of its rows; return the results in order."""
-    with Workers(threads) as pool:
+    with Workers(torch.get_num_threads()) as pool:
         return pool.map(lambda first: work(first, min(first + PART, rows)), range(0, rows, PART))
 
 
@@ -320,11 +320,7 @@ class Plane:
             gradient += (factor * weights * self.units(latents, table) ** 2).float() * (latents - level)
             return
         levels, curvature, slopes = self._arrays(latents, self._values(table)), weights.numpy(), gradient.numpy()
-
-        def part(first: int, last: int) -> None:
-            attract(*levels, curvature, factor, first, last, slopes)
-
-        each_part(part, len(latents), torch.get_num_threads())
+        each_part(lambda a, b: attract(*levels, curvature, factor, a, b, slopes), len(latents))
 
     def _arrays(
         self, latents: Float32[Tensor, "R C"], table: Float64[Tensor, "L _"]
@@ -363,11 +359,7 @@ class _Values(torch.autograd.Function):
         if latents.device.type != "cpu":
             return _entries(table.detach(), plane.lists[plane.positions(latents)])
         levels, values = plane._arrays(latents, table), np.empty(tuple(latents.shape))
-
-        def part(first: int, last: int) -> None:
-            level_values(*levels, first, last, values)
-
-        each_part(part, len(values), torch.get_num_threads())
+        each_part(lambda first, last: level_values(*levels, first, last, values), len(values))
         return torch.from_numpy(values)
 
     @staticmethod
@@ -386,11 +378,7 @@ class _Values(torch.autograd.Function):
             return (gradient * plane.units(latents, table)).float(), total, None
         arrays, v_values = plane._arrays(latents, table), gradient.double().contiguous().numpy()
         v_latents = np.empty(tuple(gradient.shape), np.float32)
-
-        def part(first: int, last: int) -> None:
-            level_gradients(*arrays, v_values, first, last, v_latents)
-
-        each_part(part, len(v_latents), torch.get_num_threads())
+        each_part(lambda first, last: level_gradients(*arrays, v_values, first, last, v_latents), len(v_latents))
         return torch.from_numpy(v_latents), total, None
 
 
@@ -427,30 +415,18 @@ def planes_of(
         if tables is None or name == "means":
             # Some readers need the largest position to be the largest level.
             planes[name] = Plane.even(field, device, freeze_top=name == "means" and field.top == MEANS_TOP)
-        elif name == "f_rest_centroids":
-            planes[name] = _codebook(field, sh_degree, device)
+        elif name == "f_rest_centroids":  # every entry uses all values; missing bands are frozen
+            frozen = np.zeros(field.levels.shape, bool)
+            frozen[:, np.arange(field.levels.shape[1]) % COEFFICIENTS >= SH_REST_COUNTS[sh_degree]] = True
+            rows, lists = np.zeros((len(frozen), 1), np.int64), [np.arange(len(field.table))]
+            planes[name] = Plane.of(field, lists, rows, frozen, device, largest_gap=CAPTURED["f_dc"])
         else:
             planes[name] = _of_classes(name, field, plan.classes.astype(np.int64), tables, device)
-    if tables is None:
-        return planes, {}
-    trained = {
-        name: ValueTable.of(
-            planes[name].field.table[:, 0],
-            device,
-            freeze_zero=name == "f_rest_centroids",
-            largest_gap=CAPTURED.get(name, CAPTURED["f_dc"]),
-        )
-        for name in TABLES
-    }
+    trained = {}
+    for name in () if tables is None else TABLES:
+        values, gap = planes[name].field.table[:, 0], CAPTURED.get(name, CAPTURED["f_dc"])
+        trained[name] = ValueTable.of(values, device, freeze_zero=name == "f_rest_centroids", largest_gap=gap)
     return planes, trained
-
-
-def _codebook(field: Quantized, sh_degree: int, device: Device) -> Plane:
-    """Return the plane of a codebook with a table: every entry uses all values; missing bands are frozen."""
-    frozen = np.zeros(field.levels.shape, bool)
-    frozen[:, np.arange(field.levels.shape[1]) % COEFFICIENTS >= SH_REST_COUNTS[sh_degree]] = True
-    rows = np.zeros((len(frozen), 1), np.int64)
-    return Plane.of(field, [np.arange(len(field.table))], rows, frozen, device, largest_gap=CAPTURED["f_dc"])
 
 
 def _of_classes(

@@ -99,12 +99,9 @@ class _LookUp(torch.autograd.Function):
         if gradient.device.type != "cpu":
             return total.index_add_(0, labels.index, gradient), None
         rows, totals = (tensor.contiguous().numpy().reshape(len(tensor), -1) for tensor in (gradient, total))
-
-        def part(first: int, last: int) -> None:
-            sum_by_label(rows, labels.order, labels.used, labels.starts, first, last, totals)
-
         if gradient.numel():
-            each_part(part, len(labels.used), torch.get_num_threads())
+            own = labels.order, labels.used, labels.starts
+            each_part(lambda first, last: sum_by_label(rows, *own, first, last, totals), len(labels.used))
         return total, None
 
 
@@ -216,22 +213,18 @@ class QuantizedScene:
                 latents.clamp_(self.planes[name].min_latent, self.planes[name].max_latent)
             for name, latents in self.table_latents.items():
                 latents.clamp_(self.trained_tables[name].min_latent, self.trained_tables[name].max_latent)
-            if rotations is not None:
-                self._keep_unit_length(rotations)
+            if rotations is not None:  # a step is taken back if three components leave no room for a fourth
+                latents = self.latents["quaternions"]
+                squares = self.planes["quaternions"].values(latents).square().sum(dim=1, keepdim=True)
+                latents.copy_(torch.where(squares > 1, rotations, latents))
 
+    @torch.no_grad()
     def _attract(self, factor: float) -> None:
         """Add the gradient of the quadratic attraction of each latent to its current level."""
-        with torch.no_grad():
-            tables = self.tables()
-            for name, latents in self.latents.items():
-                if latents.grad is not None:
-                    self.planes[name].attract(latents.grad, latents, tables.get(name), self._weights[name], factor)
-
-    def _keep_unit_length(self, former: Float32[Tensor, "M 3"]) -> None:
-        """Take back a step after which the three components of a rotation leave no room for a fourth."""
-        latents = self.latents["quaternions"]
-        squares = self.planes["quaternions"].values(latents).square().sum(dim=1, keepdim=True)
-        latents.copy_(torch.where(squares > 1, former, latents))
+        tables = self.tables()
+        for name, latents in self.latents.items():
+            if latents.grad is not None:
+                self.planes[name].attract(latents.grad, latents, tables.get(name), self._weights[name], factor)
 
     def plan(self) -> EncodingPlan:
         """Return the plan with the current levels and tables."""
@@ -370,7 +363,7 @@ class _Bits(torch.autograd.Function):
         def part(first: int, last: int) -> float:
             return float(level_bits(start, found, codes, bits_of, symbols, first, last, slopes))
 
-        bits = each_part(part, len(slopes), torch.get_num_threads())
+        bits = each_part(part, len(slopes))
         ctx.save_for_backward(torch.from_numpy(slopes))
         return torch.tensor(math.fsum(bits), dtype=torch.float32)
 
@@ -381,12 +374,10 @@ class _Bits(torch.autograd.Function):
         return torch.from_numpy(slopes.numpy() * upstream.numpy()), None, None, None, None
 
 
+# Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that. Entries
+# of the SH codebook are added where they are a list, sorted by frequency: neighbours then predict nothing. In a square
+# they predict each other (CodebookRate).
 ENTROPY_FIELDS = ("opacities", "scales", "quaternions", "f_dc")
-"""Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that.
-
-Entries of the SH codebook are added where they are a list, sorted by frequency: neighbours then predict nothing.
-In a square they predict each other (:class:`kissgs.finetuning.quantized_scene.CodebookRate`).
-"""
 
 RECOUNT_STEPS = 25  # number of steps between two updates of the histograms and of the mean differences
 

@@ -42,16 +42,11 @@ ATTRACTION_START = 0.5  # fraction of the steps after which attraction starts; i
 TABLE_LR = 1.0  # of tables, in units of that of levels: an error of a value is one of all that uses it
 
 NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
-
 NO_TIME = "there was no time for fine-tuning; the container is as it was without it"
 
+# Most steps before a deadline, in units of the usual number: more fit photographs that train better, others worse.
 MOST_STEPS = {"photos": 1, "renderings": 2}
-"""Most steps before a deadline, in units of the usual number, by the targets: more steps fit the photographs that train
-better, and those that are held out worse."""
-
 Write = Callable[[EncodingPlan, int, Context], Encoded]  # writes a plan that was fine-tuned in a number of steps
-
-
 Decode = Callable[..., Splats]  # decoder of a container: takes its files, ReadOptions and threads
 
 
@@ -100,7 +95,8 @@ class Tuner:
         tuned, checkpoint_note = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, pace, checkpoint)
         trained = time.perf_counter()
         after = write(tuned, pace.steps, self.context)
-        second = self._evaluate(after, replace(self.context, progress=self._report_images_done))
+        images_done = replace(self.context, progress=lambda *event: self.context.progress("images", 1.0))
+        second = self._evaluate(after, images_done)
         self.ending_seconds = time.perf_counter() - trained
         kept = first is None or second.cost(rd_lambda) < first.cost(rd_lambda)
         notes = ["" if kept else NOT_KEPT, checkpoint_note]
@@ -122,9 +118,6 @@ class Tuner:
             seconds=time.perf_counter() - started,
             note="; ".join(filter(None, [self.supervision.note, *notes])),
         )
-
-    def _report_images_done(self, stage: str, fraction: float, note: str = "") -> None:
-        self.context.progress("images", 1.0)
 
     def _evaluate(self, encoded: Encoded, context: Context) -> _Result:
         evaluation = self._compare(self.original, encoded, context)
@@ -185,19 +178,13 @@ class Tuner:
         """Estimate the derivative of the loss with respect to the mean squared image error. All of the loss but the
         error itself is taken as proportional to the root of the error, as for errors on top of those to photographs."""
         settings, losses, errors = self.settings, [], []
+        options: dict[str, Any] = {"ssim_weight": settings.ssim_weight, "mse_weight": 0.0}
+        options |= {"antialiased": scene.antialiased, "threads": self.context.threads}
         with torch.no_grad(), torch_threads(1):  # the sums depend on the number of threads
             parameters = scene.gaussians()
             for n in islice(self.targets.order((settings.seed,)), min(LOSS_VIEWS, len(self.targets))):
                 self.context.progress("finetune", 0.0)
-                loss, error = image_loss(
-                    parameters,
-                    self.targets,
-                    n,
-                    ssim_weight=settings.ssim_weight,
-                    mse_weight=0.0,
-                    antialiased=scene.antialiased,
-                    threads=self.context.threads,
-                )
+                loss, error = image_loss(parameters, self.targets, n, **options)
                 losses.append(float(loss))
                 errors.append(error)
         return float(np.mean(losses)) / (2 * max(float(np.mean(errors)), 1e-10)) + settings.mse_weight

@@ -116,7 +116,7 @@ class Search:
         if work.time is not None and self.photographs:
             most = work.time.scoring_views(max(self.first[0], 1))
             self.compactor = replace(self.compactor, supervision=supervision.with_scoring(most))
-        self.compare = SearchEvaluation.of(work.splats, work.views, supervision)
+        self.compare = SearchEvaluation(work.splats, None if work.views is None else supervision.eval_views)
         self.path = TrainingPath(self.compactor, keep_states=not self.tunes)
 
     @property

@@ -221,23 +221,8 @@ def _parts(
     rows, of_rows = rows if len(of_rows) else rows[:0], of_rows.reshape(-1)
     width = len(values) // max(count, 1)
     step = max(1, PART // max(width, 1))
-    return [
-        partial(
-            adam,
-            values,
-            mean,
-            square,
-            rows,
-            of_rows,
-            slopes,
-            factors,
-            width,
-            first,
-            min(first + step, count),
-            constants,
-        )
-        for first in range(0, count, step)
-    ]
+    arrays = values, mean, square, rows, of_rows, slopes, factors, width
+    return [partial(adam, *arrays, first, min(first + step, count), constants) for first in range(0, count, step)]
 
 
 @torch.no_grad()
@@ -278,8 +263,7 @@ BOUNDS = {
     "opacities": (OPACITY_LOGIT_MIN, OPACITY_LOGIT_MAX),
     "sh0": (-SH_LIMIT, SH_LIMIT),
     "shN": (-SH_LIMIT, SH_LIMIT),
-}
-"""Smallest and largest values that :func:`kissgs.core.splats.clean` leaves unchanged."""
+}  # smallest and largest values that kissgs.core.splats.clean leaves unchanged
 
 
 class GaussianModel:
@@ -304,13 +288,13 @@ class GaussianModel:
         """Receiver of gradients of images, for :meth:`step`, on the CPU; elsewhere autograd provides them."""
         return self.add_gradients if self._on_cpu else None
 
-    @property
-    def antialiased(self) -> bool:
-        return self._rest.antialiased
-
     def add_gradients(self, gradients: Gradients) -> None:
         """Add gradients of an image to those of the next :meth:`step`, on the CPU."""
         self._received.append(gradients)
+
+    @property
+    def antialiased(self) -> bool:
+        return self._rest.antialiased
 
     def gaussians(self) -> dict[str, Tensor]:
         return self.parameters

@@ -32,14 +32,10 @@ class SupervisionViews:
     """Views by their role."""
 
     train: tuple[View, ...]  # samples of larger photographs; none if nothing is trained
+    # A capture's training views and some synthetic ones, or some virtual cameras and close-ups. Virtual ones have the
+    # usual dilation, so that Gaussians between the sampled pixels of photographs count too.
     score: tuple[View, ...]
-    """Views that score Gaussians: the training views of a capture and some synthetic ones, or some virtual cameras and
-    close-ups, each with a background of its own. Virtual ones have the usual dilation, so that Gaussians between the
-    sampled pixels of photographs count too."""
-
-    test: tuple[View, ...]
-    """Held-out views for evaluation, or some training views if there are none, whole; all have photographs or none."""
-
+    test: tuple[View, ...]  # held-out views, or some training views, whole; all have photographs or none
     background: Float32[np.ndarray, "3"]
     source: str  # of the training views, in words
     captured: bool = False  # whether the training views are those of a capture
@@ -74,7 +70,7 @@ def supervision_views(
         return replace(virtual, test=_evaluation_views(views), background=views.background)
     train = tuple(_thinned(view, number, settings.view_size) for number, view in enumerate(views.train))
     synthetic, per_epoch = _synthetic_views(splats, views.train, settings, context)
-    side = _virtual_side(settings)
+    side = settings.view_size * 3 // 5  # of virtual cameras
     scoring = math.ceil(SCORING_SHARE * len(train)) if scoring_stride else 0
     source = f"{len(synthetic)} virtual cameras" if synthetic else ""
     if synthetic and scoring:
@@ -107,20 +103,12 @@ def _synthetic_views(
     cameras, threads = [view.camera for view in regions.all], context.threads
     cameras += scattered_cameras(splats, side=side, count=count - len(cameras), seed=settings.seed, threads=threads)
     order = np.random.default_rng(settings.seed).permutation(len(cameras))
-    views = [
-        View(f"synthetic {n}", cameras[index], background=_grey(BACKGROUNDS[n % len(BACKGROUNDS)]))
-        for n, index in enumerate(order)
-    ]
+    views = [View(f"synthetic {n}", cameras[index], background=_background(n)) for n, index in enumerate(order)]
     return tuple(views), min(per_epoch, len(views))
 
 
-def _virtual_side(settings: TrainingViewSettings) -> int:
-    """Return the largest side of the images of virtual cameras, pixels."""
-    return settings.view_size * 3 // 5
-
-
-def _grey(level: float) -> Float32[np.ndarray, "3"]:
-    return np.full(3, level, np.float32)
+def _background(n: int) -> Float32[np.ndarray, "3"]:
+    return np.full(3, BACKGROUNDS[n % len(BACKGROUNDS)], np.float32)
 
 
 def evaluation_only(views: Views | None) -> SupervisionViews:
@@ -146,7 +134,7 @@ def _evaluation_views(views: Views) -> tuple[View, ...]:
 
 def _virtual_views(splats: Splats, settings: TrainingViewSettings, stride: int, context: Context) -> SupervisionViews:
     """Return virtual views only; their targets are renderings of the scene."""
-    side = _virtual_side(settings)
+    side = settings.view_size * 3 // 5
     count = max(1, settings.views * (stride or SCORING_STRIDE) // SCORING_STRIDE)
     drawn = random_poses(splats, context, side=side, count=count, seed=settings.seed)
     scoring = _scoring_views(splats, drawn.train[::stride], side, settings.seed) if stride else ()
@@ -166,11 +154,7 @@ def _scoring_views(splats: Splats, views: Sequence[View], side: int, seed: int) 
     ``side`` is that of the views, pixels."""
     cameras = close_ups(splats, side=max(1, side // CLOSE_UP_SHRINK), count=CLOSE_UPS * len(views), seed=seed)
     added = [View(f"close-up {n}", camera) for n, camera in enumerate(cameras)]
-    return tuple(
-        replace(view, background=_grey(BACKGROUNDS[n % len(BACKGROUNDS)]))
-        for group in (views, added)
-        for n, view in enumerate(group)
-    )
+    return tuple(replace(view, background=_background(n)) for group in (views, added) for n, view in enumerate(group))
 
 
 def _thinned(view: View, number: int, size: int) -> View:
