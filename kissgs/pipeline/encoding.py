@@ -74,9 +74,7 @@ class Work:
     """Scene, settings and context that all encodings of one compression share."""
 
     splats: Splats  # clean scene to encode
-    original: Splats
-    """Scene before compaction, or ``splats`` itself. Its renderings are the reference of a goal's PSNR, and the targets
-    of fine-tuning where there are no photographs."""
+    original: Splats  # scene before compaction, or splats: the reference of a PSNR, and targets without photographs
     settings: Settings
     sensitivity: Sensitivity | None  # of splats if measured before; None to measure it if the settings need it
     cache: Path | None  # file in which the measured sensitivity of splats is kept
@@ -112,22 +110,14 @@ def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     refits = captured and settings.color_refit_iterations > 0  # a refit to virtual cameras is worse than none
     if sensitivity is not None and not refits:
         return Measured(splats, sensitivity)
-    cameras = sensitivity_cameras(
-        splats,
-        work.views,
-        work.context,
-        count=settings.sensitivity_views or default_view_count(len(splats)),
-        size=settings.sensitivity_view_size,
-    )
+    count, size = settings.sensitivity_views or default_view_count(len(splats)), settings.sensitivity_view_size
+    cameras = sensitivity_cameras(splats, work.views, work.context, count=count, size=size)
     if sensitivity is None:
-        view_uncertainty = settings.view_uncertainty
-        if view_uncertainty is None:
-            view_uncertainty = VIEW_UNCERTAINTY[captured]
-        sensitivity = _sensitivity(splats, cameras, view_uncertainty, work.cache if whole else None, work.context)
+        uncertainty = VIEW_UNCERTAINTY[captured] if settings.view_uncertainty is None else settings.view_uncertainty
+        sensitivity = _sensitivity(splats, cameras, uncertainty, work.cache if whole else None, work.context)
         return_free_memory()
-    recolor = None
-    if refits:
-        recolor = _recolor(splats, cameras, sensitivity, settings.color_refit_iterations, work.context)
+    steps = settings.color_refit_iterations
+    recolor = _recolor(splats, cameras, sensitivity, steps, work.context) if refits else None
     return Measured(splats, sensitivity, recolor)
 
 
@@ -198,7 +188,9 @@ def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: 
     from kissgs.training.supervision import supervision_views, training_targets
 
     settings = settings or work.settings.finetune
-    if compactor is not None and compactor.settings.trains and _same_views(work.settings):
+    names = ("synthetic_view_share", "views", "view_size", "seed")
+    same_views = all(getattr(work.settings.compact, name) == getattr(work.settings.finetune, name) for name in names)
+    if compactor is not None and compactor.settings.trains and same_views:
         supervision, targets = compactor.supervision, compactor.load_targets()
     else:
         supervision = supervision_views(work.original, work.views, settings, work.context, scoring_stride=0)
@@ -207,18 +199,8 @@ def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: 
     return Tuner(work.original, settings, supervision, targets, work.context, model, decode)
 
 
-def _same_views(settings: Settings) -> bool:
-    """Return whether compaction and fine-tuning train on the same images."""
-    names = ("synthetic_view_share", "views", "view_size", "seed")
-    return all(getattr(settings.compact, name) == getattr(settings.finetune, name) for name in names)
-
-
 def check_finetuning(settings: Settings, views: Views | None, device: Device) -> None:
-    """Refuse fine-tuning that is impossible, before any other work.
-
-    Raises:
-        UnsupportedError: torch or a GPU is missing; the goal is one that fine-tuning would miss.
-    """
+    """Refuse fine-tuning that is impossible, or that would miss the goal, before any other work."""
     if not has_torch():
         raise UnsupportedError(
             "fine-tuning needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough)"

@@ -72,21 +72,8 @@ class Clustering:
         """Assign every vector to the nearest of the centroids near its present one."""
         from kissgs.planning import kmeans_kernels as kernels
 
-        data = self.data
-        pool.map(
-            lambda part: kernels.assign_near(
-                data.table,
-                data.rows,
-                self.members,
-                self.edges,
-                self.centroids,
-                self.near,
-                *part,
-                self.labels,
-                self.distances,
-            ),
-            self.parts(),
-        )
+        arrays = self.data.table, self.data.rows, self.members, self.edges, self.centroids, self.near
+        pool.map(lambda part: kernels.assign_near(*arrays, *part, self.labels, self.distances), self.parts())
 
     def refresh_near(self, pool: Workers) -> None:
         """Find the near centroids again, which have moved, among the near ones of the nearest so far."""
@@ -146,10 +133,9 @@ def sorted_by_label(
 
 # ``ShMetric``: errors of view-dependent colour, measured in the directions from which cameras see each Gaussian.
 
+# Weight of all directions alike, beside those from which cameras see a Gaussian; both add up to 1. It grows with the
+# view uncertainty, since that shrinks the measured means, and is 1 for Gaussians that no capture has seen.
 UNIFORM_WEIGHT = 0.3
-"""Weight of all directions alike, beside those from which cameras see a Gaussian; both add up to 1. It grows with the
-view uncertainty, since that shrinks the measured means, and is 1 for Gaussians that no capture has seen."""
-
 NEIGHBORS = 32  # number of codebook entries, the nearest to a Gaussian's present one, that are compared
 SPHERE = 4 * np.pi  # area of the unit sphere: a form is the identity where all directions count alike
 

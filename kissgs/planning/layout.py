@@ -44,28 +44,20 @@ def plas(
     side = round(len(items) ** 0.5)
     placed = np.arange(len(items), dtype=np.int32)
     rng = np.random.Generator(np.random.PCG64(seed))
-    radii = _radii(start_radius or side // 2 - 1, decay)
+    start = start_radius or side // 2 - 1
+    radii, smaller = [max(start, 1)], float(start)
+    while (smaller := smaller * decay) >= 1:
+        radii.append(int(smaller))
     for step, radius in enumerate(radii):
         report(step / len(radii))
         width = min(side - 1, 2 * radius + 1)
         target = box_blur(items[placed].reshape(side, side, -1), width // 2, pool).reshape(len(items), -1)
         size = max(min(width + 1, side) // 2 * 2, MIN_BLOCK)
-        configuration = 0
-        while True:
+        for configuration in range(1, 3 * MIN_CONFIGURATIONS + 1):
             gained = _improve(items, placed, target, side, size, rng, pool)
-            configuration += 1
             if configuration >= MIN_CONFIGURATIONS and gained <= 0:
                 break
-            if configuration >= 3 * MIN_CONFIGURATIONS:
-                break
     return placed
-
-
-def _radii(start: int, decay: float) -> list[int]:
-    radii, radius = [max(start, 1)], float(start)
-    while (radius := radius * decay) >= 1:
-        radii.append(int(radius))
-    return radii
 
 
 def _improve(

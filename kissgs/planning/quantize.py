@@ -70,11 +70,8 @@ BLOCK = 1 << 14  # number of rows of a block: its float64 values stay in the pro
 class Rows(Protocol):
     """Array, or what gives the rows of one when asked: ``values[first:last]`` is ``(last - first, C)``."""
 
-    def __len__(self) -> int:
-        """Return the number of rows."""
-
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """Return some rows."""
+    def __len__(self) -> int: ...
+    def __getitem__(self, rows: slice, /) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

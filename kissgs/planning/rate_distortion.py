@@ -20,25 +20,22 @@ from kissgs.planning.quantize import Planning, Quantized, for_each_block, means_
 from kissgs.planning.rd_criterion import SEEN, Costs, RdCriterion
 from kissgs.planning.rd_fields import RdFields, decoded_entries, decoded_scene, largest_changes, largest_errors
 from kissgs.planning.rotation_forms import choose_forms
-from kissgs.planning.sh_codebook import Codebook, CodebookErrorModel
+from kissgs.planning.sh_codebook import Codebook, CodebookErrorModel, sensitivity_weights
 from kissgs.settings import EncodeSettings
 
 # Estimate of a scene's error by lambda, before it is planned, and the lambda for a given error.
 
 DIMENSIONS = 14  # rounded degrees of freedom per Gaussian: opacity, scales, rotation, base colour, position
 
+# Measured ratio of the rounding error to H d²/12: RDO quantisation prefers levels of few bits, and the errors of
+# several Gaussians add up in a pixel.
 GROWTH = 2.2
-"""Measured ratio of the rounding error to H d²/12: above 1 because RDO quantisation prefers levels of few bits, and the
-errors of several Gaussians add up in a pixel."""
-
 PAPER_RATIO = 8  # Gaussians per codebook entry of the paper
 PAPER_SH_GROWTH = 2.0  # measured factor on uncompensated shN errors, which add up in pixels
 
+# Decibels per unit of view uncertainty by which errors in other views exceed those in measured views, where planning
+# hides them. Not of shN: its codebook hardly adapts to the measured views once sensitivity is shrunk towards the prior.
 OTHER_VIEWS_DB = 9.5
-"""Decibels per unit of view uncertainty by which errors in other views exceed those in the measured views, where
-planning hides them. It does not apply to shN: its codebook hardly adapts to the measured views once sensitivity is
-shrunk towards the prior."""
-
 MIN_ERROR_RATIO = 1.1  # smallest error to aim at over the smallest possible: the last 0.4 dB cost too many bits
 SH_UNCOMPENSATED, SH_UNCOMPENSATED_GROWTH = 0.14, 1.9  # measured share, and growth per unit of view uncertainty
 REFIT_GAIN = 0.17  # PSNR gain per iteration of the colour refit, decibels: less than the measured mean
@@ -139,9 +136,8 @@ def implied_lambda(error: float, count: int) -> float:
     return 2 * float(np.log(2)) * error / (GROWTH * DIMENSIONS * max(count, 1))
 
 
+# Function that returns better base colours for the decoded Gaussians and their indices in the scene.
 ColorRefit = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
-"""Function that returns better base colours for the decoded Gaussians and their indices in the scene."""
-
 MAX_COMPENSATION = np.float32(0.5 / SH_C0)  # of lost SH coefficients by a base colour: half of a colour's range
 MANY_PRUNED = 0.2  # share of pruned Gaussians above which the report explains why they were pruned
 
@@ -196,7 +192,11 @@ def plan_rate_distortion(
     shapes, form_error = choose_forms(splats, grid.cells, grid.side, planning)
     shapes = shapes.take(grid.mask)
     size = sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry, container.entry_bits)
-    codebook = _codebook(splats, order, sensitivity, size, planning)
+    size = sh_codebook.nearest_square(size) if container.tables is None else size
+    metric = ShMetric.of(sensitivity, splats.sh_degree)
+    codebook = sh_codebook.fit_codebook(
+        splats, order, sensitivity_weights(sensitivity, order, splats), size, planning, metric=metric
+    )
     return_free_memory()
 
     planning.report("rounding")
@@ -232,16 +232,6 @@ def _ranks(order: Int[np.ndarray, " M"], kept: Int[np.ndarray, " M"], count: int
     return place.take(order)
 
 
-def _codebook(
-    splats: Splats, order: Int[np.ndarray, " M"], sensitivity: Sensitivity, size: int, planning: Planning
-) -> Codebook:
-    """Return the SH codebook of about ``size`` entries, fitted to what cameras see of each colour."""
-    weights = sh_codebook.sensitivity_weights(sensitivity, order, splats)
-    metric = ShMetric.of(sensitivity, splats.sh_degree)
-    most = sh_codebook.nearest_square(size) if planning.container.tables is None else size
-    return sh_codebook.fit_codebook(splats, order, weights, most, planning, metric=metric)
-
-
 def _base_colors(
     splats: Splats,
     order: Int[np.ndarray, " M"],
@@ -251,23 +241,9 @@ def _base_colors(
     recolor: ColorRefit | None,
     pool: Workers,
 ) -> Float32[np.ndarray, "M 3"]:
-    """Return the base colours that fit the decoded shapes and view-dependent colours."""
-    rest = decoded_entries(codebook, splats.shN.shape[1])
-    base = _compensated_colors(splats, order, sensitivity, rest, codebook.labels, pool)
-    if recolor is None:
-        return base
-    return recolor(decoded_scene(fields, base, rest[codebook.labels[: len(order)]]), order)
-
-
-def _compensated_colors(
-    splats: Splats,
-    order: Int[np.ndarray, " M"],
-    sensitivity: Sensitivity,
-    entries: Float32[np.ndarray, "entries K 3"],
-    labels: Int[np.ndarray, " M"],
-    pool: Workers,
-) -> Float32[np.ndarray, "M 3"]:
-    """Return base colours that make up for what the codebook loses of each Gaussian's shN, where cameras see it."""
+    """Return base colours that make up for what the codebook loses of each Gaussian's shN, where cameras see it; or
+    those that ``recolor`` makes of them."""
+    entries, labels = decoded_entries(codebook, splats.shN.shape[1]), codebook.labels
     base = splats.sh0.take(order, axis=0)
 
     def compensate(rows: slice) -> None:
@@ -279,7 +255,7 @@ def _compensated_colors(
 
     if splats.sh_degree > 0:
         for_each_block(len(order), compensate, pool)
-    return base
+    return base if recolor is None else recolor(decoded_scene(fields, base, entries[labels[: len(order)]]), order)
 
 
 def _pruning_note(pruned_by_rd: Bool[np.ndarray, " M"], costs: Costs) -> str:

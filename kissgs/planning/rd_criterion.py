@@ -111,10 +111,7 @@ class Costs:
 def _rows_of(sensitivity: Sensitivity, rows: slice) -> Sensitivity:
     """Return the sensitivity of some Gaussians, without a copy."""
     values: dict[str, Any] = {field.name: getattr(sensitivity, field.name) for field in fields(sensitivity)}
-    for name, value in values.items():
-        if isinstance(value, np.ndarray):
-            values[name] = value[rows]
-    return Sensitivity(**values)
+    return Sensitivity(**{name: each[rows] if isinstance(each, np.ndarray) else each for name, each in values.items()})
 
 
 def _raise_to_floor(cost: Float64[np.ndarray, " M"]) -> None:

@@ -23,17 +23,13 @@ from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook
 #
 # Every sensitivity class has its own step, and within a class, frequent levels are preferred where the error is small.
 
+# Largest step of each attribute and largest change by rounding, at any lambda: the Hessian does not hold for larger
+# errors. UNSEEN, the steps of fast, is for Gaussians that no camera saw; VIRTUAL for those that virtual cameras saw,
+# because others may come closer; CAPTURED for those that a capture's cameras saw. A Gaussian smaller than a pixel has
+# no derivative by its size, but would become a visible blob from nearby, so scales may grow less than shrink.
 UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
 VIRTUAL = {"opacities": 0.4, "scales": 0.13, "growth": 0.12, "quaternions": 0.04, "f_dc": 0.2}
 CAPTURED = {"opacities": 2.0, "scales": 0.6, "growth": 0.3, "quaternions": 0.25, "f_dc": 0.5}
-"""Largest step of each attribute and largest change by rounding, at any lambda.
-
-``UNSEEN``, the steps of ``fast``, is for Gaussians that no camera saw; ``VIRTUAL`` for those that virtual cameras saw,
-because other cameras may come closer; ``CAPTURED`` for those that a capture's cameras saw. The Hessian does not hold
-for larger errors. A Gaussian smaller than a pixel has no derivative by its size, but would become a visible blob from
-nearby, so scales may grow less than they may shrink (``growth``).
-"""
-
 STEP_GROWTH_POWER = 1 / 3  # of step_growth, by which these bounds grow; measured with other cameras
 
 

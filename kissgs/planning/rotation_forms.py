@@ -77,6 +77,7 @@ def strides(step: Float[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
 # The axes of an ellipsoid can be ordered in 6 and directed in 4 right-handed ways, and q and -q are one rotation:
 # 6 × 4 × 2 = 48. PRAS is the paper's name (section on permutation-rotation sorting) for choosing among them.
 
+# Quaternion g of each form, w x y z, the rotations of the cube: the new rotation is the Hamilton product q g.
 _A, _H = 0.5**0.5, 0.5
 ROTATIONS: Float64[np.ndarray, "24 4"] = np.array(
     [
@@ -89,11 +90,8 @@ ROTATIONS: Float64[np.ndarray, "24 4"] = np.array(
     ],
     dtype=np.float64,
 )
-"""Quaternion g of each form, w x y z, the rotations of the cube: the new rotation is the Hamilton product q g."""
-
+# Scale order of each form, (24, 3): the new scales are the old ones at these indices.
 PERMUTATIONS = np.repeat([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)], 4, axis=0).astype(np.int64)
-"""Scale order of each form, ``(24, 3)``: the new scales are the old ones at these indices."""
-
 CHUNK = 1 << 16
 
 SHAPE_COLUMNS = {"opacities": slice(0, 1), "scales": slice(1, 4), "quaternions": slice(4, 8)}  # by field

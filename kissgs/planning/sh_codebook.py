@@ -22,10 +22,9 @@ COEFFICIENTS = SH_REST_COUNTS[-1]
 MIN_SIDE = 8  # smallest side of a codebook in SOG-XT
 WEIGHT_FLOOR, WEIGHT_CEILING = 0.1, 20.0  # in units of the median: none is ignored, none dominates
 
+# Exponents of the codebook's weights: colour sensitivity to the power of 1 - SENSITIVITY_SHRINK · view uncertainty,
+# times (opacity × cross-section) to the power of SIZE_POWER · view uncertainty (size_weights).
 SENSITIVITY_SHRINK, SIZE_POWER = 0.55, 0.64
-"""Exponents of the codebook's weights: colour sensitivity to the power of 1 - SENSITIVITY_SHRINK · view uncertainty,
-times (opacity × cross-section) to the power of SIZE_POWER · view uncertainty (:func:`size_weights`)."""
-
 SH_WEIGHTS = (1e-2, 1e2)  # bounds of the codebook's weights, in units of their median
 SORTED_AXES, SORTED_RADIUS = 16, 16  # principal axes, and first filter radius, with which PLAS refines their order
 PAPER_TOP = 99  # largest level of the paper's codebook: 100 levels in every channel
@@ -58,18 +57,10 @@ def fit_codebook(
         nothing = quantize(np.zeros((MIN_SIDE**2, 3 * COEFFICIENTS)), step=1)
         return Codebook(MIN_SIDE, nothing, np.zeros(max(len(chosen), 1), dtype=np.int32), half_steps(nothing))
     most = min(size, settings.sh_codebook_size)
-    clusters = kmeans.fit(
-        splats.shN.reshape(len(splats), dimensions),
-        chosen,
-        weights,
-        max(round(most), 1) if is_list else codebook_side(most) ** 2,
-        settings,
-        pool,
-        lattice=settings.sh_step if settings.shared_step_size else 0.0,
-        from_zero=is_list,
-        metric=metric,
-        report=planning.report("codebook"),
-    )
+    wanted = max(round(most), 1) if is_list else codebook_side(most) ** 2
+    lattice, report = settings.sh_step if settings.shared_step_size else 0.0, planning.report("codebook")
+    fit = partial(kmeans.fit, lattice=lattice, from_zero=is_list, metric=metric, report=report)
+    clusters = fit(splats.shN.reshape(len(splats), dimensions), chosen, weights, wanted, settings, pool)
     # The smallest square that holds the entries; unused places repeat some of them.
     side = next(s for s in range(MIN_SIDE, MAX_CODEBOOK_SIDE + 1, 8) if s * s >= len(clusters.centroids))
     report = planning.report("sort codebook")
@@ -154,10 +145,9 @@ FEW = 64  # number of codebook entries that any scene may have: they take about 
 SAMPLE, SAMPLE_ENTRIES = 1 << 15, 1024  # Gaussians and entries from which the codebook's error is estimated
 MAX_DISPLAYED_ERROR = 3.0  # largest squared error of a displayed colour, summed over RGB from 0 to 1
 
+# Factor on errors under a metric, of Gaussians that a capture has seen. The metric leaves out what base colours
+# compensate; with the factor, the codebook's size was best for held-out photographs.
 METRIC_GROWTH = 1.5
-"""Factor on errors under a metric, of Gaussians that a capture has seen. The metric leaves out what base colours
-compensate; with the factor, the codebook's size was best for held-out photographs."""
-
 SH_MEAN_SQUARE = 0.0796  # mean square of a spherical harmonic over all directions, 1 / (4 pi)
 
 
@@ -198,16 +188,8 @@ def codebook_error_model(
     vectors = splats.shN.reshape(len(splats), -1)
     entries = min(SAMPLE_ENTRIES, len(some) // 16)
     metric = ShMetric.of(sensitivity, splats.sh_degree)
-    clusters = kmeans.fit(
-        vectors,
-        some,
-        sensitivity_weights(sensitivity, some, splats),
-        entries,
-        settings,
-        pool,
-        lattice=0.0,
-        metric=metric,
-    )
+    weights = sensitivity_weights(sensitivity, some, splats)
+    clusters = kmeans.fit(vectors, some, weights, entries, settings, pool, lattice=0.0, metric=metric)
     lost, most = vectors[some] - clusters.centroids[clusters.labels], MAX_DISPLAYED_ERROR / SH_MEAN_SQUARE
     squared = np.minimum(np.square(lost, dtype=np.float64).sum(axis=1), most)
     seen = squared
