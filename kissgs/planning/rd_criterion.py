@@ -111,7 +111,8 @@ class Costs:
 def _rows_of(sensitivity: Sensitivity, rows: slice) -> Sensitivity:
     """Return the sensitivity of some Gaussians, without a copy."""
     values: dict[str, Any] = {field.name: getattr(sensitivity, field.name) for field in fields(sensitivity)}
-    return Sensitivity(**{name: each[rows] if isinstance(each, np.ndarray) else each for name, each in values.items()})
+    values |= {name: each[rows] for name, each in values.items() if isinstance(each, np.ndarray)}
+    return Sensitivity(**values)
 
 
 def _raise_to_floor(cost: Float64[np.ndarray, " M"]) -> None:
