@@ -246,15 +246,9 @@ class SceneTraining:
     def prune(self, count: int, context: Context) -> None:
         """Keep the ``count`` Gaussians that images would miss most; reports the stage "score"."""
         views = self.compactor.supervision
-        kept = prune_by_score(
-            self.splats(),
-            views.score,
-            views.background,
-            count,
-            context,
-            min_keep_per_scoring=self.compactor.settings.min_keep_per_scoring,
-            min_score=MIN_SCORE[views.captured],
-        )
+        share, least = self.compactor.settings.min_keep_per_scoring, MIN_SCORE[views.captured]
+        limits = {"min_keep_per_scoring": share, "min_score": least}
+        kept = prune_by_score(self.splats(), views.score, views.background, count, context, **limits)
         self.index = self.index[kept]
         if self._model is not None:
             self._model.keep(kept)

@@ -197,12 +197,10 @@ class Tuner:
         targets = self.targets
         stride, others = max(1, len(targets) // SENSITIVITY_VIEWS), len(targets) - targets.synthetic
         weights = [1.0] * others + [targets.synthetic_per_epoch / max(targets.synthetic, 1)] * targets.synthetic
+        cameras = WeightedCameras(targets.cameras[::stride], weights[::stride], self.supervision.background)
+        threads, progress = self.context.threads, self.context.stage("finetune").progress
         sensitivity = measure_sensitivity(
-            splats,
-            WeightedCameras(targets.cameras[::stride], weights[::stride], self.supervision.background),
-            view_uncertainty=VIEW_UNCERTAINTY,
-            threads=self.context.threads,
-            progress=self.context.stage("finetune").progress,
+            splats, cameras, view_uncertainty=VIEW_UNCERTAINTY, threads=threads, progress=progress
         )
         return Costs.of(sensitivity, splats)
 

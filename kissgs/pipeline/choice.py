@@ -45,18 +45,12 @@ def resolved(settings: Settings, views: Views | None, *, keep_all: bool = False,
 
 def choose(requested: Settings, views: Views | None, count: int, context: Context, *, keep_all: bool) -> Choice:
     """Choose what to do with ``count`` Gaussians until the deadline; the note also says where torch is missing."""
-    deadline, threads = context.deadline, context.threads
-    chosen = {
-        torch: in_time(
-            requested,
-            resolved(requested, views, keep_all=keep_all, torch=torch),
-            None if deadline is None else SearchTime(deadline, encode_seconds(requested.preset, count, threads)),
-            count=count,
-            captured=views is not None,
-            torch=torch,
-        )
-        for torch in {has_torch(), True}
-    }
+    chosen, time = {}, None
+    if context.deadline is not None:
+        time = SearchTime(context.deadline, encode_seconds(requested.preset, count, context.threads))
+    for torch in {has_torch(), True}:
+        settings = resolved(requested, views, keep_all=keep_all, torch=torch)
+        chosen[torch] = in_time(requested, settings, time, count=count, captured=views is not None, torch=torch)
     found = chosen[has_torch()]
     if found.settings == chosen[True].settings:
         return found

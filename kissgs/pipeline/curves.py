@@ -86,17 +86,14 @@ class LambdaCurve:
     def _find_root(self, start: float) -> None:
         if self._made >= self.most and start not in self.found:
             return
-        find_root(
-            self._margin,
-            start,
-            self._slope,
-            lambda x: self.goal.decisive(self.found[x]).near_enough(trained=self.tuned),
-            LOG2_LAMBDA_RANGE,
-            stop=StopRule(
-                self.most - self._made + (start in self.found), tries_bound=not self.tuned, settled=self._settled
-            ),
-            before={x: self.goal.margin(attempt) for x, attempt in self.found.items() if x != start},
-        )
+
+        def near(x: float) -> float:
+            return self.goal.decisive(self.found[x]).near_enough(trained=self.tuned)
+
+        left = self.most - self._made + (start in self.found)
+        stop = StopRule(left, tries_bound=not self.tuned, settled=self._settled)
+        before = {x: self.goal.margin(attempt) for x, attempt in self.found.items() if x != start}
+        find_root(self._margin, start, self._slope, near, LOG2_LAMBDA_RANGE, stop=stop, before=before)
 
     def _encode(self, settings: EncodeSettings) -> Attempt:
         self._made += 1

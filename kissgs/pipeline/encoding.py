@@ -264,14 +264,7 @@ def _recolor(
 
 def _refit_cameras(cameras: WeightedCameras) -> WeightedCameras:
     """Return the capture's cameras with fewer samples, and every other virtual one, smaller and of twice its weight."""
-    chosen = np.arange(len(cameras.cameras))
-    chosen = chosen[(chosen < cameras.captured) | ((chosen - cameras.captured) % 2 == 0)]
-    virtual = chosen >= cameras.captured
-    return replace(
-        cameras,
-        cameras=[
-            cameras.cameras[n].at_most(REFIT_SIZE) if other else cameras.cameras[n].sampled_at_most(REFIT_SIZE)
-            for n, other in zip(chosen, virtual, strict=True)
-        ],
-        weights=[cameras.weights[n] * (2.0 if other else 1.0) for n, other in zip(chosen, virtual, strict=True)],
-    )
+    own = list(zip(cameras.cameras, cameras.weights, strict=True))
+    kept = [(camera.sampled_at_most(REFIT_SIZE), weight) for camera, weight in own[: cameras.captured]]
+    kept += [(camera.at_most(REFIT_SIZE), 2.0 * weight) for camera, weight in own[cameras.captured :: 2]]
+    return replace(cameras, cameras=[camera for camera, _ in kept], weights=[weight for _, weight in kept])

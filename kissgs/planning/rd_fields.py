@@ -106,29 +106,15 @@ def rdo_quantize(
         if tables is not None:
             ends[0] = tables.first_drawn, tables.last_drawn
 
-        def choose(
-            rows: slice,
-            rate_table: Float64[np.ndarray, "classes C 256"] = rate_table,
-            values_of_levels: Float64[np.ndarray, "C 256"] = values_of_levels,
-            ends: Int[np.ndarray, "C 2"] = ends,
-        ) -> None:
+        of_levels = values_of_levels, ends, rate_table
+
+        def choose(rows: slice, of_levels: tuple[np.ndarray, np.ndarray, np.ndarray] = of_levels) -> None:
             chosen = levels[rows].astype(np.int64)
             missing = np.full(len(chosen), -1) if omitted is None else omitted[rows].astype(np.int64)
-            rdo_kernels.choose_levels(
-                values[rows],
-                np.tile(np.arange(4), (len(chosen), 1)) if omitted is None else KEPT[missing],
-                missing,
-                hessians[rows],
-                forms[rows],
-                PERMUTATIONS,
-                classes[rows].astype(np.int64),
-                values_of_levels,
-                ends,
-                rate_table,
-                _bounds(largest, rows, levels.shape[1]),
-                floor,
-                chosen,
-            )
+            stored = np.tile(np.arange(4), (len(chosen), 1)) if omitted is None else KEPT[missing]
+            own = hessians[rows], forms[rows], PERMUTATIONS, classes[rows].astype(np.int64)
+            bounds = _bounds(largest, rows, levels.shape[1])
+            rdo_kernels.choose_levels(values[rows], stored, missing, *own, *of_levels, bounds, floor, chosen)
             levels[rows] = chosen
 
         for_each_block(len(levels), choose, pool, block=CHUNK)

@@ -81,16 +81,11 @@ def ms_ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "...
         exponents /= exponents.sum()
     product = np.ones(3)
     for scale, exponent in enumerate(exponents):
-        similarity, structure = _mean_similarities(a, b)
+        sums = _similarity_sums(a, b, (1, 1), WINDOW // 2)[0, 0]  # over all windows inside the images
+        similarity, structure = sums / ((a.shape[0] - WINDOW + 1) * (a.shape[1] - WINDOW + 1))
         product *= np.maximum(similarity if scale == scales - 1 else structure, 0) ** exponent
         a, b = _halved(a), _halved(b)
     return float(product.mean())
-
-
-def _mean_similarities(a: Float32[np.ndarray, "H W 3"], b: Float32[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "2 3"]:
-    """Return the means of SSIM and of its second factor over all windows inside the images, for each channel."""
-    sums = _similarity_sums(a, b, (1, 1), WINDOW // 2)[0, 0]
-    return sums / ((a.shape[0] - WINDOW + 1) * (a.shape[1] - WINDOW + 1))
 
 
 def _similarity_sums(

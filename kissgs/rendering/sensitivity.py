@@ -45,10 +45,9 @@ def local_scale(splats: Splats, *, threads: int = 0) -> Float32[np.ndarray, " N"
 # Coverage: how well the best camera has seen each Gaussian, by visibility and resolution.
 
 RESOLVED = 3.0  # length in the image of the distance to the 128th neighbour, pixels, that is resolved
-
+# A Gaussian whose neighbours are more than ISOLATED times its size away counts as an object of its own, which is viewed
+# from up to MAX_APPROACH times nearer.
 ISOLATED, MAX_APPROACH = 16.0, 3.0
-"""A Gaussian whose neighbours are more than :data:`ISOLATED` times its size away counts as an object of its own, which
-is viewed from up to :data:`MAX_APPROACH` times nearer."""
 
 
 class Coverage:
@@ -57,8 +56,8 @@ class Coverage:
     def __init__(self, splats: Splats) -> None:
         self._splats = splats
         self._scale = local_scale(splats)
+        # From 0, seen by no camera or only from far away, to 1, seen from nearby.
         self.share: Float32[np.ndarray, " N"] = np.zeros(len(splats), np.float32)
-        """``(N,)`` coverage from 0, seen by no camera or only from far away, to 1, seen from nearby."""
 
     @property
     def close_up(self) -> Float32[np.ndarray, " N"]:
@@ -170,11 +169,8 @@ def measure_sensitivity(
             if view_uncertainty and done + 1 == cameras.captured:
                 found.captured[:] = coverage.share
             del frame  # before the next one is made
-        each_part(
-            lambda a, b: moments_to_hessians(splats.scales, splats.opacities, a, b, found.shape_hessian),
-            even(len(splats), pool),
-            pool,
-        )
+        shapes, parts = (splats.scales, splats.opacities), even(len(splats), pool)
+        each_part(lambda a, b: moments_to_hessians(*shapes, a, b, found.shape_hessian), parts, pool)
     _finish(found)
     return_free_memory()
     progress("sensitivity", 1.0)

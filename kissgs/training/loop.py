@@ -123,18 +123,11 @@ def image_loss(
     """Render target ``n``; return the photometric loss, differentiable, and the mean squared error. ``antialiased`` and
     ``receive`` are as in :func:`kissgs.rendering.differentiable.rasterize`."""
     camera, target = targets.cameras[n], targets.image(n)
-    image, _ = rasterize(
-        parameters,
-        viewmats=torch.from_numpy(camera.viewmat)[None],  # float64: poses far from the origin need it
-        Ks=torch.from_numpy(camera.K)[None],
-        width=camera.width,
-        height=camera.height,
-        backgrounds=torch.from_numpy(targets.backgrounds[n])[None],
-        dilation=camera.dilation,
-        antialiased=antialiased,
-        threads=threads,
-        receive=receive,
-    )
+    matrices = (camera.viewmat, camera.K, targets.backgrounds[n])
+    viewmat, K, background = (torch.from_numpy(matrix)[None] for matrix in matrices)  # float64, for poses far away
+    model: dict[str, Any] = {"dilation": camera.dilation, "antialiased": antialiased, "threads": threads}
+    view = viewmat, K, camera.width, camera.height
+    image, _ = rasterize(parameters, *view, backgrounds=background, receive=receive, **model)
     targets_there = torch.from_numpy(target)[None].to(image.device)
     loss = photometric_loss(image, targets_there, ssim_weight=ssim_weight, mse_weight=mse_weight, threads=threads)
     return loss, float(np.square(image[0].detach().cpu().numpy() - target).mean())

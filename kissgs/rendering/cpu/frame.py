@@ -74,10 +74,8 @@ def _each_footprint(kernel: Callable[..., None], frame: Frame, slots: Slots, poo
 
 def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     """Return the squared change of the image by each Gaussian's removal; see :func:`rasterizer.removal_scores`."""
-    slots, errors = (
-        number_slots(frame.lists, len(frame.gaussians.means)),
-        np.zeros(len(frame.lists.members), np.float32),
-    )
+    slots = number_slots(frame.lists, len(frame.gaussians.means))
+    errors = np.zeros(len(frame.lists.members), np.float32)
     _each_tile(blending.removal_errors, frame, slots, pool, errors)
     return sums_of_slots(frame, slots, errors)
 

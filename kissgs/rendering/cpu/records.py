@@ -46,19 +46,10 @@ class Projection(NamedTuple):
 
     @classmethod
     def of(cls, splats: Splats, camera: Camera) -> Projection:
-        return cls(
-            camera.viewmat,
-            camera.K,
-            np.ascontiguousarray(camera.position),
-            int(camera.width),
-            int(camera.height),
-            constants.NEAR,
-            constants.FAR,
-            float(camera.dilation),
-            constants.FRUSTUM_MARGIN,
-            constants.ALPHA_MIN,
-            bool(splats.antialiased),
-        )
+        pose = camera.viewmat, camera.K, np.ascontiguousarray(camera.position), int(camera.width), int(camera.height)
+        depths, dilation = (constants.NEAR, constants.FAR), float(camera.dilation)
+        antialiased = bool(splats.antialiased)
+        return cls(*pose, *depths, dilation, constants.FRUSTUM_MARGIN, constants.ALPHA_MIN, antialiased)
 
 
 class Footprints(NamedTuple):
