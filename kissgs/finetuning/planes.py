@@ -25,6 +25,7 @@ from kissgs.planning.sh_codebook import COEFFICIENTS
 # Numba kernels of fine-tuning: one pass over the levels in place of a dozen operations with arrays in float64.
 
 T = TypeVar("T")
+Ctx = Any  # context of a torch.autograd.Function
 
 PART = 1 << 16  # number of rows that a thread processes at a time; sums of parts are added in order
 
@@ -199,13 +200,13 @@ class _Short(torch.autograd.Function):
     """Values rounded to the digits that are stored; the gradient ignores the rounding."""
 
     @staticmethod
-    def forward(ctx: Any, values: Float64[Tensor, " L"]) -> Float64[Tensor, " L"]:  # noqa: ANN401
+    def forward(ctx: Ctx, values: Float64[Tensor, " L"]) -> Float64[Tensor, " L"]:
         short = short_values(values.detach().cpu().numpy().astype(np.float32)).astype(np.float64)
         return torch.from_numpy(short).to(values.device)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float64[Tensor, " L"]) -> Float64[Tensor, " L"]:  # noqa: ANN401
+    def backward(ctx: Ctx, gradient: Float64[Tensor, " L"]) -> Float64[Tensor, " L"]:
         return gradient
 
 
@@ -349,10 +350,7 @@ class _Values(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,  # noqa: ANN401
-        latents: Float32[Tensor, "R C"],
-        table: Float64[Tensor, "L _"],
-        plane: Plane,
+        ctx: Ctx, latents: Float32[Tensor, "R C"], table: Float64[Tensor, "L _"], plane: Plane
     ) -> Float64[Tensor, "R C"]:
         ctx.plane = plane
         ctx.save_for_backward(latents.detach(), table.detach())
@@ -365,8 +363,7 @@ class _Values(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any,  # noqa: ANN401
-        gradient: Float[Tensor, "R C"],
+        ctx: Ctx, gradient: Float[Tensor, "R C"]
     ) -> tuple[Float32[Tensor, "R C"], Float64[Tensor, "L _"] | None, None]:
         latents, table = ctx.saved_tensors
         plane: Plane = ctx.plane

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.context import Device, Pace
 from kissgs.core.positions import signed_exp
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.finetuning.planes import Plane, each_part, level_bits, planes_of, sum_by_label
+from kissgs.finetuning.planes import Ctx, Plane, each_part, level_bits, planes_of, sum_by_label
 from kissgs.planning import rotation_forms
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import Grid
@@ -37,14 +36,14 @@ class _SignedExp(torch.autograd.Function):
     """Positions of signed logarithms, sign(y) (e^|y| - 1): computed in float64, rounded to float32."""
 
     @staticmethod
-    def forward(ctx: Any, y: Float64[Tensor, "..."]) -> Float32[Tensor, "..."]:  # noqa: ANN401
+    def forward(ctx: Ctx, y: Float64[Tensor, "..."]) -> Float32[Tensor, "..."]:
         x = torch.from_numpy(signed_exp(y.detach().cpu().numpy())).to(y.device)
         ctx.save_for_backward(x)
         return x.float()
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float32[Tensor, "..."]) -> Float64[Tensor, "..."]:  # noqa: ANN401
+    def backward(ctx: Ctx, gradient: Float32[Tensor, "..."]) -> Float64[Tensor, "..."]:
         (x,) = ctx.saved_tensors
         return gradient.double() * (1 + x.abs())
 
@@ -53,7 +52,7 @@ class _SmallestThree(torch.autograd.Function):
     """Quaternions of length 1 from three components and the index of the missing one, which is not negative."""
 
     @staticmethod
-    def forward(ctx: Any, small: Float64[Tensor, "M 3"], omitted: Int[Tensor, "M 1"]) -> Float32[Tensor, "M 4"]:  # noqa: ANN401
+    def forward(ctx: Ctx, small: Float64[Tensor, "M 3"], omitted: Int[Tensor, "M 1"]) -> Float32[Tensor, "M 4"]:
         whole = rotation_forms.whole(small.detach().cpu().numpy(), omitted[:, 0].cpu().numpy())
         quats = torch.from_numpy(whole).to(small.device)
         ctx.save_for_backward(small, omitted, quats.gather(1, omitted))
@@ -61,7 +60,7 @@ class _SmallestThree(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float32[Tensor, "M 4"]) -> tuple[Float64[Tensor, "M 3"], None]:  # noqa: ANN401
+    def backward(ctx: Ctx, gradient: Float32[Tensor, "M 4"]) -> tuple[Float64[Tensor, "M 3"], None]:
         small, omitted, missing = ctx.saved_tensors
         kept = torch.from_numpy(rotation_forms.KEPT).to(small.device)[omitted[:, 0]]
         wide = gradient.double()
@@ -83,7 +82,7 @@ class _LookUp(torch.autograd.Function):
     """Codebook entry of each Gaussian. On the CPU, gradients are summed in a fixed order, unlike those of torch."""
 
     @staticmethod
-    def forward(ctx: Any, entries: Float32[Tensor, "E K 3"], labels: Labels) -> Float32[Tensor, "M K 3"]:  # noqa: ANN401
+    def forward(ctx: Ctx, entries: Float32[Tensor, "E K 3"], labels: Labels) -> Float32[Tensor, "M K 3"]:
         ctx.labels = labels
         if entries.device.type != "cpu":
             return entries[labels.index]
@@ -93,7 +92,7 @@ class _LookUp(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "M K 3"]) -> tuple[Float[Tensor, "E K 3"], None]:  # noqa: ANN401
+    def backward(ctx: Ctx, gradient: Float[Tensor, "M K 3"]) -> tuple[Float[Tensor, "E K 3"], None]:
         labels: Labels = ctx.labels
         total = gradient.new_zeros((labels.entries, *gradient.shape[1:]))
         if gradient.device.type != "cpu":
@@ -349,7 +348,7 @@ class _Bits(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,  # noqa: ANN401
+        ctx: Ctx,
         latents: Float32[Tensor, "M C"],
         base: Float64[Tensor, "M C"],
         rows: Int[Tensor, "M C"],
@@ -369,7 +368,7 @@ class _Bits(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+    def backward(ctx: Ctx, upstream: Tensor) -> tuple[Tensor | None, ...]:
         (slopes,) = ctx.saved_tensors
         return torch.from_numpy(slopes.numpy() * upstream.numpy()), None, None, None, None
 

@@ -187,7 +187,9 @@ def quantize(
     """Round to uniform steps of at most ``step``, unless ``max_top`` steps do not span the widest channel. One step for
     all channels has the least error for a given entropy. If it is not shared, every channel spreads ``max_top`` levels
     over its own range."""
-    low, high = _range(values, pool)
+    ends = row_range(values, pool) if len(values) else (np.zeros(values[:0].shape[1]),) * 2
+    # The float32 numbers that are written; + 0.0 turns -0.0 into 0.0, so that equal scenes give equal bytes.
+    low, high = (end.astype(np.float32) + np.float32(0) for end in ends)
     extent = high.astype(np.float64) - low
     widest = float(extent.max(initial=0.0))
     top = max_top
@@ -226,8 +228,9 @@ def quantize_means(
     """Quantise positions to 16-bit levels of their signed logarithm, with one range for all three axes. Below 16
     ``bits``, of all or of each, levels are multiples of a power of two, so that low bytes compress; the outermost level
     stays 65535."""
+    stride = 1 << (16 - bits) if isinstance(bits, int) else np.left_shift(1, 16 - bits.astype(np.int16))
     if len(means) == 0:
-        return Quantized(np.empty((0, 3), np.uint16), np.zeros((MEANS_TOP + 1, 3)), *_strides(bits))
+        return Quantized(np.empty((0, 3), np.uint16), np.zeros((MEANS_TOP + 1, 3)), stride)
     smallest, largest = (end(values) for end, values in zip((np.min, np.max), row_range(means, pool), strict=True))
     ends = signed_log(np.array([smallest, largest])).astype(np.float32) + np.float32(0)
     low, high = np.repeat(ends[:1], 3), np.repeat(ends[1:], 3)
@@ -242,12 +245,7 @@ def quantize_means(
         levels[rows] = found
 
     for_each_block(len(means), work, pool)
-    return Quantized(levels, even_table(low, high, MEANS_TOP), *_strides(bits))
-
-
-def _strides(bits: int | Int[np.ndarray, " N"]) -> tuple[int | Int[np.ndarray, " N"]]:
-    """Return the distance of levels of 16 bits of which only ``bits`` are used."""
-    return (1 << (16 - bits),) if isinstance(bits, int) else (np.left_shift(1, 16 - bits.astype(np.int16)),)
+    return Quantized(levels, even_table(low, high, MEANS_TOP), stride)
 
 
 def means_bits(
@@ -295,18 +293,6 @@ def half_steps(quantized: Quantized, stride: int = 1) -> list[float]:
     """Return half the distance of levels that are multiples of ``stride``, per channel."""
     extent = quantized.table[-1] - quantized.table[0]
     return [float(step) for step in extent / quantized.top * stride / 2]
-
-
-def _range(
-    values: Float[np.ndarray, "N C"] | Rows, pool: Workers | None
-) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
-    """Return each channel's minimum and maximum as the float32 numbers that are written (zeros without rows)."""
-    if len(values) == 0:
-        zeros = np.zeros(values[:0].shape[1], dtype=np.float32)
-        return zeros, zeros
-    low, high = row_range(values, pool)
-    # + 0.0 turns -0.0 into 0.0, so that equal scenes give equal bytes.
-    return low.astype(np.float32) + np.float32(0), high.astype(np.float32) + np.float32(0)
 
 
 def _levels(

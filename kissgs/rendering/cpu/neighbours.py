@@ -251,11 +251,8 @@ def unique_pairs(found: np.ndarray, pairs: np.ndarray) -> int:
 
 
 def leaves_of(points: Shaped[np.ndarray, "N 3"], leaf: int) -> tuple[Int32[np.ndarray, " N"], Int64[np.ndarray, " e"]]:
-    """Split points into the leaves of a k-d tree of equal counts: at the median of a part's longest side.
-
-    Returns:
-        Numbers of the points, leaf after leaf, and the edges of the leaves of at most ``leaf`` points in it.
-    """
+    """Split points into the leaves of a k-d tree of equal counts: at the median of a part's longest side. Returned are
+    the numbers of the points, leaf after leaf, and the edges of the leaves of at most ``leaf`` points in it."""
     order, edges = np.arange(len(points), dtype=np.int32), np.empty(4 * len(points) // leaf + 2, np.int64)
     found = _split(np.array(points.T, np.float32, order="C"), leaf, order, edges)
     return order, edges[: found + 1]
