@@ -51,11 +51,11 @@ def refine_order(
     means, colors = (plan.fields[name].levels[:count] for name in ("means", "f_dc"))
     order = refined_order(means, colors, runs, pool, lambda fraction: progress("reorder", fraction))
     cells = np.concatenate([order, np.arange(count, len(plan.grid.cells), dtype=np.int32)])
-    fields = {name: field.take(cells) for name, field in plan.fields.items() if name != "f_rest_centroids"}
+    rows = {name: field.take(cells) for name, field in plan.fields.items() if name != "f_rest_centroids"}
     return replace(
         plan,
         grid=replace(plan.grid, cells=plan.grid.cells[cells]),
-        fields={name: fields.get(name, field) for name, field in plan.fields.items()},
+        fields={**plan.fields, **rows},
         codebook=replace(plan.codebook, labels=plan.codebook.labels[order]),
         classes=plan.classes[order],
         costs=None if plan.costs is None else plan.costs.take(order),
@@ -83,8 +83,7 @@ def refined_order(
         def report_done(fraction: float, done: int = done) -> None:
             report((done + fraction) / ROUNDS)
 
-        blocks = _blocks(ends, BLOCK if done % 2 == 0 else BLOCK // 2)
-        pool.map(refine, blocks, report_done)
+        pool.map(refine, _blocks(ends, BLOCK if done % 2 == 0 else BLOCK // 2), report_done)
     return _with_equal_positions_in_order(order, means)
 
 
@@ -169,12 +168,8 @@ def plan_uniform(
     size = max(len(chosen) / settings.gaussians_per_codebook_entry, FEW)
     codebook = fit_codebook(source, chosen, weights, size, planning)
     return_free_memory()
-    steps = {
-        "opacities": settings.opacity_step,
-        "scales": settings.scale_step,
-        "quaternions": settings.quat_step,
-        "f_dc": settings.sh0_step,
-    }
+    own = settings.opacity_step, settings.scale_step, settings.quat_step, settings.sh0_step
+    steps = dict(zip(PAPER_TOPS, own, strict=True))
     if container.tables is not None:
         if not shared:
             steps = dict.fromkeys(steps, FINEST)

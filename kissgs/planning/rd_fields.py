@@ -159,10 +159,8 @@ def level_bits(
 
     def counted(rows: slice) -> Int[np.ndarray, "classes C 256"]:
         base = classes[rows].astype(np.int64) * 256
-        return np.stack(
-            [np.bincount(base + column, minlength=number * 256).reshape(number, 256) for column in levels[rows].T],
-            axis=1,
-        )
+        counts = [np.bincount(base + column, minlength=number * 256) for column in levels[rows].T]
+        return np.stack([each.reshape(number, 256) for each in counts], axis=1)
 
     likely = np.sum(for_each_block(len(levels), counted, pool), axis=0) + UNUSED_COUNT
     return np.asarray(np.log2(likely.sum(axis=2, keepdims=True)) - np.log2(likely))
@@ -193,16 +191,12 @@ def rounded_shapes(
     scales = _on_lattice(values[:, 1:4], np.clip(np.rint(steps["scales"] / finest), 1, 255) * finest)
     scale_table = quantize.fit_table(scales.ravel(), np.repeat(weights, 3), finest)
     omitted = rotation_forms.omitted_components(quats)
-    small = rotation_forms.stored_components(quats, omitted)
+    small, strides = rotation_forms.stored_components(quats, omitted), rotation_forms.strides(steps["quaternions"])
+    drawn = np.clip(opacities, tables.first_drawn, tables.last_drawn)
     return {
-        "opacities": Quantized(
-            np.clip(opacities, tables.first_drawn, tables.last_drawn), tables.opacity_logits[:, None]
-        ),
+        "opacities": Quantized(drawn, tables.opacity_logits[:, None]),
         "scales": Quantized(quantize.nearest_levels(scale_table, scales), scale_table.astype(np.float64)[:, None]),
-        "quaternions": Quantized(
-            rotation_forms.lattice_levels(small, rotation_forms.strides(steps["quaternions"])),
-            rotation_forms.TABLE[:, None],
-        ),
+        "quaternions": Quantized(rotation_forms.lattice_levels(small, strides), rotation_forms.TABLE[:, None]),
         "omitted": Quantized(omitted[:, None], np.arange(4.0)[:, None]),
     }
 
@@ -290,10 +284,8 @@ class RdFields:
             fields = {name: quantize_by_steps(values.field(name), steps[name], pool) for name in SHAPE_COLUMNS}
         else:
             logits = values.field("opacities")[:][:, 0].astype(np.float64)
-            wanted = stored_values(values[:], tables)
-            fields = rounded_shapes(
-                wanted, criterion.costs.scale, {name: some[:] for name, some in steps.items()}, tables
-            )
+            wanted, each = stored_values(values[:], tables), {name: some[:] for name, some in steps.items()}
+            fields = rounded_shapes(wanted, criterion.costs.scale, each, tables)
         if self.planning.settings.rdo_quantization:
             fields = rdo_quantize(wanted, fields, hessians, values.forms, criterion, self.largest, pool, tables)
             if tables is None:

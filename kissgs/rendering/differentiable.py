@@ -79,10 +79,8 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:  # noqa: ANN401
         parameters, others = inputs[: len(ATTRIBUTES)], inputs[len(ATTRIBUTES) :]
         cameras, backgrounds, antialiased, threads, receive = others
-        means, quats, scales, opacities, sh0, shN = (each.detach().contiguous().numpy() for each in parameters)
-        splats = Splats(
-            means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN, antialiased=antialiased
-        )
+        arrays = (each.detach().contiguous().numpy() for each in parameters)
+        splats = Splats(**dict(zip(ATTRIBUTES, arrays, strict=True)), antialiased=antialiased)
         with Workers(threads) as pool:
             frames = [draw(splats, camera, colour, pool) for camera, colour in zip(cameras, backgrounds, strict=True)]
         ctx.frames, ctx.threads, ctx.receive = frames, threads, receive
@@ -122,14 +120,11 @@ def photometric_loss(
     threads: int = 0,
 ) -> Float[torch.Tensor, ""]:
     """Return (1 - w) · mean |d| + w · (1 - SSIM) + m · mean d², for d = image - target and weights ``ssim_weight``, w,
-    and ``mse_weight``, m.
-
-    Where |d| is above 1, 2 |d| - 1 takes the place of d², so that a diverged pixel does not outweigh all others.
-    SSIM is that of :func:`kissgs.rendering.metrics.ssim`. With m = 0 it is the loss of Kerbl et al., "3D Gaussian
-    Splatting for Real-Time Radiance Field Rendering", ACM Transactions on Graphics 42 (2023), equation 7. On the CPU in
-    float32 the gradient is computed together with the value; elsewhere by autograd. Images are ``(H, W, 3)`` or
-    ``(C, H, W, 3)``, not clamped, except at ±1e9.
-    """
+    and ``mse_weight``, m. Where |d| is above 1, 2 |d| - 1 takes the place of d², so that a diverged pixel does not
+    outweigh all others. SSIM is that of :func:`kissgs.rendering.metrics.ssim`. With m = 0 it is the loss of Kerbl et
+    al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", ACM Transactions on Graphics 42 (2023),
+    equation 7. On the CPU in float32 the gradient is computed together with the value; elsewhere by autograd. Images
+    are ``(H, W, 3)`` or ``(C, H, W, 3)``, not clamped, except at ±1e9."""
     if image.shape != target.shape or image.ndim not in (3, 4) or image.shape[-1] != 3 or image.numel() == 0:
         raise InvalidViewsError(
             f"images to compare must have one shape, (height, width, 3) or (count, height, width, 3), not "
