@@ -133,20 +133,11 @@ class Limit:
 
     def figure(self, attempt: Attempt) -> float | None:
         """Return what is limited of an attempt, in the unit of ``value``; None if it is unknown."""
-        match self.name:
-            case "target_size":
-                return attempt.bytes
-            case "psnr":
-                return attempt.psnr
-            case "max_psnr_drop":
-                return attempt.drop
-            case "max_ssim_drop":
-                return attempt.ssim_drop
-            case "detail":
-                return None if attempt.detail is None else -attempt.detail.worst_percent
-            case "patch":
-                return None if attempt.detail is None else -attempt.detail.worst
-        raise AssertionError(self.name)
+        if self.name in ("detail", "patch"):
+            detail = attempt.detail
+            return None if detail is None else -(detail.worst if self.name == "patch" else detail.worst_percent)
+        figures = {"target_size": attempt.bytes, "psnr": attempt.psnr, "max_psnr_drop": attempt.drop}
+        return figures.get(self.name, attempt.ssim_drop)
 
     def loss(self, attempt: Attempt, digits: Callable[[float], str] | None = None) -> str:
         """Return what is limited of an attempt in words, such as "0.003 of SSIM"; empty for bytes and a PSNR."""

@@ -171,21 +171,17 @@ def measure_sensitivity(
             del frame  # before the next one is made
         shapes, parts = (splats.scales, splats.opacities), even(len(splats), pool)
         each_part(lambda a, b: moments_to_hessians(*shapes, a, b, found.shape_hessian), parts, pool)
-    _finish(found)
+    # Bound what overflows, and turn the sums of harmonics into means.
+    _bound(found.position_hessian, (0, 1, 2))
+    _bound(found.shape_hessian, OPACITY + SCALES + ROTATION)
+    np.nan_to_num(found.color_weight, copy=False, nan=LARGEST, posinf=LARGEST)
+    colors = found.color_weight[:, None]
+    for harmonics in (found.mean_harmonics, found.higher_harmonics):
+        np.nan_to_num(harmonics, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        np.divide(harmonics, colors, out=harmonics, where=colors > 0)
     return_free_memory()
     progress("sensitivity", 1.0)
     return found.with_prior(splats, coverage.close_up, coverage.share, view_uncertainty)
-
-
-def _finish(sums: Sensitivity) -> None:
-    """Bound what overflows, and turn the sums of harmonics into means."""
-    _bound(sums.position_hessian, (0, 1, 2))
-    _bound(sums.shape_hessian, OPACITY + SCALES + ROTATION)
-    np.nan_to_num(sums.color_weight, copy=False, nan=LARGEST, posinf=LARGEST)
-    for harmonics in (sums.mean_harmonics, sums.higher_harmonics):
-        np.nan_to_num(harmonics, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        colors = sums.color_weight[:, None]
-        np.divide(harmonics, colors, out=harmonics, where=colors > 0)
 
 
 def _bound(hessians: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> None:

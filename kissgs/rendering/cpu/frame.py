@@ -36,25 +36,19 @@ def draw(
     if colour.shape != (3,) or not np.isfinite(colour).all():
         raise InvalidViewsError("a background must be three finite numbers: red, green and blue, from 0 to 1")
     try:
-        return _draw(for_kernels(splats), camera, colour, pool, end)
+        gaussians, projection = Gaussians.of(for_kernels(splats)), Projection.of(splats, camera)
+        footprints, parts = find_footprints(gaussians, projection, pool)
+        lists = sort_into_tiles(footprints, parts, projection, pool)
+        image = np.empty((camera.height, camera.width, 3), np.float32)
+        transmittance = np.empty((camera.height, camera.width), np.float32)
+        stops = np.empty((len(lists.starts) - 1, constants.TILE**2), np.int32)
+        limits = np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, end], np.float32)
+        blended = Blended(image, transmittance, stops, colour, limits)
+        frame = Frame(gaussians, projection, footprints, np.array(parts), lists, blended)
+        each_part(lambda first, last: blending.blend(frame, first, last), even_tiles(lists, pool), pool)
     except MemoryError as error:
         size = f"{camera.width}x{camera.height}"
         raise UnsupportedError(f"there is not enough memory for an image of {size}; render a smaller one") from error
-
-
-def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], pool: Workers, end: float) -> Frame:
-    gaussians, projection = Gaussians.of(splats), Projection.of(splats, camera)
-    footprints, parts = find_footprints(gaussians, projection, pool)
-    lists = sort_into_tiles(footprints, parts, projection, pool)
-    blended = Blended(
-        np.empty((camera.height, camera.width, 3), np.float32),
-        np.empty((camera.height, camera.width), np.float32),
-        np.empty((len(lists.starts) - 1, constants.TILE**2), np.int32),
-        background,
-        np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, end], np.float32),
-    )
-    frame = Frame(gaussians, projection, footprints, np.array(parts), lists, blended)
-    each_part(lambda first, last: blending.blend(frame, first, last), even_tiles(lists, pool), pool)
     return frame
 
 
