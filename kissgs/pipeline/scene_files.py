@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
@@ -95,14 +96,12 @@ def is_container(source: Path | bytes) -> bool:
     self-extractor. If the file cannot be opened, the ending ``.zip`` decides."""
     if isinstance(source, bytes):
         return sniff_format(io.BytesIO(source)) == "zip"
-    try:
+    with suppress(OSError, ValueError):
         if source.is_dir():
             return True
         if source.is_file():  # opening a named pipe would block
             with source.open("rb") as file:
                 return sniff_format(file) == "zip"
-    except (OSError, ValueError):
-        pass
     return is_packed(source)
 
 
@@ -135,12 +134,10 @@ def _beginning(source: Path | bytes) -> tuple[bytes, int]:
     """Return the first bytes and the size of a file; nothing of what cannot be read."""
     if isinstance(source, bytes):
         return source[:HEAD_BYTES], len(source)
-    try:
+    with suppress(OSError, ValueError):
         if source.is_file():  # opening a named pipe would block
             with source.open("rb") as file:
                 return file.read(HEAD_BYTES), source.stat().st_size
-    except (OSError, ValueError):
-        pass
     return b"", 0
 
 

@@ -186,7 +186,10 @@ def layout_grid(
         return Grid(side, nothing, nothing.astype(bool), nothing)
     levels = quantize_means(selected(means, kept), bits=bits, pool=pool).levels
     if settings.order != "plas":
-        order = hilbert_order(levels, _with_groups(classes, groups, kept), pool)
+        if groups is not None:  # which follow one another, and the classes within each
+            own = groups[kept]
+            classes = own if classes is None else own * np.uint16(classes.max(initial=0) + 1) + classes
+        order = hilbert_order(levels, classes, pool)
         order = np.concatenate([order, np.repeat(order[-1:], side * side - len(order))])
         mask = np.arange(side * side) < len(kept)
     else:
@@ -195,16 +198,6 @@ def layout_grid(
     rank = np.empty(len(kept), dtype=np.int32)
     rank[order[mask]] = np.arange(len(kept), dtype=np.int32)
     return Grid(side, kept.astype(np.int32, copy=False).take(order), mask, rank[order])
-
-
-def _with_groups(
-    classes: Integer[np.ndarray, " M"] | None, groups: UInt16[np.ndarray, " N"] | None, kept: Int[np.ndarray, " M"]
-) -> Integer[np.ndarray, " M"] | None:
-    """Return classes such that the groups follow one another, and the classes within each."""
-    if groups is None:
-        return classes
-    own = groups[kept]
-    return own if classes is None else own * np.uint16(classes.max(initial=0) + 1) + classes
 
 
 def _plas_order(

@@ -264,14 +264,10 @@ def plan_encoding(
             plan = plan_uniform(splats, kept, planning, groups)
         if settings.order == "refined":
             plan = refine_order(plan, groups, pool, context.progress)
-        return replace(plan, coarse=_coarse(splats, plan))
-
-
-def _coarse(splats: Splats, plan: EncodingPlan) -> str:
-    """Return the sentence about coarse positions, by at most :data:`SAMPLED` Gaussians."""
-    order, means = plan.grid.cells[plan.grid.mask], plan.fields["means"]
-    some = order[:: 1 + len(order) // SAMPLED]
-    return coarse_note(splats.means[some], splats.scales[some], means.low, means.high, len(order))
+        order, means = plan.grid.cells[plan.grid.mask], plan.fields["means"]
+        some = order[:: 1 + len(order) // SAMPLED]
+        note = coarse_note(splats.means[some], splats.scales[some], means.low, means.high, len(order))
+        return replace(plan, coarse=note)
 
 
 def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndarray, " K"]:

@@ -49,7 +49,9 @@ class Costs:
 
         for_each_block(len(splats), measure, pool)
         for cost in (found.opacity, found.scale, found.rotation, found.color, found.position):
-            _raise_to_floor(cost)
+            seen = cost[cost > 0]
+            floor = max(FLOOR * float(np.median(seen, overwrite_input=True)), 1e-30) if len(seen) else 1e-30
+            np.maximum(cost, floor, out=cost)
         return found
 
     def take(self, chosen: Int[np.ndarray, " k"]) -> Costs:
@@ -113,12 +115,6 @@ def _rows_of(sensitivity: Sensitivity, rows: slice) -> Sensitivity:
     values: dict[str, Any] = {field.name: getattr(sensitivity, field.name) for field in fields(sensitivity)}
     values |= {name: each[rows] for name, each in values.items() if isinstance(each, np.ndarray)}
     return Sensitivity(**values)
-
-
-def _raise_to_floor(cost: Float64[np.ndarray, " M"]) -> None:
-    seen = cost[cost > 0]
-    floor = max(FLOOR * float(np.median(seen, overwrite_input=True)), 1e-30) if len(seen) else 1e-30
-    np.maximum(cost, floor, out=cost)
 
 
 def _position_keys(means: Float32[np.ndarray, "M 3"] | Rows) -> UInt64[np.ndarray, " M"]:

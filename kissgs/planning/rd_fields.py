@@ -191,7 +191,8 @@ def rounded_shapes(
     scales = _on_lattice(values[:, 1:4], np.clip(np.rint(steps["scales"] / finest), 1, 255) * finest)
     scale_table = quantize.fit_table(scales.ravel(), np.repeat(weights, 3), finest)
     omitted = rotation_forms.omitted_components(quats)
-    small, strides = rotation_forms.stored_components(quats, omitted), rotation_forms.strides(steps["quaternions"])
+    small = rotation_forms.stored_components(quats, omitted)
+    strides = np.clip(np.rint(steps["quaternions"] / rotation_forms.STEP), 1, 64).astype(np.int64)
     drawn = np.clip(opacities, tables.first_drawn, tables.last_drawn)
     return {
         "opacities": Quantized(drawn, tables.opacity_logits[:, None]),

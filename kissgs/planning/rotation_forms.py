@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, UInt8
+from kissgs.core.array_types import Bool, Float32, Float64, Int, UInt8
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.planning.layout import box_blur
@@ -65,11 +65,6 @@ def whole(
     missing = np.sqrt(np.maximum(0, 1 - np.square(small).sum(axis=1, keepdims=True)))
     np.put_along_axis(quats, omitted[:, None].astype(np.int64), missing, axis=1)
     return quats
-
-
-def strides(step: Float[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
-    """Return the multiple of the levels' distance nearest to each step, from 1 to 64."""
-    return np.clip(np.rint(step / STEP), 1, 64).astype(np.int64)
 
 
 # Choice among the 48 equivalent (rotation, scales) forms of a Gaussian, which all have the same covariance.
