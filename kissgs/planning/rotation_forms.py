@@ -199,7 +199,6 @@ def pras_forms(
     quat_proxy = (quats * 127.5).astype(np.float32)
     scale_proxy = ((scales - low) * (255 / max(high - low, 1e-30))).astype(np.float32)
     rotations = ROTATIONS.astype(np.float32)
-    edges = range(0, count, CHUNK)
     radius = side / 2 - 1
     while radius >= 1:
         report(1 - np.log(radius) / np.log(side / 2))
@@ -207,13 +206,12 @@ def pras_forms(
         proxy = np.rint(current).astype(np.float32)
         target = box_blur(proxy.reshape(side, side, 7), int(radius), pool).reshape(-1, 7)
 
-        def choose(first: int, target: np.ndarray = target) -> None:
-            rows = slice(first, min(first + CHUNK, count))
+        def choose(rows: slice, target: np.ndarray = target) -> None:
             kernels.nearest_forms(
                 quat_proxy[rows], scale_proxy[rows], target[rows], rotations, PERMUTATIONS, forms[rows]
             )
 
-        pool.map(choose, edges)
+        for_each_block(count, choose, pool, block=CHUNK)
         radius *= decay
     return forms
 
