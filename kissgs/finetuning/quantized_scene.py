@@ -205,7 +205,12 @@ class QuantizedScene:
         ``rates`` has learning rates by field and :func:`table_name`, and the factor of the ``"attraction"``, 0 to 1."""
         rotations = self.latents["quaternions"].detach().clone() if self._omitted is not None else None
         if self._weights and rates["attraction"] > 0:
-            self._attract(rates["attraction"])
+            with torch.no_grad():
+                tables = self.tables()
+                for name, latents in self.latents.items():
+                    if latents.grad is not None:
+                        own = latents.grad, latents, tables.get(name), self._weights[name]
+                        self.planes[name].attract(*own, rates["attraction"])
         self._adam.step(rates)
         with torch.no_grad():
             for name, latents in self.latents.items():
@@ -216,14 +221,6 @@ class QuantizedScene:
                 latents = self.latents["quaternions"]
                 squares = self.planes["quaternions"].values(latents).square().sum(dim=1, keepdim=True)
                 latents.copy_(torch.where(squares > 1, rotations, latents))
-
-    @torch.no_grad()
-    def _attract(self, factor: float) -> None:
-        """Add the gradient of the quadratic attraction of each latent to its current level."""
-        tables = self.tables()
-        for name, latents in self.latents.items():
-            if latents.grad is not None:
-                self.planes[name].attract(latents.grad, latents, tables.get(name), self._weights[name], factor)
 
     def plan(self) -> EncodingPlan:
         """Return the plan with the current levels and tables."""
@@ -244,12 +241,8 @@ class QuantizedScene:
             name: after[name] if name == "f_rest_centroids" else after[name].take(grid.cell_to_gaussian)
             for name in former
         }
-        return replace(
-            self._plan,
-            fields=fields,
-            codebook=replace(self._plan.codebook, centroids=fields["f_rest_centroids"]),
-            errors=errors,
-        )
+        codebook = replace(self._plan.codebook, centroids=fields["f_rest_centroids"])
+        return replace(self._plan, fields=fields, codebook=codebook, errors=errors)
 
     def state(self) -> dict[str, np.ndarray]:
         return self._adam.state()
