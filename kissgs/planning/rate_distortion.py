@@ -99,17 +99,10 @@ def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_
     paper = (opacity, scale, rotation * 2 / 99, color, log_extent / 65535)
     defaults = {name: field.default for name, field in EncodeSettings.model_fields.items()}
     levels = 2 ** means_bits(splats, kept, defaults["means_tolerance"]) - 1
-    fast = (
-        np.float64(defaults["opacity_step"]),
-        np.full(3, defaults["scale_step"]),
-        rotation * defaults["quat_step"],
-        np.full(3, defaults["sh0_step"]),
-        log_extent / levels,
-    )
-    return min(
-        _error(paper, PAPER_RATIO, costs, sh_model),
-        _error(fast, defaults["gaussians_per_codebook_entry"], costs, sh_model),
-    )
+    scale, color = (np.full(3, defaults[name]) for name in ("scale_step", "sh0_step"))
+    fast = (np.float64(defaults["opacity_step"]), scale, rotation * defaults["quat_step"], color, log_extent / levels)
+    fast_ratio = defaults["gaussians_per_codebook_entry"]
+    return min(_error(paper, PAPER_RATIO, costs, sh_model), _error(fast, fast_ratio, costs, sh_model))
 
 
 def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs, sh_model: CodebookErrorModel) -> float:
