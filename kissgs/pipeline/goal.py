@@ -42,7 +42,7 @@ class Attempt:
         bytes: size of the zip, or of all files in the folder.
         psnr: PSNR of its renderings to those of the scene as goals count it, decibels
             (:func:`kissgs.evaluation.results.psnr_of`); without a capture in other views than ``drop``, in those of
-            ``worst`` and ``fifth_percentile``. None, as all that follow, where the goal is a size, but for the kept one.
+            ``worst`` and ``fifth_percentile``. None, as all that follow, where the goal is a size, save the kept one.
         drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.results.drop_of`).
         ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.results.ssim_drop_of`).
         detail: losses of SSIM in patches, in the views of ``drop``.
