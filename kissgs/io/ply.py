@@ -49,7 +49,6 @@ _CHUNK = BLOCK_ALIGNMENT  # Gaussians per row of element chunk, given by the for
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 """Properties of element ``vertex``: one word each."""
 
-_HALVES = (slice(0, 3), slice(3, 6))  # columns of minima and of maxima among the six bounds of an attribute
 _MAX_SCALE = 20.0  # bound of log-scales that a file holds, as the format's own tool has it
 
 
@@ -217,7 +216,8 @@ def _fractions(
     starts = np.arange(0, len(values), _CHUNK)
     bounds[:, :3] = np.minimum.reduceat(values, starts, axis=0)
     bounds[:, 3:] = np.maximum.reduceat(values, starts, axis=0)
-    low, high = (np.repeat(bounds[:, half].astype(np.float64), _CHUNK, axis=0)[: len(values)] for half in _HALVES)
+    ends = np.repeat(bounds.astype(np.float64), _CHUNK, axis=0)[: len(values)]
+    low, high = ends[:, :3], ends[:, 3:]
     return (values - low) / np.where(high > low, high - low, 1)
 
 

@@ -156,7 +156,11 @@ def _read_header(opened: SceneFile) -> Header:
             case ["element", element, count]:
                 if element in counts:
                     raise InvalidSceneError(f"{where}: a second element {_quote(element)}; each may occur once")
-                counts[element] = _count(count, where)
+                if not re.fullmatch(r"[0-9]{1,18}", count):  # 64 bits; it is checked against the file's size later
+                    raise InvalidSceneError(
+                        f"{where}: the count is {_quote(count)}, not a whole number from 0 to 10^18"
+                    )
+                counts[element] = int(count)
                 properties[element] = {}
             case ["property", *definition] if counts:
                 _add_property(properties[next(reversed(counts))], definition, where)
@@ -209,13 +213,6 @@ def _header_lines(file: io.BufferedIOBase, name: str) -> Iterator[tuple[int, lis
         if not line.endswith(b"\n") and line.strip() != b"end_header":
             return
         yield number, line.decode("utf-8", errors="replace").split()
-
-
-def _count(word: str, where: str) -> int:
-    # 18 digits fit 64 bits. The count is checked against the file's size before rows are read.
-    if not re.fullmatch(r"[0-9]{1,18}", word):
-        raise InvalidSceneError(f"{where}: the count is {_quote(word)}, not a whole number from 0 to 10^18")
-    return int(word)
 
 
 def _add_property(properties: dict[str, Property], definition: list[str], where: str) -> None:
@@ -367,7 +364,4 @@ def _check_line(words: list[str], names: tuple[str, ...], where: str) -> None:
 
 def _cut_short(ply: PlyFile, element: Element, found: int) -> InvalidSceneError:
     what = "Gaussians" if element.name == "vertex" else f"rows of element {element.name!r}"
-    return InvalidSceneError(
-        f"{ply.name} is cut short: it declares {element.count:,} {what} but has room for {found:,}; "
-        "export or download it again"
-    )
+    return ply.invalid(f"is cut short: it declares {element.count:,} {what} but has room for {found:,}")
