@@ -104,10 +104,8 @@ def ending_of(container: ContainerName) -> str:
 
 
 def names_folder(destination: str | PathLike[str]) -> bool:
-    """Whether a name is that of a folder: one that exists, or ends in a slash or in ``.container``.
-
-    A Path keeps no slash: one without an ending is a folder.
-    """
+    """Whether a name is that of a folder: one that exists, or ends in a slash or in ``.container``. A Path keeps no
+    slash: one without an ending is a folder."""
     name = os.fspath(destination)
     ending = Path(f"_{Path(name).name.rstrip('.')}").suffix  # also of ".zip" and "a.zip."
     return (
@@ -150,10 +148,8 @@ def named_container(requested: str | None, destination: str | PathLike[str] | No
 
 
 def named_manifest(destination: Path) -> Path | None:
-    """Return the manifest of the streamed scene that a destination names; None if it names something else.
-
-    It is the destination itself, or ``levels.json`` in a folder that ends in ``.sogxt``.
-    """
+    """Return the manifest of the streamed scene that a destination names; None if it names something else. It is the
+    destination itself, or ``levels.json`` in a folder that ends in ``.sogxt``."""
     if destination.name in MANIFESTS:
         return destination
     return destination / LEVELS_NAME if destination.suffix.lower() == LEVELS_ENDING else None

@@ -183,11 +183,9 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
 
 @dataclass
 class ClusterCompression:
-    """Compression of several scenes, submitted at once; their results are awaited in order.
-
-    An item writes below a work folder beside its output, and the result is moved from there when its outcome has
-    arrived: a node may be lost at any moment, and nothing is written twice or in part.
-    """
+    """Compression of several scenes, submitted at once; their results are awaited in order. An item writes below a work
+    folder beside its output, and the result is moved from there when its outcome has arrived: a node may be lost at any
+    moment, and nothing is written twice or in part."""
 
     address: str
     options: SceneCompression

@@ -94,10 +94,8 @@ class PlyFile(SceneFile):
 
 @contextlib.contextmanager
 def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFile]:
-    """Open a file, or the bytes of one, and parse the header. The body is not read.
-
-    ``size`` is that of the whole file if ``source`` is only its beginning.
-    """
+    """Open a file, or the bytes of one, and parse the header. The body is not read. ``size`` is that of the whole file
+    if ``source`` is only its beginning."""
     with open_scene_file(source) as opened:
         header = _read_header(opened)
         yield PlyFile(opened.name, opened.file, opened.size if size is None else size, header)
@@ -266,10 +264,8 @@ def check_complete(ply: PlyFile, element: Element) -> None:
 
 
 def rows(ply: PlyFile, element: Element) -> Iterator[np.ndarray]:
-    """Yield all rows of ``element``, in order, as structured arrays with one field per property.
-
-    The fields have the types of the file; in ascii files all are float64. Each block is overwritten by the next.
-    """
+    """Yield all rows of ``element``, in order, as structured arrays with one field per property. The fields have the
+    types of the file; in ascii files all are float64. Each block is overwritten by the next."""
     return _ascii_rows(ply, element) if ply.header.encoding == "ascii" else _binary_rows(ply, element)
 
 
@@ -321,10 +317,8 @@ def _ascii_rows(ply: PlyFile, element: Element) -> Iterator[np.ndarray]:
 
 
 def _numbered_lines(ply: PlyFile, width: int) -> Iterator[list[tuple[int, str]]]:
-    """Yield the non-blank lines of an ascii body with their line numbers, one block at a time.
-
-    A last line without a line end and with fewer than ``width`` values is skipped: the file was cut there.
-    """
+    """Yield the non-blank lines of an ascii body with their line numbers, one block at a time. A last line without a
+    line end and with fewer than ``width`` values is skipped: the file was cut there."""
     ply.file.seek(ply.header.nbytes)
     number = ply.header.lines
     rest = b""

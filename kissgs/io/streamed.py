@@ -152,10 +152,8 @@ class StreamedFormat:
         threads: int = 0,
         progress: Progress = silent,
     ) -> Splats:
-        """Decode one level of a streamed scene: the rows in the order of the files, then the environment.
-
-        Containers of a lower SH degree get zeros for the coefficients above it.
-        """
+        """Decode one level of a streamed scene: the rows in the order of the files, then the environment. Containers of
+        a lower SH degree get zeros for the coefficients above it."""
         with self.open(source) as files, Workers(threads) as pool:
             manifest = self.read_manifest(files)
             parts = list(self.parts(files, manifest, reading.level))

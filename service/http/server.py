@@ -188,10 +188,8 @@ class Server(uvicorn.Server):
         await asyncio.gather(self._context.worker.drain(), super().shutdown(sockets))
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Stop starting jobs, end streams and long polls, then let uvicorn finish its requests.
-
-        uvicorn's handler would raise the signal again afterwards, so that the exit status would look like a crash.
-        """
+        """Stop starting jobs, end streams and long polls, then let uvicorn finish its requests. uvicorn's handler would
+        raise the signal again afterwards, so that the exit status would look like a crash."""
         if self.should_exit:
             self._context.worker.kill_running()
         self._context.worker.draining = True

@@ -59,11 +59,9 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
 
 
 def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed:
-    """Compress the scene, continuing from its checkpoint if there is one.
-
-    Checkpoints are optional: an unusable one (damaged, or of another version of kissgs) is replaced, and if none can be
-    written, because the disk is full, the job runs without.
-    """
+    """Compress the scene, continuing from its checkpoint if there is one. Checkpoints are optional: an unusable one
+    (damaged, or of another version of kissgs) is replaced, and if none can be written, because the disk is full, the
+    job runs without."""
     import kissgs
 
     checkpoint = None if task["checkpoint"] is None else Path(task["checkpoint"])

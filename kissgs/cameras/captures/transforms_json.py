@@ -240,12 +240,10 @@ class _DataparserTransforms(BaseModel):
 
 
 def read_transforms(path: Path) -> Capture:
-    """Read a ``transforms.json`` with the split that it defines, if any.
-
-    nerfstudio's ``train_filenames`` are for training, and ``test_filenames`` (``val_filenames`` if that is empty) are
-    held out. If there is only one of these lists, all other frames are in the other part. If there are both, frames in
-    neither are left out, and frames in both are held out.
-    """
+    """Read a ``transforms.json`` with the split that it defines, if any. nerfstudio's ``train_filenames`` are for
+    training, and ``test_filenames`` (``val_filenames`` if that is empty) are held out. If there is only one of these
+    lists, all other frames are in the other part. If there are both, frames in neither are left out, and frames in both
+    are held out."""
     document = _read(path, _Transforms)
     images = _posed_images(path, document)
     splits = _splits(path, document)
@@ -269,10 +267,8 @@ def read_split_transforms(folder: Path) -> Capture:
 
 
 def similarities(folders: Iterable[Path], applied: Float64[np.ndarray, "4 4"] | None) -> tuple[Similarity, ...]:
-    """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have.
-
-    The first of ``folders`` that has a ``dataparser_transforms.json`` counts.
-    """
+    """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have. The first of
+    ``folders`` that has a ``dataparser_transforms.json`` counts."""
     found = []
     path = next((path for folder in folders if (path := folder / DATAPARSER_TRANSFORMS).is_file()), None)
     if path is not None:
