@@ -1,7 +1,5 @@
 """The scene formats, one line each, and what the name of an output stands for. A format's module is imported when used.
-
-To add a format, add its module, which ends in ``FORMAT = Codec(…)``, and its line in :data:`FORMATS`.
-"""
+To add a format, add its module, which ends in ``FORMAT = Codec(…)``, and its line in :data:`FORMATS`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""Procedural sample scene with the appearance and statistics of a trained 3DGS reconstruction.
-
-Axes as in COLMAP, y pointing down: the ground is y = 0, the camera looks along +z.
-"""
+"""Procedural sample scene with the appearance and statistics of a trained 3DGS reconstruction. Axes as in COLMAP, y
+pointing down: the ground is y = 0, the camera looks along +z."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""Compilation of inner loops by numba, at their first call, without the GIL and without threads of their own.
-
-Each kernel has one signature, so that its bits do not depend on who calls it first; the first call compiles it or loads
-it from numba's per-user cache. Constants are literals inside the functions, as that cache does not see changed globals.
-"""
+"""Compilation of inner loops by numba, at their first call, without the GIL and without threads of their own. Each
+kernel has one signature, so that its bits do not depend on who calls it first; the first call compiles it or loads it
+from numba's per-user cache. Constants are literals inside the functions, as that cache does not see changed globals."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""glTF with ``KHR_gaussian_splatting``: GLB or JSON; also with the attributes in ``.spz`` inside it.
-
-All primitives of the scene's nodes are read, moved by the nodes' transforms and turned from glTF's axes (x left, y up,
-z forward) to those of a ``.ply``; ``.glb`` is written with one primitive.
-"""
+"""glTF with ``KHR_gaussian_splatting``: GLB or JSON; also with the attributes in ``.spz`` inside it. All primitives of
+the scene's nodes are read, moved by the nodes' transforms and turned from glTF's axes (x left, y up, z forward) to
+those of a ``.ply``; ``.glb`` is written with one primitive."""
 
 from __future__ import annotations
 

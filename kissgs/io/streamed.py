@@ -1,8 +1,6 @@
-"""Streamed scenes: a manifest with a tree whose leaves name rows of containers, level by level.
-
-Level 0 is the finest. The environment, if there is one, belongs to every level. The package of a container's format
-says how its files are opened and decoded.
-"""
+"""Streamed scenes: a manifest with a tree whose leaves name rows of containers, level by level. Level 0 is the finest.
+The environment, if there is one, belongs to every level. The package of a container's format says how its files are
+opened and decoded."""
 
 from __future__ import annotations
 

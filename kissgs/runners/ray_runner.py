@@ -1,8 +1,6 @@
-"""``RayRunner``: work items on the nodes of a Ray cluster, through a driver process, which alone uses Ray.
-
-Ray ends the process that uses it when the cluster's head is gone for a minute, replaces its signal handlers, and prints
-to its standard output. Here, the loss of that process is one more outcome.
-"""
+"""``RayRunner``: work items on the nodes of a Ray cluster, through a driver process, which alone uses Ray. Ray ends the
+process that uses it when the cluster's head is gone for a minute, replaces its signal handlers, and prints to its
+standard output. Here, the loss of that process is one more outcome."""
 
 from __future__ import annotations
 

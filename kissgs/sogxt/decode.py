@@ -1,8 +1,6 @@
-"""SOG-XT files -> ``Splats``, by one lookup table per channel.
-
-The arithmetic is that of the paper's reference decoder (docs/reference/format.md), with tables in float64 and without
-its activation of opacities and scales and their inverse.
-"""
+"""SOG-XT files -> ``Splats``, by one lookup table per channel. The arithmetic is that of the paper's reference decoder
+(docs/reference/format.md), with tables in float64 and without its activation of opacities and scales and their
+inverse."""
 
 from __future__ import annotations
 

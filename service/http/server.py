@@ -1,7 +1,5 @@
 """uvicorn with timeouts for idle and slow connections, and with a shutdown that drains jobs and requests concurrently.
-
-uvicorn itself would begin to drain only after the last stream has ended.
-"""
+uvicorn itself would begin to drain only after the last stream has ended."""
 
 from __future__ import annotations
 

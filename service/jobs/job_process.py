@@ -1,8 +1,6 @@
-"""Work of jobs: compression and decoding, run by :mod:`kissgs.runners` in a process of their own.
-
-Tasks name their files relative to the folder of the job, the current one of the process, and results are written below
-its folder ``work``. This module reads and writes all files of jobs that the service's own process does not.
-"""
+"""Work of jobs: compression and decoding, run by :mod:`kissgs.runners` in a process of their own. Tasks name their
+files relative to the folder of the job, the current one of the process, and results are written below its folder
+``work``. This module reads and writes all files of jobs that the service's own process does not."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""``Store``: reading and changes of the tables of jobs and events, each change in one transaction.
-
-State transitions are limited to :data:`_PREDECESSORS`, and compared and set in one step, so that of a simultaneous
-cancellation and result only one takes effect. Each change of state or progress adds an event for clients.
-"""
+"""``Store``: reading and changes of the tables of jobs and events, each change in one transaction. State transitions
+are limited to :data:`_PREDECESSORS`, and compared and set in one step, so that of a simultaneous cancellation and
+result only one takes effect. Each change of state or progress adds an event for clients."""
 
 from __future__ import annotations
 
