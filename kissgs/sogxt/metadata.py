@@ -327,7 +327,8 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InvalidContainerError(f"{YAML_NAME} is not readable YAML") from error
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
-        raise InvalidContainerError(f"{YAML_NAME} lacks 'meta' or 'ops', or they are of another form") from error
+        problem = "lacks 'meta' or 'ops', or they are not of the expected form"
+        raise InvalidContainerError(f"{YAML_NAME} {problem}") from error
     _require_webp(sides.get("image_codec") if isinstance(sides, dict) else None)
     recorded = document.get("kissgs")
     return {
