@@ -197,10 +197,8 @@ def page_container(
 
 
 def _as_container(source: Path | bytes, reading: ReadOptions) -> PageScene | None:
-    """Return the zip of a container, None for other formats. The files of a folder are packed.
-
-    A container is not shown as it is if its mark of antialiasing does not count.
-    """
+    """Return the zip of a container, None for other formats. The files of a folder are packed. A container is not shown
+    as it is if its mark of antialiasing does not count."""
     found = recognise(source)
     kind = next((kind for kind in CONTAINERS if kind == found), None)
     if kind is None or reading.antialiased is not None:
@@ -341,11 +339,9 @@ _SERVED_POLICY = (
 
 
 class PageServer(ThreadingHTTPServer):
-    """Server of the page at ``/``, of its files and of the scene, and of nothing else.
-
-    Only requests whose ``Host`` is this machine by number or as ``localhost`` are answered, so that a web site whose
-    name resolves to 127.0.0.1 cannot read the scene. Port 0 is a free one.
-    """
+    """Server of the page at ``/``, of its files and of the scene, and of nothing else. Only requests whose ``Host`` is
+    this machine by number or as ``localhost`` are answered, so that a web site whose name resolves to 127.0.0.1 cannot
+    read the scene. Port 0 is a free one."""
 
     daemon_threads = True
     block_on_close = False

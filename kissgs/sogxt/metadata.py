@@ -273,10 +273,8 @@ def _layout_of(raw: dict[str, Any], name: str) -> Layout:
 
 
 def _compare(data: bytes, layout: Layout) -> None:
-    """Refuse a YAML file that states another scene than ``meta.json``, as ``web_decoder/scene.js`` does.
-
-    Numbers are compared by the word before them, and the word after "model", so that browsers need no YAML reader.
-    """
+    """Refuse a YAML file that states another scene than ``meta.json``, as ``web_decoder/scene.js`` does. Numbers are
+    compared by the word before them, and the word after "model", so that browsers need no YAML reader."""
     stated: dict[str, list[float]] = {"model": [False]}
     field = before = key = ""
     for word in _WORD.findall(data.decode("utf-8-sig", "replace")):
@@ -329,7 +327,8 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InvalidContainerError(f"{YAML_NAME} is not readable YAML") from error
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
-        raise InvalidContainerError(f"{YAML_NAME} lacks 'meta' or 'ops', or they are of another form") from error
+        problem = "lacks 'meta' or 'ops', or they are not of the expected form"
+        raise InvalidContainerError(f"{YAML_NAME} {problem}") from error
     _require_webp(sides.get("image_codec") if isinstance(sides, dict) else None)
     recorded = document.get("kissgs")
     return {
@@ -346,9 +345,7 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
 
 def _load_yaml(data: bytes) -> Any:  # noqa: ANN401
     """Return a document of lists, mappings with keys of text, and the plain values of YAML 1.2: see :func:`_value`.
-
-    PyYAML's loaders know more (numbers of base 60, merge keys, keys of any type), which takes minutes to expand.
-    """
+    PyYAML's loaders know more (numbers of base 60, merge keys, keys of any type), which takes minutes to expand."""
     waiting: list[tuple[Any, list[Any]]] = [(None, [])]
     anchors: dict[str | None, Any] = {}
     aliases = 0

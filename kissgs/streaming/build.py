@@ -64,11 +64,9 @@ COARSER_STEPS = 1.6  # of levels of SH degree 0, in units of the finest level's,
 
 
 def file_settings(settings: EncodeSettings, level: int, sh_degree: int) -> EncodeSettings:
-    """Return the settings of the files of a level.
-
-    Classes of steps would have an order of their own within each leaf, which costs 5 % of the bytes. Merging has a
-    larger error than the finest level's encoding, so coarser levels are less accurate (docs/method/streaming.md).
-    """
+    """Return the settings of the files of a level. Classes of steps would have an order of their own within each leaf,
+    which costs 5 % of the bytes. Merging has a larger error than the finest level's encoding, so coarser levels are
+    less accurate (docs/method/streaming.md)."""
     settings = settings.model_copy(update={"step_classes": 1})
     if level == 0:
         return settings
@@ -104,10 +102,8 @@ def measure_file(
     threads: int,
     progress: Progress = silent,
 ) -> Sensitivity:
-    """Measure the sensitivity of the Gaussians of a file; ``others`` stand for the rest of the scene.
-
-    A level of half the Gaussians is meant for images of half the size.
-    """
+    """Measure the sensitivity of the Gaussians of a file; ``others`` stand for the rest of the scene. A level of half
+    the Gaussians is meant for images of half the size."""
     size = max(MIN_SIZE, settings.sensitivity_view_size >> level)
     shown = [_shown(camera, splats) for camera in cameras]
     best = sorted(np.argsort(np.negative(shown), kind="stable")[:MAX_VIEWS])  # else each file would take more and more

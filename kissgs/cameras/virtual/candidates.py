@@ -30,11 +30,9 @@ class SceneBounds:
 
 
 def scene_bounds(splats: Splats, start: tuple[Vec3, float] | None = None) -> SceneBounds:
-    """Estimate centre, radius and up direction of a scene; without any opacity, the unit sphere around the origin.
-
-    A capture has most Gaussians where its photographs point. The centre is a mode of that density, by opacity, found by
-    mean shift from the weighted median of the positions, or from the centre and radius ``start``.
-    """
+    """Estimate centre, radius and up direction of a scene; without any opacity, the unit sphere around the origin. A
+    capture has most Gaussians where its photographs point. The centre is a mode of that density, by opacity, found by
+    mean shift from the weighted median of the positions, or from the centre and radius ``start``."""
     means = splats.means.astype(np.float64)
     weights = opacity(splats)
     if not weights.sum() > 0:
@@ -81,11 +79,9 @@ def weighted_quantiles(
 
 
 def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.ndarray, "N 3"]) -> Vec3:
-    """Return the up direction: the normal of the ground, or the axis that files use if there is no ground.
-
-    The short axes of flat Gaussians are surface normals; most of them near one file axis select that axis. The sign
-    follows from the skew of heights: objects stand on the ground, so that density falls off upwards.
-    """
+    """Return the up direction: the normal of the ground, or the axis that files use if there is no ground. The short
+    axes of flat Gaussians are surface normals; most of them near one file axis select that axis. The sign follows from
+    the skew of heights: objects stand on the ground, so that density falls off upwards."""
     axis = UP_AXES[0]
     if not weights.any():
         return axis
@@ -189,12 +185,9 @@ def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.
 
 
 def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[np.ndarray, " n"]:
-    """Return the view score of each camera, at most 1.
-
-    1 is a sharp image of the scene's centre, without holes and with nothing right in front of the camera. Size and
-    angle of Gaussians are compared with the best tenth of the views that show enough. The image of an object that
-    stands alone need only not be much emptier than the others.
-    """
+    """Return the view score of each camera, at most 1. 1 is a sharp image of the scene's centre, without holes and with
+    nothing right in front of the camera. Size and angle of Gaussians are compared with the best tenth of the views that
+    show enough. The image of an object that stands alone need only not be much emptier than the others."""
     names = ("alpha", "log_size", "log_angle", "near", "centre")
     alpha, log_size, log_angle, near, centre = (np.array([getattr(view, name) for view in stats]) for name in names)
     enough = alpha >= 0.5 * alpha.max()

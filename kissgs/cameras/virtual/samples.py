@@ -61,10 +61,8 @@ class Region:
 def find_regions(
     splats: Splats, size: tuple[int, int], pool: Workers, progress: Progress, *, camera_count: int
 ) -> list[Region]:
-    """Return the regions of a scene, at least one; shares add up to 1.
-
-    ``camera_count`` is the number of cameras that will be selected for the first region, at most.
-    """
+    """Return the regions of a scene, at least one; shares add up to 1. ``camera_count`` is the number of cameras that
+    will be selected for the first region, at most."""
     candidates = score_candidates(splats, size, pool, progress).refined(camera_count)
     proxy = proxy_scene(splats)
     visible, coverage, spacing = drawn_opacities(proxy), Coverage(proxy), local_scale(proxy)
@@ -109,10 +107,8 @@ def _updated_coverage(coverage: Coverage, proxy: Splats, region: Region, pool: W
 
 
 def _densest_part(proxy: Splats, remaining: Int[np.ndarray, " m"], spacing: Float32[np.ndarray, " n"]) -> SceneBounds:
-    """Return the bounds of the part where the Gaussians ``remaining`` are densest.
-
-    Mean shift starts at the 5 % quantile of spacing, because the smallest spacings are often single pairs.
-    """
+    """Return the bounds of the part where the Gaussians ``remaining`` are densest. Mean shift starts at the 5 %
+    quantile of spacing, because the smallest spacings are often single pairs."""
     densest = remaining[np.argsort(spacing[remaining], kind="stable")[len(remaining) // 20]]
     start = proxy.means[densest].astype(np.float64), 4 * float(spacing[densest])
     return scene_bounds(proxy.select(remaining), start)
@@ -176,11 +172,9 @@ def default_view_count(gaussians: int) -> int:
 def sensitivity_cameras(
     splats: Splats, views: Views | None, context: Context = DEFAULT_CONTEXT, *, count: int, size: int
 ) -> WeightedCameras:
-    """Return the cameras, each with its weight, that measure sensitivity and refit colours.
-
-    Of a capture, at most ``count`` training views are used, and two thirds as many virtual cameras are added; without
-    any, ``count`` are virtual. ``size`` is the longer side of the images, pixels; larger ones are sampled.
-    """
+    """Return the cameras, each with its weight, that measure sensitivity and refit colours. Of a capture, at most
+    ``count`` training views are used, and two thirds as many virtual cameras are added; without any, ``count`` are
+    virtual. ``size`` is the longer side of the images, pixels; larger ones are sampled."""
     if views is None or not views.train:
         side = size * 4 // 5
         virtual = scene_views(splats, context, width=side, height=side, count=count)
@@ -217,11 +211,9 @@ Pose = tuple[Vec3, Vec3]  # position and look-at target, world units
 
 
 def random_poses(splats: Splats, context: Context = DEFAULT_CONTEXT, *, side: int, count: int, seed: int = 0) -> Views:
-    """Return views for square images from random poses around every region of a scene; every 8th is held out.
-
-    The region with the largest share gets ``count`` of them; together there are at most :data:`MAX_COUNT_FACTOR` times
-    as many, and fewer where few poses show the scene.
-    """
+    """Return views for square images from random poses around every region of a scene; every 8th is held out. The
+    region with the largest share gets ``count`` of them; together there are at most :data:`MAX_COUNT_FACTOR` times as
+    many, and fewer where few poses show the scene."""
     check_images(count, side, side)
     rng = np.random.default_rng(seed)
     cameras: list[Camera] = []
