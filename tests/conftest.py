@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import helpers.examples  # registers the profiles of Hypothesis
-import helpers.shape_checks  # noqa: F401  # the hook names it
+import helpers.shape_checks  # the hook names it
 import pytest
 from helpers.servers import ray_cluster  # noqa: F401
 from jaxtyping import install_import_hook
@@ -66,6 +66,7 @@ AS_USERS_HAVE_IT = (
 @pytest.fixture(autouse=True)
 def fewer_and_smaller_images(request, monkeypatch):
     """Choose virtual cameras from fewer, and evaluate smaller images: they take most of the time for a small scene."""
+    helpers.shape_checks.checked.clear()
     folder = request.path.parent.name
     thorough = request.node.get_closest_marker("exhaustive") or request.path.stem in AS_USERS_HAVE_IT
     if folder in WITH_FEWER_CAMERAS or (folder in SMALLER_UNLESS_EXHAUSTIVE and not thorough):
