@@ -9,6 +9,7 @@ from pathlib import Path
 import helpers.examples  # registers the profiles of Hypothesis
 import helpers.shape_checks  # the hook names it
 import pytest
+from helpers.compile_once import compile_once
 from helpers.servers import ray_cluster  # noqa: F401
 from jaxtyping import install_import_hook
 
@@ -52,15 +53,17 @@ install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "h
 
 
 WITH_FEWER_CAMERAS = ("io", "sog", "sogxt", "extremes", "finetuning")
-SMALLER_UNLESS_EXHAUSTIVE = ("compaction", "evaluation", "pipeline", "planning", "streaming")
-AS_USERS_HAVE_IT = (
+SMALLER_UNLESS_EXHAUSTIVE = ("cli", "compaction", "evaluation", "pipeline", "planning", "streaming")
+AS_USERS_HAVE_IT = {
+    "test_bench",  # measures in another process
     "test_promises",
     "test_nothing_is_lost",
     "test_cameras",
     "test_overlooked",
     "test_html",
     "test_capture_fit",
-)
+    "test_ctrl_c_leaves_a_checkpoint_to_resume_from",  # the first part of the work is in another process
+}
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +71,10 @@ def fewer_and_smaller_images(request, monkeypatch):
     """Choose virtual cameras from fewer, and evaluate smaller images: they take most of the time for a small scene."""
     helpers.shape_checks.checked.clear()
     folder = request.path.parent.name
-    thorough = request.node.get_closest_marker("exhaustive") or request.path.stem in AS_USERS_HAVE_IT
+    thorough = (
+        request.node.get_closest_marker("exhaustive")
+        or {request.path.stem, request.function.__name__} & AS_USERS_HAVE_IT
+    )
     if folder in WITH_FEWER_CAMERAS or (folder in SMALLER_UNLESS_EXHAUSTIVE and not thorough):
         from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
 
@@ -94,6 +100,12 @@ def pytest_xdist_auto_num_workers():
     return processors() + 1
 
 
+def pytest_configure(config):
+    """Let one of several processes compile each kernel."""
+    if hasattr(config, "workerinput"):
+        compile_once(Path(config.option.basetemp).parent)
+
+
 def pytest_addoption(parser):
     """Add the option of continuous integration."""
     parser.addoption("--sixth", metavar="COMMIT", help="run a sixth of the exhaustive tests, chosen by the commit")
@@ -101,9 +113,14 @@ def pytest_addoption(parser):
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(config, items):
-    """Mark as exhaustive all but n sets of parameters of ``quick(n)``; with ``--sixth``, leave out five of six."""
+    """Mark as exhaustive all but n sets of parameters of ``quick(n)``; with ``--sixth``, leave out five of six.
+
+    One process runs all tests of the Ray cluster, whose start takes longer than most tests.
+    """
     sets = defaultdict[str, list[pytest.Item]](list)
     for item in items:
+        if "ray_cluster" in item.fixturenames or item.name.endswith(("[ray]", "-ray]")) or "[ray-" in item.name:
+            item.add_marker(pytest.mark.xdist_group("ray"))
         if item.get_closest_marker("quick"):
             sets[item.nodeid.partition("[")[0]].append(item)
     for group in sets.values():
