@@ -113,14 +113,9 @@ def pytest_addoption(parser):
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(config, items):
-    """Mark as exhaustive all but n sets of parameters of ``quick(n)``; with ``--sixth``, leave out five of six.
-
-    One process runs all tests of the Ray cluster, whose start takes longer than most tests.
-    """
+    """Mark as exhaustive all but n sets of parameters of ``quick(n)``; with ``--sixth``, leave out five of six."""
     sets = defaultdict[str, list[pytest.Item]](list)
     for item in items:
-        if "ray_cluster" in item.fixturenames or item.name.endswith(("[ray]", "-ray]")) or "[ray-" in item.name:
-            item.add_marker(pytest.mark.xdist_group("ray"))
         if item.get_closest_marker("quick"):
             sets[item.nodeid.partition("[")[0]].append(item)
     for group in sets.values():
