@@ -359,18 +359,19 @@ def read_ply_blocks(source: Path) -> Iterator[Splats]:
 
 
 def write_ply(
-    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent, comment: str = ""
 ) -> tuple[str, ...]:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
     Positions are those of the world: float64 (``property double``) where float32 cannot hold them. An antialiased scene
-    is marked by a comment, :data:`kissgs.io.ply_rows.MIP_COMMENT`.
+    is marked by a comment, :data:`kissgs.io.ply_rows.MIP_COMMENT`; ``comment`` is a further one.
     """
     splats = in_world(splats)
     wide = _POSITION if splats.origin != WORLD else ()
     n, k = len(splats), splats.shN.shape[1]
     names = (*_POSITION, *_NORMAL, *_COLOUR, *_rest(k), *_OPACITY, *_SCALE, *_ROTATION)
-    header = ["ply", "format binary_little_endian 1.0", *[MIP_COMMENT] * splats.antialiased, f"element vertex {n}"]
+    comments = [*[MIP_COMMENT] * splats.antialiased, *filter(None, [comment])]
+    header = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {n}"]
     header += [f"property {'double' if name in wide else 'float'} {name}" for name in names]
     file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
     for step in steps(n):

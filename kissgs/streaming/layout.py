@@ -15,8 +15,8 @@ from kissgs.io.files import atomic_file
 CONTEXT = 280_000
 """Largest number of Gaussians of the level that stands for other chunks where sensitivity is measured."""
 
-PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"
-"""Names in the work folder: the marker of the partition, the cameras, and the folder of the result."""
+PARTITION, CAMERAS, VIEW, OUT = "partition.json", "cameras.json", "view.json", "out"
+"""Names in the work folder: the marker of the partition, the cameras, the first view, and the folder of the result."""
 
 ENVIRONMENT = "environment"
 """Name of the environment's container."""

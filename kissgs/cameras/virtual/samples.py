@@ -18,6 +18,7 @@ from kissgs.cameras.virtual.candidates import (
     proxy_scene,
     scene_bounds,
 )
+from kissgs.cameras.virtual.first_view import Record, first_view
 from kissgs.cameras.virtual.select import (
     ScoredCandidates,
     score_candidates,
@@ -168,13 +169,20 @@ def _surrounding_cameras(bounds: SceneBounds, like: Camera) -> Iterator[Camera]:
 
 def scene_views(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: int, height: int, count: int) -> Views:
     """Return views of every region of a scene, more of regions that show more; every 8th is held out."""
+    return _scene_views(splats, context, width, height, count)[0]
+
+
+def _scene_views(
+    splats: Splats, context: Context, width: int, height: int, count: int
+) -> tuple[Views, ScoredCandidates]:
+    """Return :func:`scene_views`, and the candidates of the densest region."""
     check_images(count, width, height)
     with Workers(context.threads) as pool:
         regions = find_regions(splats, (width, height), pool, context.progress, camera_count=count)
     context.progress("cameras", 1.0)
     counts = allocate_cameras(regions, count)
     cameras = [camera for region, n in zip(regions, counts, strict=True) for camera in region.cameras(n)]
-    return split_views(with_size(cameras[:count], width, height))
+    return split_views(with_size(cameras[:count], width, height)), regions[0].candidates
 
 
 # Cameras of the sensitivity and of the colour refit: a capture's and some virtual ones, or virtual ones alone.
@@ -205,26 +213,27 @@ def sensitivity_cameras(
     *,
     count: int,
     size: int,
-) -> WeightedCameras:
-    """Return the cameras, each with its weight, that measure sensitivity and refit colours.
+) -> tuple[WeightedCameras, Record]:
+    """Return the cameras, each with its weight, that measure sensitivity and refit colours; and the first view.
 
     Of a capture, at most ``count`` training views are used, and two thirds as many virtual cameras are added; without
     any, ``count`` are virtual. ``size`` is the longer side of the images, pixels; larger ones are sampled.
     """
     if views is None or not views.train:
         side = size * 4 // 5
-        virtual = scene_views(splats, context, width=side, height=side, count=count)
+        virtual, candidates = _scene_views(splats, context, side, side, count)
         cameras = [_widened(view.camera) if n % 2 else view.camera for n, view in enumerate(virtual.all)]
-        return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
+        return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background), first_view(candidates)
     captured = [view.camera for view in views.train]
     chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
     selected = [captured[n].sampled_at_most(size) for n in chosen]  # virtual cameras see what is between the samples
     side = round(float(np.sqrt(selected[0].width * selected[0].height)))
-    virtual = scene_views(splats, context, width=side, height=side, count=max(1, count * 2 // 3))
+    virtual, candidates = _scene_views(splats, context, side, side, max(1, count * 2 // 3))
     weight = VIRTUAL_WEIGHT * len(selected) / len(virtual.all)
     cameras = [*selected, *(view.camera for view in virtual.all)]
     weights = [1.0] * len(selected) + [weight] * len(virtual.all)
-    return WeightedCameras(cameras, weights, views.background, captured=len(selected))
+    weighted = WeightedCameras(cameras, weights, views.background, captured=len(selected))
+    return weighted, first_view(candidates, selected)
 
 
 def _widened(camera: Camera) -> Camera:
