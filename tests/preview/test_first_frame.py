@@ -113,7 +113,7 @@ def test_narrow_windows_show_it_whole(files, opened):
 
 def test_without_a_possible_record_what_is_dense_is_framed(files, opened, tmp_path):
     tab, image = opened(with_view(files, None))
-    assert_whole(extent(tab, image), 0.12)
+    assert_whole(extent(tab, image), 0.2)  # what is near is larger
     assert colours(image) > 20
     _, other = opened(with_view(files, {**RECORD, "target": RECORD["eye"]}))
     assert psnr(image, other) > 50
@@ -121,4 +121,4 @@ def test_without_a_possible_record_what_is_dense_is_framed(files, opened, tmp_pa
     scene = page_scene(tmp_path / "scene.ply")
     assert b"\ncomment kissgs view {" in scene.data[:2000]
     tab, image = opened(scene)
-    assert_whole(extent(tab, image), 0.12)
+    assert_whole(extent(tab, image), 0.2)  # what is near is larger

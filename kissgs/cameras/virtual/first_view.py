@@ -104,8 +104,8 @@ def _captured_up(up: Vec3, cameras: list[Camera]) -> Vec3:
     """Return the scene's up direction if photographs are held like that or upside down, else their mean one."""
     mean = -np.mean([camera.viewmat[1, :3] for camera in cameras], axis=0)
     along = float(up @ mean)
-    if abs(along) > 0.5 * np.linalg.norm(mean):
-        return up if along > 0 else -up
+    if abs(along) >= 0.5 * np.linalg.norm(mean):
+        return up if along >= 0 else -up
     return np.asarray(mean / np.linalg.norm(mean))
 
 

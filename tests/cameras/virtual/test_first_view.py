@@ -62,7 +62,7 @@ def test_an_object_is_whole_upright_in_the_middle_and_seen_from_its_front():
 
 
 def test_a_head_with_more_gaussians_than_the_rest_is_up():
-    """Its density falls off downwards, and there is no ground: it was once shown upside down."""
+    """The density falls off downwards, and there is no ground: such a person was once shown upside down."""
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(9000, 3))
     ball = directions / np.linalg.norm(directions, axis=1, keepdims=True)
