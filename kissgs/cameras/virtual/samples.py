@@ -169,20 +169,20 @@ def _surrounding_cameras(bounds: SceneBounds, like: Camera) -> Iterator[Camera]:
 
 def scene_views(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: int, height: int, count: int) -> Views:
     """Return views of every region of a scene, more of regions that show more; every 8th is held out."""
-    return _scene_views(splats, context, width, height, count)[0]
+    check_images(count, width, height)
+    with Workers(context.threads) as pool:
+        return _scene_views(splats, (width, height), count, pool, context)[0]
 
 
 def _scene_views(
-    splats: Splats, context: Context, width: int, height: int, count: int
+    splats: Splats, size: tuple[int, int], count: int, pool: Workers, context: Context
 ) -> tuple[Views, ScoredCandidates]:
     """Return :func:`scene_views`, and the candidates of the densest region."""
-    check_images(count, width, height)
-    with Workers(context.threads) as pool:
-        regions = find_regions(splats, (width, height), pool, context.progress, camera_count=count)
+    regions = find_regions(splats, size, pool, context.progress, camera_count=count)
     context.progress("cameras", 1.0)
     counts = allocate_cameras(regions, count)
     cameras = [camera for region, n in zip(regions, counts, strict=True) for camera in region.cameras(n)]
-    return split_views(with_size(cameras[:count], width, height)), regions[0].candidates
+    return split_views(with_size(cameras[:count], *size)), regions[0].candidates
 
 
 # Cameras of the sensitivity and of the colour refit: a capture's and some virtual ones, or virtual ones alone.
@@ -221,19 +221,23 @@ def sensitivity_cameras(
     """
     if views is None or not views.train:
         side = size * 4 // 5
-        virtual, candidates = _scene_views(splats, context, side, side, count)
+        with Workers(context.threads) as pool:
+            virtual, candidates = _scene_views(splats, (side, side), count, pool, context)
+            opening = first_view(candidates)
         cameras = [_widened(view.camera) if n % 2 else view.camera for n, view in enumerate(virtual.all)]
-        return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background), first_view(candidates)
+        return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background), opening
     captured = [view.camera for view in views.train]
     chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
     selected = [captured[n].sampled_at_most(size) for n in chosen]  # virtual cameras see what is between the samples
     side = round(float(np.sqrt(selected[0].width * selected[0].height)))
-    virtual, candidates = _scene_views(splats, context, side, side, max(1, count * 2 // 3))
+    with Workers(context.threads) as pool:
+        virtual, candidates = _scene_views(splats, (side, side), max(1, count * 2 // 3), pool, context)
+        opening = first_view(candidates, selected)
     weight = VIRTUAL_WEIGHT * len(selected) / len(virtual.all)
     cameras = [*selected, *(view.camera for view in virtual.all)]
     weights = [1.0] * len(selected) + [weight] * len(virtual.all)
     weighted = WeightedCameras(cameras, weights, views.background, captured=len(selected))
-    return weighted, first_view(candidates, selected)
+    return weighted, opening
 
 
 def _widened(camera: Camera) -> Camera:

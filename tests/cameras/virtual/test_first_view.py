@@ -9,9 +9,11 @@ from helpers.fewer_cameras import try_fewer
 from helpers.hollow_scenes import box, surface
 
 import kissgs
+from kissgs.cameras.views import black
 from kissgs.cameras.virtual.first_view import first_view, first_view_of
+from kissgs.cameras.virtual.samples import sensitivity_cameras
 from kissgs.cameras.virtual.select import score_candidates
-from kissgs.core.context import silent
+from kissgs.core.context import Context, silent
 from kissgs.core.resources import Workers
 from kissgs.core.splats import concatenate
 from kissgs.rendering.camera import look_at
@@ -90,6 +92,9 @@ def test_of_a_capture_it_is_the_middle_one_of_the_cameras_that_show_the_object()
         assert np.array(record["up"]) @ -captured[0].viewmat[1, :3] > 0, "photographs are held upright"
         assert record["fov"] == round(np.degrees(2 * np.arctan(0.75 * np.tan(0.45))), 1)
     assert first_view(candidates, away) == first_view(candidates), "none shows it"
+    capture = kissgs.Views(tuple(kissgs.View(str(n), each) for n, each in enumerate(row)), (), black(), "a capture")
+    _, found = sensitivity_cameras(box(HALF, 3000, 0.1), capture, Context(2), count=9, size=64)
+    np.testing.assert_allclose(found["eye"], [0, 0, -4], atol=0.8)
 
 
 def test_numbers_are_short_and_fine_enough_far_from_the_origin():
