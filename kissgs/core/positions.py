@@ -248,9 +248,9 @@ def relative_to(origin: Origin) -> str:
     return "positions are relative to the point ({:,.0f}, {:,.0f}, {:,.0f})".format(*origin)
 
 
-def recorded(origin: Origin) -> dict[str, list[float]]:
-    """Return the entry of a container's metadata under the key "kissgs"; nothing for the origin of the world."""
-    return {} if origin == WORLD else {"origin": list(origin)}
+def recorded(origin: Origin, view: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return entries of a container's metadata under the key "kissgs": the view; the origin, if not the world's."""
+    return {**({} if origin == WORLD else {"origin": list(origin)}), **({} if view is None else {"view": view})}
 
 
 def read_origin(document: Mapping[str, Any], name: str) -> Origin:

@@ -315,17 +315,20 @@ def read_ply_blocks(source: Path) -> Iterator[Splats]:
                 waiting = []
 
 
-def write_ply(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
+def write_ply(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent, comment: str = ""
+) -> Notes:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
     Positions are those of the world: float64 (``property double``) where float32 cannot hold them. An antialiased scene
-    is marked by a comment (:func:`kissgs.io.ply_rows.header_bytes`)."""
+    is marked by a comment (:func:`kissgs.io.ply_rows.header_bytes`); ``comment`` is a further one."""
     splats = in_world(splats)
     wide = _POSITION if splats.origin != WORLD else ()
     n, k = len(splats), splats.shN.shape[1]
     rest_names = (f"f_rest_{i}" for i in range(3 * k))
     names = (*_POSITION, *_NORMAL, *_COLOUR, *rest_names, *_OPACITY, *_SCALE, *_ROTATION)
     properties = [f"property {'double' if name in wide else 'float'} {name}" for name in names]
-    file.write(header_bytes([f"element vertex {n}", *properties], splats.antialiased))
+    comments = [comment] * bool(comment)
+    file.write(header_bytes([*comments, f"element vertex {n}", *properties], splats.antialiased))
     for step in steps(n):
         part = splats.select(step)
         rest = part.shN.transpose(0, 2, 1).reshape(len(part), 3 * k)  # all of R, then G, then B

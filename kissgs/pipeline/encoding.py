@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -102,6 +103,7 @@ class Measured:
     splats: Splats
     sensitivity: Sensitivity | None = None
     recolor: ColorRefit | None = None
+    first_view: Mapping[str, Any] | None = None
 
 
 def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
@@ -119,7 +121,7 @@ def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     refits = captured and settings.color_refit_iterations > 0  # a refit to virtual cameras is worse than none
     if sensitivity is not None and not refits:
         return Measured(splats, sensitivity)
-    cameras = sensitivity_cameras(
+    cameras, first_view = sensitivity_cameras(
         splats,
         work.views,
         work.context,
@@ -135,12 +137,12 @@ def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     recolor = None
     if refits:
         recolor = _recolor(splats, cameras, sensitivity, settings.color_refit_iterations, work.context)
-    return Measured(splats, sensitivity, recolor)
+    return Measured(splats, sensitivity, recolor, first_view)
 
 
 def plan(work: Work, scene: Measured, settings: EncodeSettings, context: Context) -> EncodingPlan:
     """Decide all levels of a scene."""
-    return plan_encoding(
+    chosen = plan_encoding(
         scene.splats,
         settings,
         context,
@@ -149,6 +151,7 @@ def plan(work: Work, scene: Measured, settings: EncodeSettings, context: Context
         container=MODELS[work.container],
         keep_costs=bool(work.settings.finetune.enabled),
     )
+    return replace(chosen, scene=replace(chosen.scene, first_view=scene.first_view))
 
 
 def write(

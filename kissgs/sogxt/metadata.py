@@ -84,6 +84,8 @@ class Layout(BaseModel):
     origin: Origin = WORLD
     model: str | None = None
     """Variant of the renderer that the scene was made for, as in SOG: "antialiased", or None."""
+    first_view: dict[str, Any] | None = None
+    """View with which viewers open the scene; in ``meta.json`` only, and not read."""
     crc32: dict[str, Annotated[int, Field(ge=0, lt=1 << 32)]] = Field(default_factory=dict)
     """CRC-32 of each image's pixels (:func:`kissgs.io.images.pixels_crc32`); in ``meta.json`` only."""
 
@@ -176,7 +178,7 @@ class Layout(BaseModel):
             document["model"] = self.model
         if self.provenance:
             own = self.provenance.model_dump(include={"version", "sh_degree"})
-            document["kissgs"] = {**own, **recorded(self.origin), "crc32": self.crc32}
+            document["kissgs"] = {**own, **recorded(self.origin, self.first_view), "crc32": self.crc32}
             document[CHECKSUM] = self.checksum
         return json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -33,6 +34,7 @@ from kissgs.streaming.layout import (
     CAMERAS,
     ENVIRONMENT,
     OUT,
+    VIEW,
     ContainerFile,
     Layout,
     chunk_file,
@@ -247,7 +249,8 @@ def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: 
     least = min(MOST_VIEWS, VIEWS_PER_CHUNK * len(layout.filled))
     views = settings.sensitivity_views or max(default_view_count(total), least)
     size = settings.sensitivity_view_size
-    cameras = sensitivity_cameras(coarsest, None, Context(threads), count=views, size=size)
+    cameras, view = sensitivity_cameras(coarsest, None, Context(threads), count=views, size=size)
+    write_json(work / VIEW, view)  # before the cameras, which mark this step as done
     write_json(work / CAMERAS, [camera_as_dict(camera) for camera in cameras.cameras])
 
 
@@ -339,12 +342,13 @@ def make_manifest(work: Path, layout: Layout) -> None:
                 low, high = ([float(f"{value:.7g}") for value in corner] for corner in corners)
                 levels = {str(level): rows for level, rows in sorted(lods[chunk, leaf].items())}
                 leaves.append({"bound": {"min": low, "max": high}, "lods": levels, "errors": errors})
+    view = json.loads((work / VIEW).read_bytes()) if (work / VIEW).exists() else None
     has_environment = (work / OUT / layout.path(ENVIRONMENT)).exists()
     document = {
         "version": 1,
         **({"format": FORMAT} if layout.container == "sogxt" else {}),
         "asset": {"generator": f"kissgs {__version__}"},
-        **({"kissgs": own_origin} if (own_origin := recorded(layout.origin)) else {}),
+        **({"kissgs": facts} if (facts := recorded(layout.origin, view)) else {}),
         "count": totals[0],
         "counts": totals,
         "lodLevels": layout.levels,

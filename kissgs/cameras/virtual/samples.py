@@ -18,6 +18,7 @@ from kissgs.cameras.virtual.candidates import (
     proxy_scene,
     scene_bounds,
 )
+from kissgs.cameras.virtual.first_view import Record, first_view
 from kissgs.cameras.virtual.select import ScoredCandidates, score_candidates, select_diverse, split_views, with_size
 from kissgs.core.array_types import Bool, Float32, Int
 from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress
@@ -146,11 +147,18 @@ def scene_views(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: in
     """Return views of every region of a scene, more of regions that show more; every 8th is held out."""
     check_images(count, width, height)
     with Workers(context.threads) as pool:
-        regions = find_regions(splats, (width, height), pool, context.progress, camera_count=count)
+        return _scene_views(splats, (width, height), count, pool, context)[0]
+
+
+def _scene_views(
+    splats: Splats, size: tuple[int, int], count: int, pool: Workers, context: Context
+) -> tuple[Views, ScoredCandidates]:
+    """Return :func:`scene_views`, and the candidates of the densest region."""
+    regions = find_regions(splats, size, pool, context.progress, camera_count=count)
     context.progress("cameras", 1.0)
     counts = allocate_cameras(regions, count)
     cameras = [camera for region, n in zip(regions, counts, strict=True) for camera in region.cameras(n)]
-    return split_views(with_size(cameras[:count], width, height))
+    return split_views(with_size(cameras[:count], *size)), regions[0].candidates
 
 
 # Cameras of the sensitivity and of the colour refit: a capture's and some virtual ones, or virtual ones alone.
@@ -171,28 +179,33 @@ def default_view_count(gaussians: int) -> int:
 
 def sensitivity_cameras(
     splats: Splats, views: Views | None, context: Context = DEFAULT_CONTEXT, *, count: int, size: int
-) -> WeightedCameras:
-    """Return the cameras, each with its weight, that measure sensitivity and refit colours. Of a capture, at most
-    ``count`` training views are used, and two thirds as many virtual cameras are added; without any, ``count`` are
-    virtual. ``size`` is the longer side of the images, pixels; larger ones are sampled."""
+) -> tuple[WeightedCameras, Record]:
+    """Return the cameras, each with its weight, that measure sensitivity and refit colours; and the first view. Of a
+    capture, at most ``count`` training views are used, and two thirds as many virtual cameras are added; without any,
+    ``count`` are virtual. ``size`` is the longer side of the images, pixels; larger ones are sampled."""
     if views is None or not views.train:
         side = size * 4 // 5
-        virtual = scene_views(splats, context, width=side, height=side, count=count)
+        with Workers(context.threads) as pool:
+            virtual, candidates = _scene_views(splats, (side, side), count, pool, context)
+            opening = first_view(candidates)
         cameras = [view.camera for view in virtual.all]
         for n in range(1, len(cameras), 2):  # a wider field of view
             K = cameras[n].K.copy()
             K[[0, 1], [0, 1]] *= WIDE_FOCAL_SCALE
             cameras[n] = Camera(cameras[n].viewmat, K, cameras[n].width, cameras[n].height)
-        return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
+        return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background), opening
     captured = [view.camera for view in views.train]
     chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
     selected = [captured[n].sampled_at_most(size) for n in chosen]  # virtual cameras see what is between the samples
     side = round(float(np.sqrt(selected[0].width * selected[0].height)))
-    virtual = scene_views(splats, context, width=side, height=side, count=max(1, count * 2 // 3))
+    with Workers(context.threads) as pool:
+        virtual, candidates = _scene_views(splats, (side, side), max(1, count * 2 // 3), pool, context)
+        opening = first_view(candidates, selected)
     weight = VIRTUAL_WEIGHT * len(selected) / len(virtual.all)
     cameras = [*selected, *(view.camera for view in virtual.all)]
     weights = [1.0] * len(selected) + [weight] * len(virtual.all)
-    return WeightedCameras(cameras, weights, views.background, captured=len(selected))
+    weighted = WeightedCameras(cameras, weights, views.background, captured=len(selected))
+    return weighted, opening
 
 
 # Random poses, from where photographs might have been taken, to train or to measure losses with.
