@@ -22,17 +22,10 @@ from kissgs.rendering.rasterizer import need_cuda
 from kissgs.settings import CompactSettings
 from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, evaluation_only, supervision_views
 
-START_LOG2, MAX_LOG2 = -2.0, -0.1
-"""log2 of the first share of the Gaussians that a search tries, and of the largest one."""
-
-DROP_PER_HALVING = 0.4
-"""Drop of PSNR, decibels, that a search expects from half as many Gaussians; only for its first steps."""
-
-GRAIN_LOG2 = 1 / 64
-"""Shares are multiples of this, as log2: counts that differ by less than 1 % are not tried both."""
-
-TOLERANCE_DB = 0.02
-"""A search ends once the drop is at most this far below the allowed one, decibels."""
+START_LOG2, MAX_LOG2 = -2.0, -0.1  # log2 of the first share of the Gaussians, and of the largest one
+DROP_PER_HALVING = 0.4  # decibels that a search expects from half as many Gaussians, for its first steps
+GRAIN_LOG2 = 1 / 64  # shares are multiples of this, as log2: counts that differ by less than 1 % are not tried both
+TOLERANCE_DB = 0.02  # a search ends once the drop is at most this far below the allowed one, decibels
 
 NO_CHECKPOINT = "a search for a {} keeps no checkpoint; give a count or a ratio with it"
 
@@ -46,11 +39,9 @@ def compact_scene(
     evaluate: bool = False,
     checkpoint: Path | None = None,
 ) -> Compacted:
-    """Reduce the number of Gaussians to the budget of the settings; no more than that are returned unchanged.
-
-    With a capture, its training views train and score, and its held-out views evaluate. Without one, virtual views
-    train and score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate.
-    """
+    """Reduce the number of Gaussians to the budget of the settings; no more than that are returned unchanged. With a
+    capture, its training views train and score, and its held-out views evaluate. Without one, virtual views train and
+    score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate."""
     if not settings.enabled:
         raise UnsupportedError("missing the number of Gaussians to keep: give count, ratio or max_psnr_drop")
     if settings.auto_count:
@@ -65,16 +56,15 @@ def compact_scene(
     compactor = Popspa(splats, settings, chosen_views(splats, settings, views, context), context)
     if settings.max_psnr_drop is None:
         return _compacted(compactor, count, evaluate=evaluate, checkpoint=checkpoint)
-    return _search_drop(compactor, SearchEvaluation.of(splats, views, compactor.supervision), settings.max_psnr_drop)
+    compare = SearchEvaluation(splats, None if views is None else compactor.supervision.eval_views)
+    return _search_drop(compactor, compare, settings.max_psnr_drop)
 
 
 def unchanged(splats: Splats, reason: str) -> Compacted:
     """Return the scene with all its Gaussians and a report whose note gives the reason."""
     count = f"{len(splats):,} Gaussian{'' if len(splats) == 1 else 's'}"
     note = f"the scene has {count}, {reason}: it is unchanged"
-    report = CompactionReport(
-        source_count=len(splats), count=len(splats), target_source="nothing", source="", steps=(), note=note
-    )
+    report = CompactionReport(source_count=len(splats), count=len(splats), note=note)
     return Compacted(splats, np.arange(len(splats)), report)
 
 
@@ -90,14 +80,8 @@ def _merge(compactor: Popspa, count: int, *, evaluate: bool) -> Compacted:
     merged, index = merge_gaussians(compactor.splats, count, compactor.context)
     log.record("merge", merged)
     uses_views = evaluate or compactor.settings.max_psnr_drop is not None
-    report = CompactionReport(
-        source_count=len(compactor.splats),
-        count=count,
-        target_source="nothing",
-        source="",
-        steps=tuple(log.steps),
-        note=compactor.supervision.note if uses_views else "",
-    )
+    note, total = compactor.supervision.note if uses_views else "", len(compactor.splats)
+    report = CompactionReport(source_count=total, count=count, steps=tuple(log.steps), note=note)
     return Compacted(merged, index, report)
 
 

@@ -19,10 +19,8 @@ from kissgs.rendering.cpu.tiles import each_part, even
 
 @compiled("void(float32[:, ::1], float32[:, ::1], int64, int64, float64[:, ::1])")
 def covariances_of(quats: np.ndarray, scales: np.ndarray, first: int, last: int, out: np.ndarray) -> None:
-    """Compute the covariances (xx, xy, xz, yy, yz, zz) of rows ``first`` to ``last`` (exclusive).
-
-    Quaternions are w, x, y, z of unit length; scales are natural logarithms of standard deviations.
-    """
+    """Compute the covariances (xx, xy, xz, yy, yz, zz) of rows ``first`` to ``last`` (exclusive). Quaternions are w, x,
+    y, z of unit length; scales are natural logarithms of standard deviations."""
     turn = np.empty((3, 3))
     for n in range(first, last):
         w, x, y, z = np.float64(quats[n, 0]), np.float64(quats[n, 1]), np.float64(quats[n, 2]), np.float64(quats[n, 3])
@@ -87,10 +85,8 @@ def _quaternion(turn: np.ndarray, out: np.ndarray) -> None:
 def decompose(
     covariances: np.ndarray, rows: np.ndarray, first: int, last: int, quats: np.ndarray, scales: np.ndarray
 ) -> None:
-    """Compute rotation and log-scales of covariances by Jacobi's method, ``rows[first:last]``.
-
-    Scales of less than 1e-7 of the largest one are lost in rounding.
-    """
+    """Compute rotation and log-scales of covariances by Jacobi's method, ``rows[first:last]``. Scales of less than 1e-7
+    of the largest one are lost in rounding."""
     matrix, turn = np.empty((3, 3)), np.empty((3, 3))
     for at in range(first, last):
         n, from_ = rows[at], 0
@@ -153,10 +149,8 @@ def _overlaps(
     jx: float,
     jy: float,
 ) -> tuple[float, float]:
-    """Return the integrals of the products of a and b, and of all three images, over 2 pi.
-
-    Images have peak 1; ``a`` is at the origin, others at (x, y).
-    """
+    """Return the integrals of the products of a and b, and of all three images, over 2 pi. Images have peak 1; ``a`` is
+    at the origin, others at (x, y)."""
     xx, xy, yy = a[0] + b[0], a[1] + b[1], a[2] + b[2]
     determinant = max(xx * yy - xy * xy, 1e-12 * xx * yy)
     height = math.exp(-0.5 * _squared_distance(xx, xy, yy, determinant, bx, by))
@@ -205,14 +199,12 @@ def _fit(
     color_ij: float,
     contrast: float,
 ) -> tuple[float, float]:
-    """Return opacity and error of the joint Gaussian, sums over images along the three axes.
-
-    With the opacity, 1e-6 to 1 - 1e-6, it is nearest, in least squares, to the alpha ``a + b - a b`` of both together.
-    The error is the squared error, world units squared, of an image of it instead of both, whose alphas are
-    ``a (1 - b / 2)`` and ``b (1 - a / 2)``: the mean of both orders of depth. ``color_ii``, ``color_jj`` and
-    ``color_ij`` are squares and product of the colour differences of ``i`` and ``j`` from the joint colour, sums over
-    RGB; ``contrast`` is the squared contrast to what is behind.
-    """
+    """Return opacity and error of the joint Gaussian, sums over images along the three axes. With the opacity, 1e-6 to
+    1 - 1e-6, it is nearest, in least squares, to the alpha ``a + b - a b`` of both together. The error is the squared
+    error, world units squared, of an image of it instead of both, whose alphas are ``a (1 - b / 2)`` and ``b (1 - a /
+    2)``: the mean of both orders of depth. ``color_ii``, ``color_jj`` and ``color_ij`` are squares and product of the
+    colour differences of ``i`` and ``j`` from the joint colour, sums over RGB; ``contrast`` is the squared contrast to
+    what is behind."""
     alpha_i, alpha_j = alphas[i], alphas[j]
     aa = bb = ab = aab = abb = aabb = joint_ab = square = 0.0
     for axis in range(3):
@@ -278,11 +270,9 @@ def pair_errors(
     added: np.ndarray,
 ) -> None:
     """Compute what the error grows by if each pair merges, pairs ``first`` to ``last`` (exclusive), into ``added``.
-
     Errors of repeated merges are alike: their amplitudes add. The mean over all directions of a squared colour
     difference is the sum of squared differences of the SH coefficients, divided by 4 pi. ``blur`` is in units of
-    ``spacing``, the squared distances to neighbours; ``contrast`` is the squared one to what is behind, over RGB.
-    """
+    ``spacing``, the squared distances to neighbours; ``contrast`` is the squared one to what is behind, over RGB."""
     mean, covariance = np.empty(3), np.empty(6)
     for at in range(first, last):
         i, j = pairs[at, 0], pairs[at, 1]
@@ -347,35 +337,21 @@ def merge(
 # No image is rendered. What a merge costs is the squared error of its image, in closed form;
 # the cheapest pairs merge first.
 
-NEIGHBOURS = 8
-"""Number of nearest neighbours that a Gaussian may merge with."""
-
-SPACING_RANK = 3
-"""Neighbour, from 0, whose distance is the spacing of the Gaussians."""
-
-BLUR = 0.01
-"""Variance of the blur of the compared images, in squared spacings: viewers stand where they cannot tell neighbours
-much smaller than their distance apart."""
-
-CONTRAST = 0.09
-"""Squared contrast of Gaussians to what is behind them, a sum over RGB in [0, 1]."""
-
-BLOCK = 65536
-"""Number of Gaussians whose colours are moved at a time."""
-
-LARGEST_STEP = 0.3
-"""Largest share of the Gaussians that disappears before neighbours and errors are computed anew."""
+NEIGHBOURS = 8  # number of nearest neighbours that a Gaussian may merge with
+SPACING_RANK = 3  # neighbour, from 0, whose distance is the spacing of the Gaussians
+BLUR = 0.01  # variance of the blur of compared images, squared spacings: viewers do not stand nearer
+CONTRAST = 0.09  # squared contrast of Gaussians to what is behind them, a sum over RGB in [0, 1]
+BLOCK = 65536  # number of Gaussians whose colours are moved at a time
+LARGEST_STEP = 0.3  # largest share of the Gaussians that disappears before neighbours and errors are computed anew
 
 
 def merge_gaussians(
     splats: Splats, count: int, context: Context = DEFAULT_CONTEXT
 ) -> tuple[Splats, Int64[np.ndarray, " M"]]:
-    """Reduce a scene to ``count`` Gaussians by merging.
-
-    Merged Gaussians keep mean, covariance and mean colour of the mixture, weighted by opacity times area, and get the
-    opacity that is nearest to the alpha of both together. Gaussians that are not merged stay exactly as they are.
-    Returns the scene, and of each of its Gaussians the index of the heaviest among those it stands for, ascending.
-    """
+    """Reduce a scene to ``count`` Gaussians by merging. Merged Gaussians keep mean, covariance and mean colour of the
+    mixture, weighted by opacity times area, and get the opacity that is nearest to the alpha of both together.
+    Gaussians that are not merged stay exactly as they are. Returns the scene, and of each of its Gaussians the index of
+    the heaviest among those it stands for, ascending."""
     with Workers(context.threads) as pool:
         clusters = _Clusters(splats, pool)
         for left in clusters.reduce(count):
@@ -385,10 +361,8 @@ def merge_gaussians(
 
 
 def merged_levels(splats: Splats, counts: Sequence[int], *, threads: int = 0) -> list[Splats]:
-    """Reduce a scene to each of ``counts``, which descend, each result by merging the one before further.
-
-    Arguments and results are those of :func:`merge_gaussians`.
-    """
+    """Reduce a scene to each of ``counts``, which descend, each result by merging the one before further. Arguments and
+    results are those of :func:`merge_gaussians`."""
     with Workers(threads) as pool:
         clusters, levels = _Clusters(splats, pool), []
         for count in counts:
@@ -399,10 +373,8 @@ def merged_levels(splats: Splats, counts: Sequence[int], *, threads: int = 0) ->
 
 
 class _Clusters:
-    """The Gaussians that are left, each of which stands for one or more of the input.
-
-    Neighbours have rows near each other, which processors read faster.
-    """
+    """The Gaussians that are left, each of which stands for one or more of the input. Neighbours have rows near each
+    other, which processors read faster."""
 
     def __init__(self, source: Splats, pool: Workers) -> None:
         count, self.source, self.pool = len(source), source, pool
@@ -458,10 +430,7 @@ class _Clusters:
         pairs = pairs[: unique_pairs(near, pairs)]
         added = np.empty(len(pairs))
         gaussians = self.means, self.covariances, self.alphas, self.colors, weights, spacing
-        self._each(
-            len(pairs),
-            lambda a, b: pair_errors(*gaussians, self.errors, BLUR, CONTRAST, pairs, a, b, added),
-        )
+        self._each(len(pairs), lambda a, b: pair_errors(*gaussians, self.errors, BLUR, CONTRAST, pairs, a, b, added))
         chosen = np.empty(count, np.int64)
         order = np.argsort(added, kind="stable")
         chosen = chosen[: choose(order, pairs, len(self.means), chosen)]

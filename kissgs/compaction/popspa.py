@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 
 # Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.1).
 
-BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
-"""Learning rates of 3DGS by parameter; that of positions is in units of the extent of the cameras around each."""
+BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}  # of 3DGS
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +57,8 @@ def first_pruning_count(settings: CompactSettings, source_count: int, count: int
 
 
 def training_phases(settings: CompactSettings, source_count: int, count: int) -> list[Phase]:
-    """Return all phases of training: one before each further pruning, then refinement; none if nothing is trained.
-
-    The prunings are spread evenly over ``sparsify_steps``, and each keeps the same share of the Gaussians.
-    """
+    """Return all phases of training: one before each further pruning, then refinement; none if nothing is trained. The
+    prunings are spread evenly over ``sparsify_steps``, and each keeps the same share of the Gaussians."""
     phases = []
     if settings.sparsify_steps:
         rounds = min(settings.prune_rounds, settings.sparsify_steps)
@@ -75,10 +72,8 @@ def training_phases(settings: CompactSettings, source_count: int, count: int) ->
 
 
 def stage_progress(progress: Progress, phases: Sequence[Phase], number: int) -> Progress:
-    """Return a receiver that reports phase ``number`` and the pruning after it as a part of one stage.
-
-    All phases of the same name, and the prunings after them, are one stage of that name.
-    """
+    """Return a receiver that reports phase ``number`` and the pruning after it as a part of one stage. All phases of
+    the same name, and the prunings after them, are one stage of that name."""
     name = phases[number].name
     before = sum(phase.steps for phase in phases[:number] if phase.name == name)
     total = sum(phase.steps for phase in phases if phase.name == name)
@@ -91,16 +86,12 @@ def stage_progress(progress: Progress, phases: Sequence[Phase], number: int) -> 
 
 
 def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> LrSchedule:
-    """Return learning rates: constant while Gaussians are pruned, falling exponentially during refinement.
-
-    3DGS does the latter for positions only. ``target_source`` is that of the training targets: "photos" or
-    "renderings".
-    """
+    """Return learning rates: constant while Gaussians are pruned, falling exponentially during refinement. 3DGS does
+    the latter for positions only. ``target_source`` is that of the training targets: "photos" or "renderings"."""
     from kissgs.training.loop import exponential_lr
 
-    base = dict(BASE_LR)
-    if target_source == "renderings":
-        base = {name: rate * settings.synthetic_lr_scale for name, rate in base.items()}
+    scale = settings.synthetic_lr_scale if target_source == "renderings" else 1.0
+    base = {name: rate * scale for name, rate in BASE_LR.items()}
     begin = {name: settings.means_lr_scale if name == "means" else settings.lr_scale for name in base}
     end = {name: settings.final_means_lr_scale if name == "means" else settings.final_lr_scale for name in base}
     return exponential_lr(base, begin, end if phase.name == "refine" else begin)
@@ -108,11 +99,8 @@ def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> 
 
 # Checkpoint of a compaction: the status beside the state of the training.
 
-State = Mapping[str, np.ndarray]
-"""Arrays of a checkpoint by name."""
-
-STATUS_ENTRY = "status"
-"""Name of the array that holds the status as JSON; part of the file format."""
+State = Mapping[str, np.ndarray]  # arrays of a checkpoint by name
+STATUS_ENTRY = "status"  # name of the array that holds the status as JSON; part of the file format
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,12 +113,10 @@ class Status:
     steps: Sequence[CompactionStep]
 
     def as_state(self) -> State:
-        """Return the status as an array for the checkpoint, see :meth:`from_state`."""
         return {STATUS_ENTRY: np.frombuffer(json.dumps(asdict(self)).encode(), np.uint8)}
 
     @classmethod
     def from_state(cls, state: State) -> Status:
-        """Return the status in a checkpoint."""
         values = json.loads(state[STATUS_ENTRY].tobytes())
         return cls(**{**values, "steps": [CompactionStep(**step) for step in values["steps"]]})
 
@@ -168,10 +154,8 @@ class StepLog:
 
 @dataclass(slots=True, eq=False)
 class Popspa:
-    """Compacts one scene by POPSpa.
-
-    On the device "cuda", sums have no fixed order, so that results vary slightly. Scores are computed on the CPU.
-    """
+    """Compacts one scene by POPSpa. On the device "cuda", sums have no fixed order, so that results vary slightly.
+    Scores are computed on the CPU."""
 
     splats: Splats
     settings: CompactSettings  # their budget is ignored
@@ -180,16 +164,15 @@ class Popspa:
     targets: TrainingTargets | None = None  # of these views; loaded or rendered when first needed
 
     def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
-        """Return the scene with exactly ``count`` Gaussians; ``evaluate`` measures every step.
-
-        Training continues from ``checkpoint`` if that exists and belongs to this work, on the CPU with the same result
-        as without an interruption. It stays at the end.
-        """
+        """Return the scene with exactly ``count`` Gaussians; ``evaluate`` measures every step. Training continues from
+        ``checkpoint`` if that exists and belongs to this work, on the CPU with the same result as without an
+        interruption. It stays at the end."""
         if self.settings.trains:
             self.load_targets()
         key = "" if checkpoint is None else self._key(count, evaluate)
         log = StepLog(self.evaluate if evaluate else None)
-        compacted = _Run(self, count, Checkpoint(checkpoint, key), log).run()
+        training = SceneTraining(self, np.arange(len(self.splats)))
+        compacted = _Run(self, count, Checkpoint(checkpoint, key), log, training).run()
         return replace(compacted, checkpoint=checkpoint) if self.settings.trains else compacted
 
     def evaluate(self, scene: Splats) -> tuple[ImageMetrics, int]:
@@ -230,16 +213,11 @@ class Popspa:
 
 # ``SceneTraining``: a scene that is pruned and trained in turn, and its state.
 
-MIN_RELATIVE_EXTENT = 1e-4
-"""Extent of the cameras, in radii of the scene, up to which they count as being at one position: a rotating camera,
-whose extent is 0 except for rounding."""
+MIN_RELATIVE_EXTENT = 1e-4  # of cameras, in radii of the scene, up to which they count as one rotating camera
+MOST_STEP_PER_SIZE = 0.025  # largest rate of a position over the Gaussian's size, the middle of its scales
 
-MOST_STEP_PER_SIZE = 0.025
-"""Largest learning rate of a position, in units of the Gaussian's size: the middle one of its three scales."""
-
+# Lowest score, in units of what an unobstructed camera nearby would find: True with a capture.
 MIN_SCORE = {True: 0.05, False: 0.3}
-"""Lowest score, in units of the score that an unobstructed camera nearby would find: True with a capture, whose cameras
-show what matters, False for virtual views."""
 
 
 @dataclass(slots=True, eq=False)
@@ -247,11 +225,8 @@ class SceneTraining:
     """Prunes and trains the scene of a compactor, step by step."""
 
     compactor: Popspa
-    index: Int[np.ndarray, " M"] = field(init=False)  # in that scene, of each Gaussian that is left, ascending
+    index: Int[np.ndarray, " M"]  # in that scene, of each Gaussian that is left, ascending
     _model: GaussianModel | None = field(init=False, default=None)
-
-    def __post_init__(self) -> None:
-        self.index = np.arange(len(self.compactor.splats))
 
     def __len__(self) -> int:
         return len(self.index)
@@ -262,30 +237,18 @@ class SceneTraining:
         assert self._model is not None  # noqa: S101  callers begin first
         return self._model
 
-    @property
-    def begun(self) -> bool:
-        """Whether the scene is trainable."""
-        return self._model is not None
-
     def splats(self) -> Splats:
-        """Return the current scene."""
         if self._model is not None:
-            return self.trained.splats()
+            return self._model.splats()
         source = self.compactor.splats
         return source if len(self) == len(source) else source.select(self.index)
 
     def prune(self, count: int, context: Context) -> None:
         """Keep the ``count`` Gaussians that images would miss most; reports the stage "score"."""
         views = self.compactor.supervision
-        kept = prune_by_score(
-            self.splats(),
-            views.score,
-            views.background,
-            count,
-            context,
-            min_keep_per_scoring=self.compactor.settings.min_keep_per_scoring,
-            min_score=MIN_SCORE[views.captured],
-        )
+        share, least = self.compactor.settings.min_keep_per_scoring, MIN_SCORE[views.captured]
+        limits = {"min_keep_per_scoring": share, "min_score": least}
+        kept = prune_by_score(self.splats(), views.score, views.background, count, context, **limits)
         self.index = self.index[kept]
         if self._model is not None:
             self._model.keep(kept)
@@ -303,9 +266,9 @@ class SceneTraining:
         self.index, device = index, self.compactor.context.device
         self._model = GaussianModel.restored(state, self.compactor.splats, device, self._position_extents())
 
-    def state(self) -> State:
-        """Return a copy of the state of the training, see :meth:`restore`."""
-        return {name: array.copy() for name, array in self.trained.state().items()}
+    def state(self) -> State | None:
+        """Return a copy of the state of the training, see :meth:`restore`; None before it."""
+        return None if self._model is None else {name: each.copy() for name, each in self._model.state().items()}
 
     def train(
         self,
@@ -318,12 +281,14 @@ class SceneTraining:
         after: Callable[[int], None] = lambda done: None,
     ) -> None:
         """Train for a phase, in fewer steps where the deadline is near; each ``number`` has another order of images.
-
-        The other arguments are those of :func:`kissgs.training.loop.train`.
-        """
+        The other arguments are those of :func:`kissgs.training.loop.train`."""
+        from kissgs.compaction.regularizers import ShapeRegularizer
         from kissgs.training.loop import TrainingPlan, train
 
         settings, targets = self.compactor.settings, self.compactor.load_targets()
+        if settings.erank_weight or settings.min_scale_weight:
+            shapes = ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent())
+            regularizers = (shapes, *regularizers)
         plan = TrainingPlan(
             stage=phase.name,
             pace=Pace(phase.steps, context.deadline),
@@ -331,17 +296,9 @@ class SceneTraining:
             ssim_weight=settings.ssim_weight,
             mse_weight=settings.mse_weight,
             seed=(settings.seed, number),
-            regularizers=(*self._shape_regularizers(), *regularizers),
+            regularizers=regularizers,
         )
         train(self.trained, targets, plan, context, first=first, after=after)
-
-    def _shape_regularizers(self) -> tuple[Regularizer, ...]:
-        settings = self.compactor.settings
-        if not (settings.erank_weight or settings.min_scale_weight):
-            return ()
-        from kissgs.compaction.regularizers import ShapeRegularizer
-
-        return (ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent()),)
 
     def _camera_extent(self) -> float:
         """Return the extent of the cameras, world units; the scene's radius if they are nearly at one position."""
@@ -349,11 +306,9 @@ class SceneTraining:
         return extent if extent > MIN_RELATIVE_EXTENT * radius else radius
 
     def _position_extents(self) -> Float32[np.ndarray, " M"]:
-        """Return the unit of the position learning rate of each Gaussian, from its position and size in the source.
-
-        The rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size,
-        and positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes.
-        """
+        """Return the unit of the position learning rate of each Gaussian, from its position and size in the source. The
+        rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size, and
+        positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes."""
         settings, source = self.compactor.settings, self.compactor.splats
         extents = self.compactor.load_targets().local_extents(source.means[self.index], self._camera_extent())
         sizes = np.exp(np.median(source.scales[self.index].astype(np.float64), axis=1))
@@ -369,11 +324,8 @@ class _Run:
     count: int
     checkpoint: Checkpoint
     log: StepLog
-    training: SceneTraining = field(init=False)
+    training: SceneTraining
     checkpoint_note: str = field(init=False, default="")
-
-    def __post_init__(self) -> None:
-        self.training = SceneTraining(self.compactor)
 
     def run(self) -> Compacted:
         """Do all steps, or those that remain after the checkpoint."""
@@ -392,8 +344,7 @@ class _Run:
 
     def _start(self) -> tuple[int, int, State]:
         """Do the first pruning, or load the checkpoint; return the current phase, its steps done, and the state."""
-        compactor = self.compactor
-        state = self.checkpoint.load()
+        compactor, state = self.compactor, self.checkpoint.load()
         if state is not None:
             status = Status.from_state(state)
             self.training.restore(state, state["index"])
@@ -405,7 +356,6 @@ class _Run:
         return 0, 0, {}
 
     def _first_pruning(self, count: int) -> None:
-        """Prune the input to ``count`` Gaussians."""
         self.log.record("input", self.compactor.splats)
         self.training.prune(count, self.compactor.context)
         self.log.record("prune", self.training.splats())
@@ -421,14 +371,8 @@ class _Run:
 
         progress = stage_progress(self.compactor.context.progress, phases, number)
         context = replace(self.compactor.context, progress=progress, deadline=None)  # a given count takes all steps
-        training.train(
-            phase,
-            number,
-            context,
-            regularizers=() if sparsifier is None else (sparsifier,),
-            first=done,
-            after=save_if_due,
-        )
+        regularizers = () if sparsifier is None else (sparsifier,)
+        training.train(phase, number, context, regularizers=regularizers, first=done, after=save_if_due)
         self.log.record(phase.name, training.splats())
         if len(training) > phase.count:
             training.prune(phase.count, context)
@@ -448,8 +392,7 @@ class _Run:
 
     def _save(self, number: int, done: int, sparsifier_state: State) -> None:
         """Save the state in phase ``number`` after ``done`` of its steps."""
-        status = Status(number, done, self.log.seconds, self.log.steps)
-        training = self.training
+        status, training = Status(number, done, self.log.seconds, self.log.steps), self.training
         state = {**training.trained.state(), **sparsifier_state, "index": training.index, **status.as_state()}
         try:
             self.checkpoint.save(state)
@@ -473,14 +416,11 @@ class _Run:
 
 # ``TrainingPath``: one training through falling numbers of Gaussians, which can be completed at any of them.
 
-REFINEMENT = 1_000_000
-"""Number of the refinement in seeds: no path has as many points."""
+REFINEMENT = 1_000_000  # number of the refinement in seeds: no path has as many points
 
+# Training steps at a point by the targets, in units of those between two prunings of a compaction to one number. At
+# points that are passed on the way to another, one unit serves (docs/method/research-log.md, "More training").
 POINT_STEPS = {"photos": 3, "renderings": 1}
-"""Training steps at a point by the targets, in units of those between two prunings of a compaction to one number.
-
-At points that are passed on the way to another, one unit serves (docs/method/research-log.md, "More training").
-"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -500,11 +440,9 @@ class PathPoint:
 
 @dataclass(slots=True, eq=False)
 class TrainingPath:
-    """Prunes and trains a scene in turn, and keeps the scene at every number of Gaussians.
-
-    Learning rates stay high along the path. :meth:`compacted` lets them fall from any of its points, which a compaction
-    to that number alone would do at its end. So several numbers of Gaussians share one training.
-    """
+    """Prunes and trains a scene in turn, and keeps the scene at every number of Gaussians. Learning rates stay high
+    along the path. :meth:`compacted` lets them fall from any of its points, which a compaction to that number alone
+    would do at its end. So several numbers of Gaussians share one training."""
 
     compactor: Popspa
     keep_states: bool = True  # every point, not just the last one, can be refined: that takes three times the memory
@@ -516,21 +454,17 @@ class TrainingPath:
         self.points = [self.whole]
 
     def prune(self, count: int) -> PathPoint:
-        """Prune to ``count`` Gaussians, and return the new point; reports the stages "kernels" and "score".
-
-        If a progress receiver raises here or in :meth:`train`, the path stays as it was.
-        """
+        """Prune to ``count`` Gaussians, and return the new point; reports the stages "kernels" and "score". If a
+        progress receiver raises here or in :meth:`train`, the path stays as it was."""
         load_kernels(self.compactor.context.progress)
         training = self._at(self.points[-1])
         training.prune(count, self.compactor.context)
         return self._add(training, len(self.points), 0)
 
     def train(self, *, passed: bool = False, deadline: Deadline | None = None) -> PathPoint:
-        """Train the last point, and return it; reports "sparsify".
-
-        :data:`POINT_STEPS` times ``sparsify_steps / prune_rounds`` steps are made in all, rounded down, or a single
-        time as many if it is ``passed`` on the way to another; with a deadline, as many of them as fit in.
-        """
+        """Train the last point, and return it; reports "sparsify". :data:`POINT_STEPS` times ``sparsify_steps /
+        prune_rounds`` steps are made in all, rounded down, or a single time as many if it is ``passed`` on the way to
+        another; with a deadline, as many of them as fit in."""
         compactor, point = self.compactor, self.points[-1]
         if compactor.settings.sparsify_steps == 0:
             return point
@@ -549,10 +483,8 @@ class TrainingPath:
         return self._add(training, point.number, made[-1])
 
     def compacted(self, point: PathPoint, *, refine: bool, deadline: Deadline | None = None) -> Compacted:
-        """Return a point as a compacted scene; ``refine`` completes its training with falling learning rates.
-
-        With a ``deadline``, as many of its steps are made as fit in; reports the stage "refine".
-        """
+        """Return a point as a compacted scene; ``refine`` completes its training with falling learning rates. With a
+        ``deadline``, as many of its steps are made as fit in; reports the stage "refine"."""
         compactor, splats = self.compactor, point.splats
         if refine and compactor.settings.refine_steps:
             training = self._at(point)
@@ -566,22 +498,21 @@ class TrainingPath:
             count=len(splats),
             target_source=compactor.load_targets().target_source if point.trained or refine else "nothing",
             source=compactor.supervision.source,
-            steps=(),
             note=compactor.supervision.note,
         )
         return Compacted(splats, point.index, report)
 
     def _at(self, point: PathPoint) -> SceneTraining:
-        training = SceneTraining(self.compactor)
-        training.index = point.index
+        training = SceneTraining(self.compactor, point.index)
         if point.state is not None:
             training.restore(point.state, point.index)
         return training
 
     def _add(self, training: SceneTraining, number: int, steps: int) -> PathPoint:
         """Add the state of a training as the last point."""
-        state = training.state() if training.begun else None
+        state = training.state()
         if self.points and not self.keep_states:
             self.points[-1] = replace(self.points[-1], state=None)
-        self.points.append(PathPoint(number, training.splats(), training.index, training.begun, steps, state))
+        trained = state is not None
+        self.points.append(PathPoint(number, training.splats(), training.index, trained, steps, state))
         return self.points[-1]

@@ -14,11 +14,9 @@ from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompactionStep:
-    """One step of a compaction, and the scene after it; quality and size are None if not requested.
-
-    PSNR is the mean over held-out views, to their photographs; without photographs, over cameras drawn over the whole
-    scene, to renderings of the input, so that the input itself has infinity.
-    """
+    """One step of a compaction, and the scene after it; quality and size are None if not requested. PSNR is the mean
+    over held-out views, to their photographs; without photographs, over cameras drawn over the whole scene, to
+    renderings of the input, so that the input itself has infinity."""
 
     name: str  # "input", "prune", "merge", "sparsify" or "refine"
     count: int
@@ -66,9 +64,9 @@ class CompactionReport:
 
     source_count: int
     count: int
-    target_source: str
-    source: str
-    steps: tuple[CompactionStep, ...]
+    target_source: str = "nothing"
+    source: str = ""
+    steps: tuple[CompactionStep, ...] = ()
     trials: tuple[CountTrial, ...] = ()
     cleaned: Cleaned = NOTHING_CLEANED
     cpu_seconds: float = 0.0

@@ -35,13 +35,11 @@ def prune_by_score(
     min_score: float = 0.0,
 ) -> Int[np.ndarray, " M"]:
     """Return the indices of the ``count`` Gaussians to keep: those whose removal would change the images most.
-
     GaussianPOP, section 3, with mean squared errors, so that every image has the same weight whatever its size. A score
     is the error of a single removal: of two Gaussians, one behind the other, each may be superfluous only while the
     other is there. So deep pruning is done in rounds that remove the same share each, and the remaining Gaussians are
     scored anew after each. No round leaves less than ``min_keep_per_scoring`` of them (0: a single round), and no score
-    is below ``min_score`` of what an unobstructed camera nearby would find.
-    """
+    is below ``min_score`` of what an unobstructed camera nearby would find."""
     kept = np.arange(len(splats))
     close_up = Coverage(splats).close_up
     share = min_keep_per_scoring
@@ -84,11 +82,9 @@ def _mean_scores(
 
 
 def _nearby_scores(scores: Float[np.ndarray, " N"], close_up: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """Estimate the score that an unobstructed camera near each Gaussian would find.
-
-    It is taken as proportional to ``close_up``, see :attr:`kissgs.rendering.sensitivity.Coverage.close_up`; the factor
-    is the median over the Gaussians that were seen, or 1 if none was.
-    """
+    """Estimate the score that an unobstructed camera near each Gaussian would find. It is taken as proportional to
+    ``close_up``, see :attr:`kissgs.rendering.sensitivity.Coverage.close_up`; the factor is the median over the
+    Gaussians that were seen, or 1 if none was."""
     seen = (scores > 0) & (close_up > 0)
     if not seen.any():
         return close_up

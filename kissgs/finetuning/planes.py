@@ -25,14 +25,14 @@ from kissgs.planning.sh_codebook import COEFFICIENTS
 # Numba kernels of fine-tuning: one pass over the levels in place of a dozen operations with arrays in float64.
 
 T = TypeVar("T")
+Ctx = Any  # context of a torch.autograd.Function
 
-PART = 1 << 16
-"""Number of rows that a thread processes at a time; sums of parts are added in order."""
+PART = 1 << 16  # number of rows that a thread processes at a time; sums of parts are added in order
 
 
-def each_part(work: Callable[[int, int], T], rows: int, threads: int) -> list[T]:
+def each_part(work: Callable[[int, int], T], rows: int) -> list[T]:
     """Call ``work`` with the first row of each part and the end of its rows; return the results in order."""
-    with Workers(threads) as pool:
+    with Workers(torch.get_num_threads()) as pool:
         return pool.map(lambda first: work(first, min(first + PART, rows)), range(0, rows, PART))
 
 
@@ -158,14 +158,9 @@ def sum_by_label(
 
 # Levels of a field in training, and the tables whose values are trained.
 
-FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")
-"""Trained fields of an encoding plan."""
-
-TABLES = ("scales", "f_dc", "f_rest_centroids")
-"""Fields whose tables are trained, in a container with tables."""
-
-REACH = 0.45
-"""Largest change of a value of a table, in units of the distance to its neighbour, so that the order stays."""
+FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")  # trained
+TABLES = ("scales", "f_dc", "f_rest_centroids")  # fields whose tables are trained, in a container with tables
+REACH = 0.45  # largest change of a value of a table, in units of the distance to its neighbour, so that the order stays
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,23 +200,21 @@ class _Short(torch.autograd.Function):
     """Values rounded to the digits that are stored; the gradient ignores the rounding."""
 
     @staticmethod
-    def forward(ctx: Any, values: Float64[Tensor, " L"]) -> Float64[Tensor, " L"]:  # noqa: ANN401
+    def forward(ctx: Ctx, values: Float64[Tensor, " L"]) -> Float64[Tensor, " L"]:
         short = short_values(values.detach().cpu().numpy().astype(np.float32)).astype(np.float64)
         return torch.from_numpy(short).to(values.device)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float64[Tensor, " L"]) -> Float64[Tensor, " L"]:  # noqa: ANN401
+    def backward(ctx: Ctx, gradient: Float64[Tensor, " L"]) -> Float64[Tensor, " L"]:
         return gradient
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
-    """One field: maps latents to levels to values of its table.
-
-    A row uses some of the levels, which are a list. A latent beside each level is in units of the distance to the next
-    level of the list, so it is rounded to the level of the nearest value.
-    """
+    """One field: maps latents to levels to values of its table. A row uses some of the levels, which are a list. A
+    latent beside each level is in units of the distance to the next level of the list, so it is rounded to the level of
+    the nearest value."""
 
     field: Quantized  # levels of the plan; one row per Gaussian, or per entry of the codebook
     base_multiples: Float64[Tensor, "R C"]  # place of each level of the plan in the list of its row
@@ -243,11 +236,9 @@ class Plane:
         usable: tuple[int, int] = (0, SIZE - 1),
         largest_gap: float = np.inf,
     ) -> Plane:
-        """Return the plane of a field whose rows use the levels of the ``lists`` with these ``numbers``.
-
-        No latent crosses a larger distance of values than ``largest_gap``: a step over a wider one, as between the flat
-        and the thick axes of discs, would make a different Gaussian.
-        """
+        """Return the plane of a field whose rows use the levels of the ``lists`` with these ``numbers``. No latent
+        crosses a larger distance of values than ``largest_gap``: a step over a wider one, as between the flat and the
+        thick axes of discs, would make a different Gaussian."""
         starts = np.cumsum([1] + [len(levels) + 2 for levels in lists])
         lowest, highest = np.empty(field.levels.shape, np.int64), np.empty(field.levels.shape, np.int64)
         place = np.empty(field.levels.shape, np.int64)
@@ -262,10 +253,8 @@ class Plane:
 
     @classmethod
     def even(cls, field: Quantized, device: Device, *, freeze_top: bool = False) -> Plane:
-        """Return the plane of a field with even levels, of which a row uses the multiples of its stride.
-
-        A level that is no multiple of its stride starts at the nearest multiple.
-        """
+        """Return the plane of a field with even levels, of which a row uses the multiples of its stride. A level that
+        is no multiple of its stride starts at the nearest multiple."""
         levels, offset = field.levels.astype(np.int64), field.level_offset
         stride = np.asarray(field.level_stride, np.int64)
         stride = np.broadcast_to(stride if stride.ndim == 2 else stride.reshape(-1, 1), levels.shape)
@@ -326,19 +315,13 @@ class Plane:
         factor: float,
     ) -> None:
         """Add ``factor`` times the gradient of the quadratic attraction of each latent to its current level.
-
-        ``weights`` are the curvature of the loss by the values.
-        """
+        ``weights`` are the curvature of the loss by the values."""
         if latents.device.type != "cpu":
             level = (torch.round(self.base_multiples + latents) - self.base_multiples).float()
             gradient += (factor * weights * self.units(latents, table) ** 2).float() * (latents - level)
             return
         levels, curvature, slopes = self._arrays(latents, self._values(table)), weights.numpy(), gradient.numpy()
-
-        def part(first: int, last: int) -> None:
-            attract(*levels, curvature, factor, first, last, slopes)
-
-        each_part(part, len(latents), torch.get_num_threads())
+        each_part(lambda a, b: attract(*levels, curvature, factor, a, b, slopes), len(latents))
 
     def _arrays(
         self, latents: Float32[Tensor, "R C"], table: Float64[Tensor, "L _"]
@@ -367,28 +350,20 @@ class _Values(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,  # noqa: ANN401
-        latents: Float32[Tensor, "R C"],
-        table: Float64[Tensor, "L _"],
-        plane: Plane,
+        ctx: Ctx, latents: Float32[Tensor, "R C"], table: Float64[Tensor, "L _"], plane: Plane
     ) -> Float64[Tensor, "R C"]:
         ctx.plane = plane
         ctx.save_for_backward(latents.detach(), table.detach())
         if latents.device.type != "cpu":
             return _entries(table.detach(), plane.lists[plane.positions(latents)])
         levels, values = plane._arrays(latents, table), np.empty(tuple(latents.shape))
-
-        def part(first: int, last: int) -> None:
-            level_values(*levels, first, last, values)
-
-        each_part(part, len(values), torch.get_num_threads())
+        each_part(lambda first, last: level_values(*levels, first, last, values), len(values))
         return torch.from_numpy(values)
 
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any,  # noqa: ANN401
-        gradient: Float[Tensor, "R C"],
+        ctx: Ctx, gradient: Float[Tensor, "R C"]
     ) -> tuple[Float32[Tensor, "R C"], Float64[Tensor, "L _"] | None, None]:
         latents, table = ctx.saved_tensors
         plane: Plane = ctx.plane
@@ -400,11 +375,7 @@ class _Values(torch.autograd.Function):
             return (gradient * plane.units(latents, table)).float(), total, None
         arrays, v_values = plane._arrays(latents, table), gradient.double().contiguous().numpy()
         v_latents = np.empty(tuple(gradient.shape), np.float32)
-
-        def part(first: int, last: int) -> None:
-            level_gradients(*arrays, v_values, first, last, v_latents)
-
-        each_part(part, len(v_latents), torch.get_num_threads())
+        each_part(lambda first, last: level_gradients(*arrays, v_values, first, last, v_latents), len(v_latents))
         return torch.from_numpy(v_latents), total, None
 
 
@@ -416,10 +387,8 @@ def _entries(table: Float64[Tensor, "L _"], levels: Int[Tensor, "R C"]) -> Float
 def _reachable(
     values: Float64[np.ndarray, " levels"], usable: Int[np.ndarray, " 2"], largest_gap: float
 ) -> tuple[Int[np.ndarray, " levels"], Int[np.ndarray, " levels"]]:
-    """Return the first and the last place that each place of a list reaches without a wide gap.
-
-    ``usable`` are the first place that may be used, and the one after the last.
-    """
+    """Return the first and the last place that each place of a list reaches without a wide gap. ``usable`` are the
+    first place that may be used, and the one after the last."""
     wide = np.diff(values) > largest_gap
     part, places = np.concatenate([[0], np.cumsum(wide)]), np.arange(len(values))
     first, last = np.searchsorted(part, part), np.searchsorted(part, part, side="right") - 1
@@ -443,30 +412,18 @@ def planes_of(
         if tables is None or name == "means":
             # Some readers need the largest position to be the largest level.
             planes[name] = Plane.even(field, device, freeze_top=name == "means" and field.top == MEANS_TOP)
-        elif name == "f_rest_centroids":
-            planes[name] = _codebook(field, sh_degree, device)
+        elif name == "f_rest_centroids":  # every entry uses all values; missing bands are frozen
+            frozen = np.zeros(field.levels.shape, bool)
+            frozen[:, np.arange(field.levels.shape[1]) % COEFFICIENTS >= SH_REST_COUNTS[sh_degree]] = True
+            rows, lists = np.zeros((len(frozen), 1), np.int64), [np.arange(len(field.table))]
+            planes[name] = Plane.of(field, lists, rows, frozen, device, largest_gap=CAPTURED["f_dc"])
         else:
             planes[name] = _of_classes(name, field, plan.classes.astype(np.int64), tables, device)
-    if tables is None:
-        return planes, {}
-    trained = {
-        name: ValueTable.of(
-            planes[name].field.table[:, 0],
-            device,
-            freeze_zero=name == "f_rest_centroids",
-            largest_gap=CAPTURED.get(name, CAPTURED["f_dc"]),
-        )
-        for name in TABLES
-    }
+    trained = {}
+    for name in () if tables is None else TABLES:
+        values, gap = planes[name].field.table[:, 0], CAPTURED.get(name, CAPTURED["f_dc"])
+        trained[name] = ValueTable.of(values, device, freeze_zero=name == "f_rest_centroids", largest_gap=gap)
     return planes, trained
-
-
-def _codebook(field: Quantized, sh_degree: int, device: Device) -> Plane:
-    """Return the plane of a codebook with a table: every entry uses all values; missing bands are frozen."""
-    frozen = np.zeros(field.levels.shape, bool)
-    frozen[:, np.arange(field.levels.shape[1]) % COEFFICIENTS >= SH_REST_COUNTS[sh_degree]] = True
-    rows = np.zeros((len(frozen), 1), np.int64)
-    return Plane.of(field, [np.arange(len(field.table))], rows, frozen, device, largest_gap=CAPTURED["f_dc"])
 
 
 def _of_classes(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.context import Device, Pace
 from kissgs.core.positions import signed_exp
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.finetuning.planes import Plane, each_part, level_bits, planes_of, sum_by_label
+from kissgs.finetuning.planes import Ctx, Plane, each_part, level_bits, planes_of, sum_by_label
 from kissgs.planning import rotation_forms
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import Grid
@@ -30,22 +29,21 @@ from kissgs.training.model import PrunableAdam
 
 # The decoders' own functions for training: exact values forward, gradients backward.
 
-SMALLEST_DIVISOR = 0.05
-"""Smallest missing component of a rotation by which its gradient is divided."""
+SMALLEST_DIVISOR = 0.05  # smallest missing component of a rotation by which its gradient is divided
 
 
 class _SignedExp(torch.autograd.Function):
     """Positions of signed logarithms, sign(y) (e^|y| - 1): computed in float64, rounded to float32."""
 
     @staticmethod
-    def forward(ctx: Any, y: Float64[Tensor, "..."]) -> Float32[Tensor, "..."]:  # noqa: ANN401
+    def forward(ctx: Ctx, y: Float64[Tensor, "..."]) -> Float32[Tensor, "..."]:
         x = torch.from_numpy(signed_exp(y.detach().cpu().numpy())).to(y.device)
         ctx.save_for_backward(x)
         return x.float()
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float32[Tensor, "..."]) -> Float64[Tensor, "..."]:  # noqa: ANN401
+    def backward(ctx: Ctx, gradient: Float32[Tensor, "..."]) -> Float64[Tensor, "..."]:
         (x,) = ctx.saved_tensors
         return gradient.double() * (1 + x.abs())
 
@@ -54,7 +52,7 @@ class _SmallestThree(torch.autograd.Function):
     """Quaternions of length 1 from three components and the index of the missing one, which is not negative."""
 
     @staticmethod
-    def forward(ctx: Any, small: Float64[Tensor, "M 3"], omitted: Int[Tensor, "M 1"]) -> Float32[Tensor, "M 4"]:  # noqa: ANN401
+    def forward(ctx: Ctx, small: Float64[Tensor, "M 3"], omitted: Int[Tensor, "M 1"]) -> Float32[Tensor, "M 4"]:
         whole = rotation_forms.whole(small.detach().cpu().numpy(), omitted[:, 0].cpu().numpy())
         quats = torch.from_numpy(whole).to(small.device)
         ctx.save_for_backward(small, omitted, quats.gather(1, omitted))
@@ -62,7 +60,7 @@ class _SmallestThree(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float32[Tensor, "M 4"]) -> tuple[Float64[Tensor, "M 3"], None]:  # noqa: ANN401
+    def backward(ctx: Ctx, gradient: Float32[Tensor, "M 4"]) -> tuple[Float64[Tensor, "M 3"], None]:
         small, omitted, missing = ctx.saved_tensors
         kept = torch.from_numpy(rotation_forms.KEPT).to(small.device)[omitted[:, 0]]
         wide = gradient.double()
@@ -84,7 +82,7 @@ class _LookUp(torch.autograd.Function):
     """Codebook entry of each Gaussian. On the CPU, gradients are summed in a fixed order, unlike those of torch."""
 
     @staticmethod
-    def forward(ctx: Any, entries: Float32[Tensor, "E K 3"], labels: Labels) -> Float32[Tensor, "M K 3"]:  # noqa: ANN401
+    def forward(ctx: Ctx, entries: Float32[Tensor, "E K 3"], labels: Labels) -> Float32[Tensor, "M K 3"]:
         ctx.labels = labels
         if entries.device.type != "cpu":
             return entries[labels.index]
@@ -94,18 +92,15 @@ class _LookUp(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "M K 3"]) -> tuple[Float[Tensor, "E K 3"], None]:  # noqa: ANN401
+    def backward(ctx: Ctx, gradient: Float[Tensor, "M K 3"]) -> tuple[Float[Tensor, "E K 3"], None]:
         labels: Labels = ctx.labels
         total = gradient.new_zeros((labels.entries, *gradient.shape[1:]))
         if gradient.device.type != "cpu":
             return total.index_add_(0, labels.index, gradient), None
         rows, totals = (tensor.contiguous().numpy().reshape(len(tensor), -1) for tensor in (gradient, total))
-
-        def part(first: int, last: int) -> None:
-            sum_by_label(rows, labels.order, labels.used, labels.starts, first, last, totals)
-
         if gradient.numel():
-            each_part(part, len(labels.used), torch.get_num_threads())
+            own = labels.order, labels.used, labels.starts
+            each_part(lambda first, last: sum_by_label(rows, *own, first, last, totals), len(labels.used))
         return total, None
 
 
@@ -123,8 +118,7 @@ class _LookUp(torch.autograd.Function):
 # ``level - gradient / curvature``, which is the same point from both levels, and is rounded to the nearer one. The
 # curvature follows from the costs of errors (:class:`kissgs.planning.rd_criterion.Costs`).
 
-ATTRIBUTE_FIELDS = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}
-"""Fields that hold an attribute without transformation, by attribute."""
+ATTRIBUTE_FIELDS = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}  # without transformation
 
 
 class QuantizedScene:
@@ -200,7 +194,6 @@ class QuantizedScene:
 
     @property
     def antialiased(self) -> bool:
-        """See :class:`kissgs.Splats`."""
         return self._plan.scene.antialiased
 
     @property
@@ -209,9 +202,7 @@ class QuantizedScene:
 
     def step(self, rates: Mapping[str, float]) -> None:
         """Make an Adam step of the latents, with quadratic attraction, within the levels that the images can hold.
-
-        ``rates`` has learning rates by field and :func:`table_name`, and the factor of the ``"attraction"``, 0 to 1.
-        """
+        ``rates`` has learning rates by field and :func:`table_name`, and the factor of the ``"attraction"``, 0 to 1."""
         rotations = self.latents["quaternions"].detach().clone() if self._omitted is not None else None
         if self._weights and rates["attraction"] > 0:
             self._attract(rates["attraction"])
@@ -221,22 +212,18 @@ class QuantizedScene:
                 latents.clamp_(self.planes[name].min_latent, self.planes[name].max_latent)
             for name, latents in self.table_latents.items():
                 latents.clamp_(self.trained_tables[name].min_latent, self.trained_tables[name].max_latent)
-            if rotations is not None:
-                self._keep_unit_length(rotations)
+            if rotations is not None:  # a step is taken back if three components leave no room for a fourth
+                latents = self.latents["quaternions"]
+                squares = self.planes["quaternions"].values(latents).square().sum(dim=1, keepdim=True)
+                latents.copy_(torch.where(squares > 1, rotations, latents))
 
+    @torch.no_grad()
     def _attract(self, factor: float) -> None:
         """Add the gradient of the quadratic attraction of each latent to its current level."""
-        with torch.no_grad():
-            tables = self.tables()
-            for name, latents in self.latents.items():
-                if latents.grad is not None:
-                    self.planes[name].attract(latents.grad, latents, tables.get(name), self._weights[name], factor)
-
-    def _keep_unit_length(self, former: Float32[Tensor, "M 3"]) -> None:
-        """Take back a step after which the three components of a rotation leave no room for a fourth."""
-        latents = self.latents["quaternions"]
-        squares = self.planes["quaternions"].values(latents).square().sum(dim=1, keepdim=True)
-        latents.copy_(torch.where(squares > 1, former, latents))
+        tables = self.tables()
+        for name, latents in self.latents.items():
+            if latents.grad is not None:
+                self.planes[name].attract(latents.grad, latents, tables.get(name), self._weights[name], factor)
 
     def plan(self) -> EncodingPlan:
         """Return the plan with the current levels and tables."""
@@ -265,11 +252,9 @@ class QuantizedScene:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the state of the training, see :meth:`restore`."""
         return self._adam.state()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from a :meth:`state` of a scene with an equal plan."""
         self._adam.restore(state)
 
 
@@ -284,18 +269,14 @@ def _values(name: str, fields: Mapping[str, Quantized]) -> Float64[np.ndarray, "
 
 # ``CodebookRate``: estimated bits of the SH codebook's image, for fine-tuning.
 
-DIFFERENCE_OFFSET = 0.3
-"""Added to mean differences, levels; it bounds the bits of a level where neighbours are nearly equal."""
+DIFFERENCE_OFFSET = 0.3  # added to mean differences, levels; it bounds the bits where neighbours are equal
 
 
 class CodebookRate:
-    """Bits of the square image of an SH codebook.
-
-    WebP subtracts green from red and blue, predicts each from its neighbours, and codes the rest. So the bits of a
-    level are those of its difference from the entries beside and above it, in Laplace distributions: the mean of both
-    differences, over ln 2 times the mean difference of its colour and coefficient. Only their derivative matters; the
-    constant is left out.
-    """
+    """Bits of the square image of an SH codebook. WebP subtracts green from red and blue, predicts each from its
+    neighbours, and codes the rest. So the bits of a level are those of its difference from the entries beside and above
+    it, in Laplace distributions: the mean of both differences, over ln 2 times the mean difference of its colour and
+    coefficient. Only their derivative matters; the constant is left out."""
 
     table: Float32[np.ndarray, "3 15"]  # mean difference plus DIFFERENCE_OFFSET of red - green, green and blue - green
 
@@ -328,8 +309,6 @@ class CodebookRate:
 
 
 class _LevelRate:
-    """Rate of the levels of one field."""
-
     table: Float32[np.ndarray, "classes channels symbols"]  # bits of each level; the last entry is repeated
 
     def __init__(self, plane: Plane, classes: Int[np.ndarray, " M"], channels: Int[np.ndarray, " C"]) -> None:
@@ -369,7 +348,7 @@ class _Bits(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,  # noqa: ANN401
+        ctx: Ctx,
         latents: Float32[Tensor, "M C"],
         base: Float64[Tensor, "M C"],
         rows: Int[Tensor, "M C"],
@@ -383,36 +362,31 @@ class _Bits(torch.autograd.Function):
         def part(first: int, last: int) -> float:
             return float(level_bits(start, found, codes, bits_of, symbols, first, last, slopes))
 
-        bits = each_part(part, len(slopes), torch.get_num_threads())
+        bits = each_part(part, len(slopes))
         ctx.save_for_backward(torch.from_numpy(slopes))
         return torch.tensor(math.fsum(bits), dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+    def backward(ctx: Ctx, upstream: Tensor) -> tuple[Tensor | None, ...]:
         (slopes,) = ctx.saved_tensors
         return torch.from_numpy(slopes.numpy() * upstream.numpy()), None, None, None, None
 
 
+# Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that. Entries
+# of the SH codebook are added where they are a list, sorted by frequency: neighbours then predict nothing. In a square
+# they predict each other (CodebookRate).
 ENTROPY_FIELDS = ("opacities", "scales", "quaternions", "f_dc")
-"""Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that.
 
-Entries of the SH codebook are added where they are a list, sorted by frequency: neighbours then predict nothing.
-In a square they predict each other (:class:`kissgs.finetuning.quantized_scene.CodebookRate`).
-"""
-
-RECOUNT_STEPS = 25
-"""Number of steps between two updates of the histograms and of the mean differences."""
+RECOUNT_STEPS = 25  # number of steps between two updates of the histograms and of the mean differences
 
 
 class RateLoss(Regularizer):
-    """Regularizer: estimated bits of all levels.
-
-    The bits are those of an ideal entropy code with one histogram per sensitivity class and channel. WebP's entropy
-    image comes near to it, and RDO quantisation uses it too (:mod:`kissgs.planning.rd_fields`). Between two levels,
-    bits are interpolated linearly, so that the gradient moves latents to the cheaper neighbouring level. Those of a
-    square SH codebook come from differences of neighbouring entries.
-    """
+    """Regularizer: estimated bits of all levels. The bits are those of an ideal entropy code with one histogram per
+    sensitivity class and channel. WebP's entropy image comes near to it, and RDO quantisation uses it too
+    (:mod:`kissgs.planning.rd_fields`). Between two levels, bits are interpolated linearly, so that the gradient moves
+    latents to the cheaper neighbouring level. Those of a square SH codebook come from differences of neighbouring
+    entries."""
 
     def __init__(self, scene: QuantizedScene, weight: float) -> None:
         """Prepare the loss of ``scene``; ``weight`` is the weight of one bit."""
@@ -441,11 +415,9 @@ class RateLoss(Regularizer):
         return self._weight * sum((rate.bits(latents[name]) for name, rate in self._rates.items()), torch.tensor(0.0))
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the rate tables by field, see :meth:`restore`."""
         return {f"{name}.bits": rate.table for name, rate in self._rates.items()}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from a :meth:`state`."""
         for name, rate in self._rates.items():
             rate.table = state[f"{name}.bits"]
 
@@ -453,19 +425,15 @@ class RateLoss(Regularizer):
 PAPER_TV_WEIGHTS = {"opacities": 1e-4, "scales": 1e-4, "means": 1e-4, "f_dc": 1e-4, "quaternions": 1e-2}
 """Weights of total variation by field (KISS-GS, appendix); for positions, of each of the two byte images."""
 
-TV_RAMP = (0.35, 0.6)
-"""Fractions of the steps between which these weights grow linearly from 0 (KISS-GS, appendix)."""
+TV_RAMP = (0.35, 0.6)  # fractions of the steps between which these weights grow linearly from 0 (KISS-GS, appendix)
 
 
 class TotalVariationLoss(Regularizer):
-    """Regularizer: masked L1 total variation of the images, the paper's term for small files.
-
-    For each image it is the mean absolute difference of levels over all pairs of neighbouring cells that hold Gaussians
-    and over channels. The paper does not state the unit; here it is levels.
-    """
+    """Regularizer: masked L1 total variation of the images, the paper's term for small files. For each image it is the
+    mean absolute difference of levels over all pairs of neighbouring cells that hold Gaussians and over channels. The
+    paper does not state the unit; here it is levels."""
 
     def __init__(self, scene: QuantizedScene, weight: float, pace: Pace) -> None:
-        """Prepare the loss."""
         self._scene, self._weight, self._pace = scene, weight, pace
         device = scene.latents["means"].device
         self._one, self._other = (torch.from_numpy(side).to(device) for side in _neighbours(scene.grid))

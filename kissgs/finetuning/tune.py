@@ -35,35 +35,19 @@ from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
 from kissgs.training.supervision import SupervisionViews, TrainingTargets
 
-SENSITIVITY_VIEWS = 64
-"""Approximate number of training cameras from which costs are measured, if the plan has none."""
-
-VIEW_UNCERTAINTY = 0.1
-"""View uncertainty of these costs, see :class:`kissgs.Sensitivity`."""
-
-LOSS_VIEWS = 16
-"""Largest number of targets from which the loss before training is estimated."""
-
-ATTRACTION_START = 0.5
-"""Fraction of the steps after which quadratic attraction starts; it grows linearly to 1 at the last step."""
-
-TABLE_LR = 1.0
-"""Learning rate of tables in units of that of the levels: an error of a value is one of everything that uses it."""
+SENSITIVITY_VIEWS = 64  # approximate number of training cameras from which costs are measured, if the plan has none
+VIEW_UNCERTAINTY = 0.1  # view uncertainty of these costs, see Sensitivity
+LOSS_VIEWS = 16  # largest number of targets from which the loss before training is estimated
+ATTRACTION_START = 0.5  # fraction of the steps after which attraction starts; it grows linearly to 1
+TABLE_LR = 1.0  # of tables, in units of that of levels: an error of a value is one of all that uses it
 
 NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
-
 NO_TIME = "there was no time for fine-tuning; the container is as it was without it"
 
+# Most steps before a deadline, in units of the usual number: more fit photographs that train better, others worse.
 MOST_STEPS = {"photos": 1, "renderings": 2}
-"""Most steps before a deadline, in units of the usual number, by the targets: more steps fit the photographs that train
-better, and those that are held out worse."""
-
-Write = Callable[[EncodingPlan, int, Context], Encoded]
-"""Writes a plan that was fine-tuned in a number of steps."""
-
-
-Decode = Callable[..., Splats]
-"""Decoder of a container: takes its files, ``ReadOptions`` and ``threads``."""
+Write = Callable[[EncodingPlan, int, Context], Encoded]  # writes a plan that was fine-tuned in a number of steps
+Decode = Callable[..., Splats]  # decoder of a container: takes its files, ReadOptions and threads
 
 
 @dataclass(slots=True, eq=False)
@@ -88,10 +72,8 @@ class Tuner:
         checkpoint: Path | None = None,
     ) -> tuple[Encoded, FinetuneReport]:
         """Fine-tune from ``start``, and return the better container with a report: the tuned one, or that of ``plan``.
-
         Without ``plan``, the training is part of that of the scene, and no container is made before it. If the file
-        ``checkpoint`` exists and belongs to this work, training continues from it.
-        """
+        ``checkpoint`` exists and belongs to this work, training continues from it."""
         started = time.perf_counter()
         as_finetune = self.context.stage("finetune")
         before, first, rd_lambda = None, None, start.rd_lambda
@@ -113,7 +95,8 @@ class Tuner:
         tuned, checkpoint_note = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, pace, checkpoint)
         trained = time.perf_counter()
         after = write(tuned, pace.steps, self.context)
-        second = self._evaluate(after, replace(self.context, progress=self._report_images_done))
+        images_done = replace(self.context, progress=lambda *event: self.context.progress("images", 1.0))
+        second = self._evaluate(after, images_done)
         self.ending_seconds = time.perf_counter() - trained
         kept = first is None or second.cost(rd_lambda) < first.cost(rd_lambda)
         notes = ["" if kept else NOT_KEPT, checkpoint_note]
@@ -135,9 +118,6 @@ class Tuner:
             seconds=time.perf_counter() - started,
             note="; ".join(filter(None, [self.supervision.note, *notes])),
         )
-
-    def _report_images_done(self, stage: str, fraction: float, note: str = "") -> None:
-        self.context.progress("images", 1.0)
 
     def _evaluate(self, encoded: Encoded, context: Context) -> _Result:
         evaluation = self._compare(self.original, encoded, context)
@@ -195,25 +175,16 @@ class Tuner:
         return scene.plan(), checkpoint_note
 
     def _loss_per_error(self, scene: QuantizedScene) -> float:
-        """Estimate the derivative of the loss with respect to the mean squared image error.
-
-        All of the loss but the error itself is taken as proportional to the root of the error, as for errors on top of
-        those to photographs.
-        """
+        """Estimate the derivative of the loss with respect to the mean squared image error. All of the loss but the
+        error itself is taken as proportional to the root of the error, as for errors on top of those to photographs."""
         settings, losses, errors = self.settings, [], []
+        options: dict[str, Any] = {"ssim_weight": settings.ssim_weight, "mse_weight": 0.0}
+        options |= {"antialiased": scene.antialiased, "threads": self.context.threads}
         with torch.no_grad(), torch_threads(1):  # the sums depend on the number of threads
             parameters = scene.gaussians()
             for n in islice(self.targets.order((settings.seed,)), min(LOSS_VIEWS, len(self.targets))):
                 self.context.progress("finetune", 0.0)
-                loss, error = image_loss(
-                    parameters,
-                    self.targets,
-                    n,
-                    ssim_weight=settings.ssim_weight,
-                    mse_weight=0.0,
-                    antialiased=scene.antialiased,
-                    threads=self.context.threads,
-                )
+                loss, error = image_loss(parameters, self.targets, n, **options)
                 losses.append(float(loss))
                 errors.append(error)
         return float(np.mean(losses)) / (2 * max(float(np.mean(errors)), 1e-10)) + settings.mse_weight
@@ -226,12 +197,10 @@ class Tuner:
         targets = self.targets
         stride, others = max(1, len(targets) // SENSITIVITY_VIEWS), len(targets) - targets.synthetic
         weights = [1.0] * others + [targets.synthetic_per_epoch / max(targets.synthetic, 1)] * targets.synthetic
+        cameras = WeightedCameras(targets.cameras[::stride], weights[::stride], self.supervision.background)
+        threads, progress = self.context.threads, self.context.stage("finetune").progress
         sensitivity = measure_sensitivity(
-            splats,
-            WeightedCameras(targets.cameras[::stride], weights[::stride], self.supervision.background),
-            view_uncertainty=VIEW_UNCERTAINTY,
-            threads=self.context.threads,
-            progress=self.context.stage("finetune").progress,
+            splats, cameras, view_uncertainty=VIEW_UNCERTAINTY, threads=threads, progress=progress
         )
         return Costs.of(sensitivity, splats)
 

@@ -35,10 +35,8 @@ class Choice:
 
 
 def resolved(settings: Settings, views: Views | None, *, keep_all: bool = False, torch: bool | None = None) -> Settings:
-    """Return the settings with what they leave open resolved, see :meth:`kissgs.Settings.resolved`.
-
-    ``keep_all`` says that all Gaussians stay unless the settings request otherwise, ``torch`` whether it is installed.
-    """
+    """Return the settings with what they leave open resolved, see :meth:`kissgs.Settings.resolved`. ``keep_all`` says
+    that all Gaussians stay unless the settings request otherwise, ``torch`` whether it is installed."""
     if keep_all and settings.compact.auto_count is None:
         settings = settings.model_copy(update={"compact": settings.compact.model_copy(update={"auto_count": False})})
     photographs = None if views is None else has_photographs(views)
@@ -47,18 +45,12 @@ def resolved(settings: Settings, views: Views | None, *, keep_all: bool = False,
 
 def choose(requested: Settings, views: Views | None, count: int, context: Context, *, keep_all: bool) -> Choice:
     """Choose what to do with ``count`` Gaussians until the deadline; the note also says where torch is missing."""
-    deadline, threads = context.deadline, context.threads
-    chosen = {
-        torch: in_time(
-            requested,
-            resolved(requested, views, keep_all=keep_all, torch=torch),
-            None if deadline is None else SearchTime(deadline, encode_seconds(requested.preset, count, threads)),
-            count=count,
-            captured=views is not None,
-            torch=torch,
-        )
-        for torch in {has_torch(), True}
-    }
+    chosen, time = {}, None
+    if context.deadline is not None:
+        time = SearchTime(context.deadline, encode_seconds(requested.preset, count, context.threads))
+    for torch in {has_torch(), True}:
+        settings = resolved(requested, views, keep_all=keep_all, torch=torch)
+        chosen[torch] = in_time(requested, settings, time, count=count, captured=views is not None, torch=torch)
     found = chosen[has_torch()]
     if found.settings == chosen[True].settings:
         return found
@@ -69,11 +61,9 @@ def in_time(
     requested: Settings, settings: Settings, time: SearchTime | None, *, count: int, captured: bool, torch: bool
 ) -> Choice:
     """Return the ``settings`` that were resolved as if there were time for everything, changed to fit into the time.
-
-    Training that was not requested is left out where there is too little time for it, and the preset where even a
-    plain encoding takes too long, unless a goal or a setting of the encoder is given. Without a goal and a capture,
-    time that is left goes to fine-tuning on renderings of the scene.
-    """
+    Training that was not requested is left out where there is too little time for it, and the preset where even a plain
+    encoding takes too long, unless a goal or a setting of the encoder is given. Without a goal and a capture, time that
+    is left goes to fine-tuning on renderings of the scene."""
     if time is None:
         return Choice(settings)
     plain, left = time.encode_seconds, time.deadline.seconds

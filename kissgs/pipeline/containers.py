@@ -15,14 +15,9 @@ from kissgs.sogxt import encode as sogxt
 from kissgs.sogxt.container import FILES as SOGXT_FILES
 from kissgs.sogxt.decode import decode as decode_sogxt
 
-MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}
-"""Model of each container for the planner."""
-
-DECODERS = {"sogxt": decode_sogxt, "sog": decode_sog}
-"""Decoder of each container."""
-
-FILES = frozenset({*SOGXT_FILES, *sog.FILES})
-"""Names of all files that containers may have: a folder with no others may be replaced by a container."""
+MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}  # for the planner
+DECODERS = {"sogxt": decode_sogxt, "sog": decode_sog}  # decoder of each container
+FILES = frozenset({*SOGXT_FILES, *sog.FILES})  # a folder with no others may be replaced by a container
 
 
 def write_files(

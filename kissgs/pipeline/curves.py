@@ -1,7 +1,5 @@
 """Curves through the plane of number of Gaussians and lambda, along which a search finds the root of a goal's margin.
-
-One curve changes lambda alone, the other removes Gaussians and raises lambda together.
-"""
+One curve changes lambda alone, the other removes Gaussians and raises lambda together."""
 
 from __future__ import annotations
 
@@ -43,29 +41,19 @@ def codebook_limited(settings: EncodeSettings, sh_degree: int) -> bool:
 
 @dataclass(slots=True, eq=False)
 class LambdaCurve:
-    """Containers of one scene with several values of lambda.
-
-    Lambda alone may not meet a goal: to save time, the codebook has a limit, ``gaussians_per_codebook_entry``, and its
-    side is a multiple of 8. So the goal may lie beyond that limit, or between the containers of two sides.
-
-    Attributes:
-        goal: the goal.
-        encode: makes a container with settings.
-        settings: settings of the containers, but for lambda.
-        most: largest number of containers.
-        tuned: whether the levels are fine-tuned: then a container less near the goal ends the search, the finest or
-            coarsest one is not tried where all others missed the goal, and the codebook stays.
-        sh_degree: of the scene.
-        found: attempts by log2(lambda), of those that can be compared.
-    """
+    """Containers of one scene with several values of lambda. Lambda alone may not meet a goal: to save time, the
+    codebook has a limit, ``gaussians_per_codebook_entry``, and its side is a multiple of 8. So the goal may lie beyond
+    that limit, or between the containers of two sides."""
 
     goal: Goal
     encode: Callable[[EncodeSettings], Attempt]
-    settings: EncodeSettings
-    most: int
+    settings: EncodeSettings  # of the containers, but for lambda
+    most: int  # containers
+    # Fine-tuned: then a container less near the goal ends the search, the finest or coarsest one is not tried where all
+    # others missed the goal, and the codebook stays.
     tuned: bool = False
     sh_degree: int = 0
-    found: dict[float, Attempt] = field(default_factory=dict)
+    found: dict[float, Attempt] = field(default_factory=dict)  # by log2(lambda), those that can be compared
     _made: int = field(init=False, default=0)
     _slope: float = field(init=False, default=0.0)
 
@@ -98,17 +86,14 @@ class LambdaCurve:
     def _find_root(self, start: float) -> None:
         if self._made >= self.most and start not in self.found:
             return
-        find_root(
-            self._margin,
-            start,
-            self._slope,
-            lambda x: self.goal.decisive(self.found[x]).near_enough(trained=self.tuned),
-            LOG2_LAMBDA_RANGE,
-            stop=StopRule(
-                self.most - self._made + (start in self.found), tries_bound=not self.tuned, settled=self._settled
-            ),
-            before={x: self.goal.margin(attempt) for x, attempt in self.found.items() if x != start},
-        )
+
+        def near(x: float) -> float:
+            return self.goal.decisive(self.found[x]).near_enough(trained=self.tuned)
+
+        left = self.most - self._made + (start in self.found)
+        stop = StopRule(left, tries_bound=not self.tuned, settled=self._settled)
+        before = {x: self.goal.margin(attempt) for x, attempt in self.found.items() if x != start}
+        find_root(self._margin, start, self._slope, near, LOG2_LAMBDA_RANGE, stop=stop, before=before)
 
     def _encode(self, settings: EncodeSettings) -> Attempt:
         self._made += 1
@@ -132,9 +117,7 @@ class LambdaCurve:
 
     def _settled(self, inside: float, outside: float) -> bool:
         """Whether the size jumps between two values of log2(lambda), the last that fits and the next that does not.
-
-        Only for sizes: for a PSNR or a drop, the codebook that belongs to the finer lambda is the better one.
-        """
+        Only for sizes: for a PSNR or a drop, the codebook that belongs to the finer lambda is the better one."""
         sides = {self.found[x].made.encoded.codebook_side for x in (inside, outside)}
         gap = abs(inside - outside)
         return self.goal.by_size and (gap < MIN_STEP_LOG2 or (gap < JUMP_LOG2 and len(sides) > 1 and not self.tuned))
@@ -188,12 +171,10 @@ def last_number(count: int) -> int:
 
 
 def first_point(goal: Goal, number: int, offset_db: float, *, may_step: bool) -> tuple[int, float]:
-    """Return the point of the first container, and the decibels added to ``quality_offset_db`` there.
-
-    ``number`` and ``offset_db`` are those for a loss of 0.1 dB. A goal that allows more gets fewer Gaussians if it
-    ``may_step``. With fewer Gaussians, lambda at equal quality is larger by about :data:`LAMBDA_SHARE` of the step
-    already, so the decibels only make up for the rounding to whole points.
-    """
+    """Return the point of the first container, and the decibels added to ``quality_offset_db`` there. ``number`` and
+    ``offset_db`` are those for a loss of 0.1 dB. A goal that allows more gets fewer Gaussians if it ``may_step``. With
+    fewer Gaussians, lambda at equal quality is larger by about :data:`LAMBDA_SHARE` of the step already, so the
+    decibels only make up for the rounding to whole points."""
     step = min(goal.allowed_log2, MAX_STEP if may_step else 0.0)
     points = round((1 - LAMBDA_SHARE) * step * POINTS_PER_HALVING)
     rest = (1 - LAMBDA_SHARE) * step - points / POINTS_PER_HALVING
@@ -203,16 +184,9 @@ def first_point(goal: Goal, number: int, offset_db: float, *, may_step: bool) ->
 def along_path(
     goal: Goal, encode: Callable[[int, float | None], Attempt], first: int, last: int, most: int, near: float
 ) -> None:
-    """Make up to ``most`` containers at points of the path, the first one at point ``first`` as its settings say.
-
-    Args:
-        goal: the goal; no PSNR.
-        encode: makes the container of a point at a value of log2(lambda).
-        first: number of the first point.
-        last: largest number of a point.
-        most: largest number of containers.
-        near: margin, log2 of the number of Gaussians, below which a container that meets the goal ends the search.
-    """
+    """Make up to ``most`` containers at points of the path up to ``last``, the first one at point ``first`` as its
+    settings say, for a goal that is no PSNR; ``encode`` makes that of a point at a value of log2(lambda). A margin
+    below ``near``, log2 of the number of Gaussians, ends the search."""
     first, begin = min(max(first, 1), last), math.nan
 
     def margin(step: float) -> float:

@@ -37,10 +37,8 @@ if TYPE_CHECKING:
 
 
 def read_sensitivity(path: Path, key: str) -> Sensitivity | None:
-    """Read what :func:`write_sensitivity` has written with ``key``; None if the file is missing or has another key.
-
-    Any other file is refused, because it would be replaced.
-    """
+    """Read what :func:`write_sensitivity` has written with ``key``; None if the file is missing or has another key. Any
+    other file is refused, because it would be replaced."""
     refuse_existing(path, overwrite=True)  # before the measurement, whose result is written there
     try:
         if not path.exists():
@@ -67,14 +65,9 @@ def write_sensitivity(path: Path, sensitivity: Sensitivity, key: str) -> None:
 
 # One encoding of a scene: measure sensitivity, plan, fine-tune, write.
 
-VIEW_UNCERTAINTY = {True: 0.1, False: 0.55}
-"""Default of the setting ``view_uncertainty``: True with the cameras of a capture, False with virtual cameras only."""
-
-SENSITIVITY_VERSION = 5
-"""Version of the measurement of sensitivity; a cache file of another version is measured again and replaced."""
-
-REFIT_SIZE = 320
-"""Largest longer side of the images that colours are refitted to, pixels."""
+VIEW_UNCERTAINTY = {True: 0.1, False: 0.55}  # by default: True with a capture's cameras
+SENSITIVITY_VERSION = 5  # of its measurement; a cache file of another version is measured again
+REFIT_SIZE = 320  # largest longer side of the images that colours are refitted to, pixels
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -82,9 +75,7 @@ class Work:
     """Scene, settings and context that all encodings of one compression share."""
 
     splats: Splats  # clean scene to encode
-    original: Splats
-    """Scene before compaction, or ``splats`` itself. Its renderings are the reference of a goal's PSNR, and the targets
-    of fine-tuning where there are no photographs."""
+    original: Splats  # scene before compaction, or splats: the reference of a PSNR, and targets without photographs
     settings: Settings
     sensitivity: Sensitivity | None  # of splats if measured before; None to measure it if the settings need it
     cache: Path | None  # file in which the measured sensitivity of splats is kept
@@ -121,22 +112,14 @@ def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     refits = captured and settings.color_refit_iterations > 0  # a refit to virtual cameras is worse than none
     if sensitivity is not None and not refits:
         return Measured(splats, sensitivity)
-    cameras, first_view = sensitivity_cameras(
-        splats,
-        work.views,
-        work.context,
-        count=settings.sensitivity_views or default_view_count(len(splats)),
-        size=settings.sensitivity_view_size,
-    )
+    count, size = settings.sensitivity_views or default_view_count(len(splats)), settings.sensitivity_view_size
+    cameras, first_view = sensitivity_cameras(splats, work.views, work.context, count=count, size=size)
     if sensitivity is None:
-        view_uncertainty = settings.view_uncertainty
-        if view_uncertainty is None:
-            view_uncertainty = VIEW_UNCERTAINTY[captured]
-        sensitivity = _sensitivity(splats, cameras, view_uncertainty, work.cache if whole else None, work.context)
+        uncertainty = VIEW_UNCERTAINTY[captured] if settings.view_uncertainty is None else settings.view_uncertainty
+        sensitivity = _sensitivity(splats, cameras, uncertainty, work.cache if whole else None, work.context)
         return_free_memory()
-    recolor = None
-    if refits:
-        recolor = _recolor(splats, cameras, sensitivity, settings.color_refit_iterations, work.context)
+    steps = settings.color_refit_iterations
+    recolor = _recolor(splats, cameras, sensitivity, steps, work.context) if refits else None
     return Measured(splats, sensitivity, recolor, first_view)
 
 
@@ -175,10 +158,8 @@ def encode(
     checkpoint: Path | None = None,
     completes: bool = False,
 ) -> Container:
-    """Plan a scene, fine-tune its levels if there is a tuner, and write the files.
-
-    If fine-tuning ``completes`` the training of the scene, no container is made without it.
-    """
+    """Plan a scene, fine-tune its levels if there is a tuner, and write the files. If fine-tuning ``completes`` the
+    training of the scene, no container is made without it."""
     compacted = len(work.original) - len(scene.splats)
     pruned = settings if tuner is None else _pruned_for_finetune(settings, work.settings.finetune)
     chosen = plan(work, scene, pruned if completes else settings, work.context)
@@ -210,7 +191,9 @@ def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: 
     from kissgs.training.supervision import supervision_views, training_targets
 
     settings = settings or work.settings.finetune
-    if compactor is not None and compactor.settings.trains and _same_views(work.settings):
+    names = ("synthetic_view_share", "views", "view_size", "seed")
+    same_views = all(getattr(work.settings.compact, name) == getattr(work.settings.finetune, name) for name in names)
+    if compactor is not None and compactor.settings.trains and same_views:
         supervision, targets = compactor.supervision, compactor.load_targets()
     else:
         supervision = supervision_views(work.original, work.views, settings, work.context, scoring_stride=0)
@@ -219,18 +202,8 @@ def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: 
     return Tuner(work.original, settings, supervision, targets, work.context, model, decode)
 
 
-def _same_views(settings: Settings) -> bool:
-    """Return whether compaction and fine-tuning train on the same images."""
-    names = ("synthetic_view_share", "views", "view_size", "seed")
-    return all(getattr(settings.compact, name) == getattr(settings.finetune, name) for name in names)
-
-
 def check_finetuning(settings: Settings, views: Views | None, device: Device) -> None:
-    """Refuse fine-tuning that is impossible, before any other work.
-
-    Raises:
-        UnsupportedError: torch or a GPU is missing; the goal is one that fine-tuning would miss.
-    """
+    """Refuse fine-tuning that is impossible, or that would miss the goal, before any other work."""
     if not has_torch():
         raise UnsupportedError(
             "fine-tuning needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough)"
@@ -294,14 +267,7 @@ def _recolor(
 
 def _refit_cameras(cameras: WeightedCameras) -> WeightedCameras:
     """Return the capture's cameras with fewer samples, and every other virtual one, smaller and of twice its weight."""
-    chosen = np.arange(len(cameras.cameras))
-    chosen = chosen[(chosen < cameras.captured) | ((chosen - cameras.captured) % 2 == 0)]
-    virtual = chosen >= cameras.captured
-    return replace(
-        cameras,
-        cameras=[
-            cameras.cameras[n].at_most(REFIT_SIZE) if other else cameras.cameras[n].sampled_at_most(REFIT_SIZE)
-            for n, other in zip(chosen, virtual, strict=True)
-        ],
-        weights=[cameras.weights[n] * (2.0 if other else 1.0) for n, other in zip(chosen, virtual, strict=True)],
-    )
+    own = list(zip(cameras.cameras, cameras.weights, strict=True))
+    kept = [(camera.sampled_at_most(REFIT_SIZE), weight) for camera, weight in own[: cameras.captured]]
+    kept += [(camera.at_most(REFIT_SIZE), 2.0 * weight) for camera, weight in own[cameras.captured :: 2]]
+    return replace(cameras, cameras=[camera for camera, _ in kept], weights=[weight for _, weight in kept])

@@ -34,35 +34,21 @@ class Container:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One container, or a scene before any encoding (0 bytes).
+    """One container, or a scene before any encoding (0 bytes)."""
 
-    Attributes:
-        count: Gaussians of the scene that was encoded.
-        rd_lambda: squared error per bit; None if no Gaussian is visible, so that there was no rate-distortion planning.
-        bytes: size of the zip, or of all files in the folder.
-        psnr: PSNR of its renderings to those of the scene as goals count it, decibels
-            (:func:`kissgs.evaluation.results.psnr_of`); without a capture in other views than ``drop``, in those of
-            ``worst`` and ``fifth_percentile``. None, as all that follow, where the goal is a size, save the kept one.
-        drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.results.drop_of`).
-        ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.results.ssim_drop_of`).
-        detail: losses of SSIM in patches, in the views of ``drop``.
-        worst: PSNR of the worst view, decibels.
-        fifth_percentile: fifth percentile of the views' PSNR, decibels.
-        against: what ``drop`` is a loss against: "photos", or "renderings", from which it is estimated.
-        container: the container itself; None in reports.
-    """
-
-    count: int
-    rd_lambda: float | None
-    bytes: int
-    psnr: float | None = None
-    drop: float | None = None
+    count: int  # Gaussians of the scene that was encoded
+    rd_lambda: float | None  # squared error per bit; None if no Gaussian is visible
+    bytes: int  # of the zip, or of all files in the folder
+    # Where the goal is a size, figures of quality are known of the kept one only. PSNR is to renderings of the scene,
+    # as goals count it: without a capture in the views of worst and fifth_percentile, others than those of the drops.
+    psnr: float | None = None  # decibels, as all but those of SSIM
+    drop: float | None = None  # of PSNR, see kissgs.evaluation.results.drop_of
     ssim_drop: float | None = None
-    detail: Detail | None = None
-    worst: float | None = None
-    fifth_percentile: float | None = None
-    against: str | None = None
-    container: Container | None = field(default=None, repr=False, compare=False)
+    detail: Detail | None = None  # losses of SSIM in patches, in the views of drop
+    worst: float | None = None  # PSNR of the worst view
+    fifth_percentile: float | None = None  # of the views' PSNR
+    against: str | None = None  # of drop: "photos", or "renderings", from which it is estimated
+    container: Container | None = field(default=None, repr=False, compare=False)  # None in reports
 
     @property
     def made(self) -> Container:
@@ -131,8 +117,6 @@ LOSSES = {
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A limit of one figure."""
-
     name: str  # of the setting; "detail" or "patch" for losses that a quality alone limits
     value: float  # bytes, decibels, or a difference of SSIM
     slope: float  # typical change of the margin per doubling of lambda
@@ -149,20 +133,11 @@ class Limit:
 
     def figure(self, attempt: Attempt) -> float | None:
         """Return what is limited of an attempt, in the unit of ``value``; None if it is unknown."""
-        match self.name:
-            case "target_size":
-                return attempt.bytes
-            case "psnr":
-                return attempt.psnr
-            case "max_psnr_drop":
-                return attempt.drop
-            case "max_ssim_drop":
-                return attempt.ssim_drop
-            case "detail":
-                return None if attempt.detail is None else -attempt.detail.worst_percent
-            case "patch":
-                return None if attempt.detail is None else -attempt.detail.worst
-        raise AssertionError(self.name)
+        if self.name in ("detail", "patch"):
+            detail = attempt.detail
+            return None if detail is None else -(detail.worst if self.name == "patch" else detail.worst_percent)
+        figures = {"target_size": attempt.bytes, "psnr": attempt.psnr, "max_psnr_drop": attempt.drop}
+        return figures.get(self.name, attempt.ssim_drop)
 
     def loss(self, attempt: Attempt, digits: Callable[[float], str] | None = None) -> str:
         """Return what is limited of an attempt in words, such as "0.003 of SSIM"; empty for bytes and a PSNR."""
@@ -173,11 +148,9 @@ class Limit:
         return (digits or form.format)(found) + unit
 
     def margin(self, attempt: Attempt) -> float:
-        """Return by how much an attempt stays within the limit: at least 0 where it is met.
-
-        The unit is log2 of a ratio for sizes and drops, and decibels for a PSNR. Infinite where nothing is lost at all:
-        then the distance to the limit is unknown. -∞ where the figure is unknown or not a number.
-        """
+        """Return by how much an attempt stays within the limit: at least 0 where it is met. The unit is log2 of a ratio
+        for sizes and drops, and decibels for a PSNR. Infinite where nothing is lost at all: then the distance to the
+        limit is unknown. -∞ where the figure is unknown or not a number."""
         found = self.figure(attempt)
         if found is None or math.isnan(found):
             return -math.inf
@@ -204,23 +177,15 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A goal for a container: a size, or the quality that the smallest container must have.
+    """A goal for a container: a size, or the quality that the smallest container must have."""
 
-    Attributes:
-        limits: what the container must meet: its size, or a PSNR, a drop of PSNR, one of SSIM, or several of these.
-        most_bytes: for a quality: bytes that the smallest container with it may have at most; None for any number.
-    """
-
-    limits: tuple[Limit, ...]
-    most_bytes: int | None = None
+    limits: tuple[Limit, ...]  # its size, or a PSNR, a drop of PSNR, losses of SSIM, or several of these
+    most_bytes: int | None = None  # for a quality: of the smallest container with it
 
     @classmethod
     def of(cls, settings: EncodeSettings) -> Goal:
-        """Return the goal of these settings.
-
-        Near is 3 % of a size, 0.1 dB of a PSNR, 0.02 dB of a drop of PSNR and 5 % of a drop of SSIM, for which a
-        container takes some 3 % of bytes.
-        """
+        """Return the goal of these settings. Near is 3 % of a size, 0.1 dB of a PSNR, 0.02 dB of a drop of PSNR and 5 %
+        of a drop of SSIM, for which a container takes some 3 % of bytes."""
         limits, size, quality = list[Limit](), settings.target_size, QUALITIES.get(settings.quality or "")
         name, of_psnr, of_ssim = settings.quality or "", "", ""
         psnr_drop, ssim_drop = settings.max_psnr_drop, settings.max_ssim_drop
@@ -252,7 +217,6 @@ class Goal:
 
     @property
     def psnr_drop(self) -> float | None:
-        """The largest drop of PSNR, decibels; None if it is not limited."""
         return next((limit.value for limit in self.limits if limit.name == "max_psnr_drop"), None)
 
     def decisive(self, attempt: Attempt) -> Limit:
@@ -269,10 +233,8 @@ class Goal:
 
     @property
     def allowed_log2(self) -> float:
-        """How often the limits on losses typically allow to halve a quarter of the Gaussians, a fraction.
-
-        Below 0 if more than a quarter are needed; 0 if the goal limits no loss.
-        """
+        """How often the limits on losses typically allow to halve a quarter of the Gaussians, a fraction. Below 0 if
+        more than a quarter are needed; 0 if the goal limits no loss."""
         known = [(limit, limit.quarter_loss) for limit in self.limits if limit.quarter_loss is not None]
         return min(((limit.value - expected) / limit.per_halving for limit, expected in known), default=0.0)
 
@@ -292,23 +254,19 @@ class Goal:
             missed = {first: missed[first]}
         wanted = " and ".join(dict.fromkeys(limit.wanted for limit in missed))
         found = [math.nan if figure is None else figure for figure in missed.values()]
+        failed = f"{wanted} cannot be met: "
         if any(map(math.isnan, found)):
-            return (
-                f"{wanted} cannot be met: a rendering of the finest container found failed, so its quality is unknown"
-            )
+            return f"{failed}a rendering of the finest container found failed, so its quality is unknown"
         if math.inf in found:
-            return (
-                f"{wanted} cannot be met: the scene's renderings equal the photographs, so any loss of PSNR is infinite"
-            )
+            return f"{failed}the scene's renderings equal the photographs, so any loss of PSNR is infinite"
         if first.name == "psnr":
             highest, limit = math.floor(100 * found[0]) / 100, first.value
-            return f"{wanted} cannot be met: the finest container found has {highest:.2f} dB; ask for at most that" + (
-                f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if limit > MAX_VIEW_PSNR else ""
-            )
+            most = f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if limit > MAX_VIEW_PSNR else ""
+            return f"{failed}the finest container found has {highest:.2f} dB; ask for at most that{most}"
         losses = " and ".join(limit.loss(finest, _rounded_up) for limit in missed)
         of_quality = all(limit.quality for limit in missed)
         lower = "choose a lower quality, or give max_psnr_drop" if of_quality else "allow at least that"
-        return f"{wanted} cannot be met: the finest container found loses {losses}; {lower}"
+        return f"{failed}the finest container found loses {losses}; {lower}"
 
 
 def _rounded_up(value: float) -> str:

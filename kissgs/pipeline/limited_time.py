@@ -7,17 +7,12 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from kissgs.core.context import Deadline
 from kissgs.core.errors import OutputError
 from kissgs.core.resources import processors
 from kissgs.io.files import atomic_file, reason_of
 from kissgs.settings import Preset
-
-if TYPE_CHECKING:
-    pass
-
 
 # Expected time of an encoding on this machine, from its speed as ``kissgs warmup`` has measured it.
 
@@ -30,21 +25,14 @@ ENCODE_SECONDS = {
 """Seconds of an encoding by preset, measured on two processors: a fixed part; one that all scenes of more than
 :data:`FULL_RENDERINGS` Gaussians have, for renderings; one per Gaussian."""
 
-FULL_RENDERINGS = 20_000
-"""Number of Gaussians from which renderings take about the same time; with fewer, they take in proportion less."""
-
-SPEEDS = (1e-3, 1e3)
-"""Slowest and fastest speed of a processor that is believed, in units of :func:`save_speed`."""
-
-REFERENCE_PROCESSORS, MOST_PROCESSORS = 2, 8
-"""Processors of that machine, and the number beyond which an encoding is taken to become no faster."""
+FULL_RENDERINGS = 20_000  # Gaussians from which renderings take about the same time; fewer take less
+SPEEDS = (1e-3, 1e3)  # slowest and fastest speed of a processor that is believed, in units of save_speed
+REFERENCE_PROCESSORS, MOST_PROCESSORS = 2, 8  # of that machine, and beyond which nothing becomes faster
 
 
 def encode_seconds(preset: Preset, count: int, threads: int = 0) -> float:
-    """Return the expected wall time of an encoding of ``count`` Gaussians without training, seconds.
-
-    ``threads`` is the number of threads; 0 means one per processor.
-    """
+    """Return the expected wall time of an encoding of ``count`` Gaussians without training, seconds. ``threads`` is the
+    number of threads; 0 means one per processor."""
     used = min(threads or processors(), processors(), MOST_PROCESSORS)
     return _reference_seconds(preset, count) / (_speed_per_processor() * used)
 
@@ -55,11 +43,7 @@ def _reference_seconds(preset: Preset, count: int) -> float:
 
 
 def save_speed(seconds: float, preset: Preset, count: int) -> None:
-    """Save the speed of this machine, which encoded ``count`` Gaussians in ``seconds`` with all its processors.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Save the speed of this machine, which encoded ``count`` Gaussians in ``seconds`` with all its processors."""
     speed = _reference_seconds(preset, count) / seconds
     try:
         path = _speed_file()
@@ -89,29 +73,19 @@ def _speed_file() -> Path:
 # ``SearchTime``: how a limited time is divided among training and containers. The unit is the expected time of an
 # encoding of the whole scene without training.
 
-CONTAINER_SHARE, LAST_CONTAINER_SHARE = 2.0, 4.0
-"""Time to fine-tune a container, in units of that to train one point of the path; the second for the last container,
-which is the only one where time is short."""
+CONTAINER_SHARE, LAST_CONTAINER_SHARE = 2.0, 4.0  # to fine-tune one; a point's training is 1
+ENDING_SHARE = 0.38  # time to write a fine-tuned container and to evaluate it in small images
+LEAST_FOR_CONTAINER, CAPTURE_TIME = 2.0, 1.5  # to begin a trained one; an encoding with a capture and refits
 
-ENDING_SHARE = 0.38
-"""Time to write a fine-tuned container and to evaluate it in small images."""
-
-LEAST_FOR_CONTAINER, CAPTURE_TIME = 2.0, 1.5
-"""Time below which another trained container is not begun, and that of an encoding with a capture, whose images colours
-are refitted to."""
-
+# Time to score in one view, share of the time that all scoring shall take, and views that score in any case.
 SCORE_SHARE, SCORING_SHARE, LEAST_SCORING_VIEWS = 0.004, 0.15, 16
-"""Time to score the Gaussians in one view, the share of the time that all scoring shall take, and the number of views
-that score in any case."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchPlan:
-    """Containers and training of a search.
-
-    A search for a small loss that began with a fifth of the Gaussians ended, for a scene of 300, with more bytes than
-    the encoder alone takes; 5 dB instead of 4 take 4 % more bytes and rarely save a second container.
-    """
+    """Containers and training of a search. A search for a small loss that began with a fifth of the Gaussians ended,
+    for a scene of 300, with more bytes than the encoder alone takes; 5 dB instead of 4 take 4 % more bytes and rarely
+    save a second container."""
 
     containers: int
     number: int = 6  # point of the path that is tried first for a loss of 0.1 dB: a quarter of the Gaussians
@@ -138,26 +112,14 @@ WITH_GOAL = (
 )
 """Plans where the goal must be met: a single container needs a reserve, two can come near it."""
 
-RENDERED = (
-    (15.0, SearchPlan(0)),
-    (30.0, SearchPlan(1)),
-    (60.0, SearchPlan(2)),
-    (math.inf, SearchPlan(3)),
-)
+RENDERED = ((15.0, SearchPlan(0)), (30.0, SearchPlan(1)), (60.0, SearchPlan(2)), (math.inf, SearchPlan(3)))
 """Plans where renderings of the scene are the targets: number and lambda follow from a search of the encoder."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchTime:
-    """The time of a search.
-
-    Attributes:
-        deadline: time until which the best container shall be ready.
-        encode_seconds: expected seconds of an encoding of the whole scene without training.
-    """
-
-    deadline: Deadline
-    encode_seconds: float
+    deadline: Deadline  # until which the best container shall be ready
+    encode_seconds: float  # expected of an encoding of the whole scene without training
 
     def expected(self, longest: float, *, trained: bool) -> float:
         """Return the expected seconds of another container; ``longest`` is the longest one without training so far."""

@@ -329,6 +329,8 @@ def compress(
         delete_checkpoints(*checkpoints)
     clock.stop()
     container_bytes, file_bytes = stored_sizes(encoded.files, packed=work.packed)
+    names = ("invisible", "pruned_by_rd", "clipped_colors", "form_error", "rd_lambda")
+    figures: dict[str, Any] = {name: getattr(encoded, name) for name in names}
     report = Report(
         source_count=source_count,
         count=len(encoded.order),
@@ -339,19 +341,15 @@ def compress(
         cleaned=cleaned,
         compaction=None if compacted is None else compacted.report,
         finetuning=made.finetuning,
-        invisible=encoded.invisible,
-        pruned_by_rd=encoded.pruned_by_rd,
         note="; ".join(filter(None, [*notes, encoded.coarse, encoded.note, note, choice.note])),
-        clipped_colors=encoded.clipped_colors,
-        form_error=encoded.form_error,
         max_quantization_error=encoded.errors,
-        rd_lambda=encoded.rd_lambda,
         trials=trials,
         seconds=clock.seconds,
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
         settings=_settings_as_used(settings, made.settings, requested),
         evaluation=evaluation,
+        **figures,
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
     remaining = () if target is not None else tuple(path for path in checkpoints if path is not None)
@@ -416,10 +414,8 @@ def _search(work: Work, *, time_only: bool) -> tuple[Container, tuple[Attempt, .
 
 
 def _encode_once(work: Work, checkpoint: Path | None, *, disposable: bool) -> Container:
-    """Plan, fine-tune if the settings say so, and write the files.
-
-    A disposable scene that is not fine-tuned is forgotten once it is planned, so that its memory is free for the files.
-    """
+    """Plan, fine-tune if the settings say so, and write the files. A disposable scene that is not fine-tuned is
+    forgotten once it is planned, so that its memory is free for the files."""
     from kissgs.pipeline.encoding import encode, make_tuner, measure, plan, write
     from kissgs.pipeline.goal import Container
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
@@ -32,11 +33,8 @@ from kissgs.sogxt.container import YAML_NAME, is_packed
 
 # Recognition of scene formats: by content where a format has a mark, else by the ending of the name.
 
-HEAD_BYTES = 512
-"""Bytes at the beginning of a file that recognition needs."""
-
-_STREAMED = {each.manifest: name for name, each in FORMATS.items() if each.manifest}
-"""Format of streamed scenes by the name of their manifest, the first of which decides."""
+HEAD_BYTES = 512  # bytes at the beginning of a file that recognition needs
+_STREAMED = {each.manifest: name for name, each in FORMATS.items() if each.manifest}  # by manifest
 
 
 def recognise(source: Path | bytes | Mapping[str, bytes], *, name: str | None = None, size: int | None = None) -> str:
@@ -94,21 +92,16 @@ def scene_root(path: Path) -> Path:
 
 
 def is_container(source: Path | bytes) -> bool:
-    """Whether a source is a folder or a zip, rather than another file.
-
-    A zip may have any name, and a prefix such as a self-extractor. If the file cannot be opened, the ending ``.zip``
-    decides.
-    """
+    """Whether a source is a folder or a zip, rather than another file. A zip may have any name, and a prefix such as a
+    self-extractor. If the file cannot be opened, the ending ``.zip`` decides."""
     if isinstance(source, bytes):
         return sniff_format(io.BytesIO(source)) == "zip"
-    try:
+    with suppress(OSError, ValueError):
         if source.is_dir():
             return True
         if source.is_file():  # opening a named pipe would block
             with source.open("rb") as file:
                 return sniff_format(file) == "zip"
-    except (OSError, ValueError):
-        pass
     return is_packed(source)
 
 
@@ -141,12 +134,10 @@ def _beginning(source: Path | bytes) -> tuple[bytes, int]:
     """Return the first bytes and the size of a file; nothing of what cannot be read."""
     if isinstance(source, bytes):
         return source[:HEAD_BYTES], len(source)
-    try:
+    with suppress(OSError, ValueError):
         if source.is_file():  # opening a named pipe would block
             with source.open("rb") as file:
                 return file.read(HEAD_BYTES), source.stat().st_size
-    except (OSError, ValueError):
-        pass
     return b"", 0
 
 
@@ -189,10 +180,8 @@ def _container_format(files: Source, unknown: str) -> str:
 def write_scene(
     file: BinaryWriter, splats: Splats, kind: str, *, raw_axes: bool = False, progress: Progress = silent
 ) -> tuple[str, ...]:
-    """Write a scene in a format, which all but ``ply`` need cleaned; return what the format cannot hold.
-
-    Each loss beyond the steps that the format always has is one phrase.
-    """
+    """Write a scene in a format, which all but ``ply`` need cleaned; return what the format cannot hold. Each loss
+    beyond the steps that the format always has is one phrase."""
     ending = f".{kind}"
     codec = next(each.codec for each in FORMATS.values() if ending in each.written)
     if kind == "ply":
@@ -424,8 +413,7 @@ class Info(Facts):
 
     path: str
     kind: str
-    bytes: int
-    """Size of the file or the folder."""
+    bytes: int  # size of the file or the folder
 
     @property
     def bits_per_gaussian(self) -> float:
@@ -470,10 +458,8 @@ def read_scene_info(path: Path, *, name: str | None = None) -> SceneInfo:
 
 
 def describe(path: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS) -> Info:
-    """Describe a scene file.
-
-    No image of a container is decoded, except SOG-XT's mask if the metadata does not state the number of Gaussians.
-    """
+    """Describe a scene file. No image of a container is decoded, except SOG-XT's mask if the metadata does not state
+    the number of Gaussians."""
     kind = recognise(path)
     refuse_level(kind, scene_root(path), reading.level)
     facts = FORMATS[kind].codec.info(scene_root(path), reading.level)

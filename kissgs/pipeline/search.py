@@ -18,22 +18,12 @@ from kissgs.compaction.search_evaluation import SearchEvaluation
 from kissgs.core.context import Context, SearchNote, ignore_stop_search
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.splats import Splats
-from kissgs.evaluation.results import ESTIMATED_DROP, drop_of
+from kissgs.evaluation.results import ESTIMATED_DROP, Evaluation, drop_of
+from kissgs.finetuning.result import FinetuneReport
 from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline import curves
 from kissgs.pipeline.choice import has_photographs
-from kissgs.pipeline.curves import (
-    KEEP,
-    LOG2_LAMBDA_RANGE,
-    SMALL_SCENE,
-    LambdaCurve,
-    NoFurtherError,
-    along_path,
-    at_lambda,
-    codebook_limited,
-    count_at,
-    first_point,
-    last_number,
-)
+from kissgs.pipeline.curves import LambdaCurve, NoFurtherError, at_lambda, count_at, last_number
 from kissgs.pipeline.encoding import Measured, Work, encode, make_tuner, measure
 from kissgs.pipeline.goal import Attempt, Container, Goal
 from kissgs.pipeline.limited_time import SearchPlan
@@ -42,54 +32,27 @@ from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
-    from kissgs.evaluation.results import Evaluation
-    from kissgs.finetuning.result import FinetuneReport
     from kissgs.finetuning.tune import Tuner
 
-MAX_OFFSET_DB = 30.0
-"""Largest value of the setting ``quality_offset_db``."""
-
-TUNED_CONTAINERS, ENCODES = 3, 6
-"""Largest number of containers of all Gaussians that are fine-tuned, and of those without training before others that
-are trained."""
-
+MAX_OFFSET_DB = 30.0  # largest value of the setting quality_offset_db
+TUNED_CONTAINERS, ENCODES = 3, 6  # most containers fine-tuned, and of those before trained ones
+# Factors on settings of fine-tuning that completes the training of the path too: a refinement would take more steps.
 COMPLETING = {"steps": 1.2, "lr": 2.5, "codebook_lr": 2.0}
-"""Factors on settings of fine-tuning that completes the training of the path too.
-
-A refinement of the scene before its encoding would take more steps for the same quality.
-"""
-
-PRUNABLE_POINTS, PRUNABLE_DROP = 3, 1.0
-"""Last point that is pruned without training where there are photographs, half of the Gaussians, unless one before it
-loses more than so many decibels."""
-
-RENDERED_POINTS = 5
-"""Last point that is pruned without training where renderings of the scene are the targets, from which training along
-the path departs."""
-
+PRUNABLE_POINTS, PRUNABLE_DROP = 3, 1.0  # last one pruned without training; most decibels that others lose
+RENDERED_POINTS = 5  # last point pruned without training on renderings, from which training departs
+# Largest loss after a short training path, decibels beyond the allowed one, that fine-tuning is expected to recover
+# (docs/method/research-log.md, "Large scenes in a limited time").
 RECOVERABLE_DB = 1.5
-"""Loss of PSNR at the end of a short training path, decibels beyond the one that is allowed, from which fine-tuning
-is not expected to recover (docs/method/research-log.md, "Large scenes in a limited time")."""
-
+# Expected of a trained container, before the first one is made: bytes per Gaussian, those of view-dependent colour in
+# addition, and those that are no images.
 BYTES_PER_GAUSSIAN, BYTES_OF_SH, OVERHEAD_BYTES = 8.6, 4.0, 4000
-"""Bytes of a trained container per Gaussian that are expected at first, those of view-dependent colour in addition, and
-those that are no images before the first container shows how many these are."""
-
-SIZE_BY_COUNT = 0.6
-"""Exponent of the number of Gaussians to which the size of a container grows at equal lambda."""
-
-HALF_LEFT = 1.0
-"""Margin of a point before any encoding that leaves half of the allowed loss to the encoder."""
-
+SIZE_BY_COUNT = 0.6  # exponent of the number of Gaussians to which the size of a container grows at equal lambda
+HALF_LEFT = 1.0  # margin of a point before any encoding that leaves half of the allowed loss to the encoder
+# Margin that ends a search, as log2 of the number of Gaussians, some 3 % of the bytes; less in a time that is given.
 NEAR_LOG2, NEAR_IN_TIME = 0.09, 0.06
-"""Margin, as log2 of the number of Gaussians, below which a container that meets the goal ends the search: 0.03 dB.
-Another one would save some 3 % of its bytes, or 1 to 2 %, which is worth a time that the user has given."""
-
-UNKNOWN_DROP = 1e6
-"""Larger than any finite drop of PSNR, decibels."""
+UNKNOWN_DROP = 1e6  # larger than any finite drop of PSNR, decibels
 
 NOT_FINETUNED = "no fine-tuned container meets the goal better: this one is not fine-tuned"
-
 BEYOND_PHOTOGRAPHS = (
     "trained for what the photographs show: beyond them it changes more (--evaluate measures how much; --compact 100% "
     "--finetune 0 keeps it)"
@@ -105,41 +68,23 @@ class Scene:
     compacted: Compacted | None = None  # None for all Gaussians
     trained: bool = False  # by fine-tuning that completes its training
 
-    def __len__(self) -> int:
-        return len(self.measured.splats)
-
 
 @dataclass(slots=True, eq=False)
 class Search:
-    """A search for the container that serves the goal of the settings best.
-
-    Attributes:
-        work: what all encodings share.
-        time_only: whether only the time is limited: if no container meets the usual loss, the closest one is kept.
-        goal: the goal.
-        compare: compares a decoded container with the original scene.
-        plan: number of trained containers, and the first of them.
-        compactor: compaction of the scene if fewer Gaussians may serve the goal; None to keep all of them.
-        path: its training path.
-        attempts: all attempts, in order, without their containers.
-        tried: scenes that were evaluated before any encoding.
-        best: the attempt that serves the goal best; None if none meets it.
-        closest: of those that miss it, the one with the least distance to it.
-        stopped: whether the search was stopped from outside (:class:`kissgs.StopSearch`).
-    """
+    """A search for the container that serves the goal of the settings best."""
 
     work: Work
-    time_only: bool = False
-    compactor: Popspa | None = field(init=False, default=None)
+    time_only: bool = False  # only the time is limited: if no container meets the usual loss, the closest one is kept
+    compactor: Popspa | None = field(init=False, default=None)  # if fewer Gaussians may serve the goal
     goal: Goal = field(init=False)
     compare: SearchEvaluation = field(init=False)
     plan: SearchPlan = field(init=False)
-    path: TrainingPath | None = field(init=False, default=None)
-    attempts: list[Attempt] = field(init=False, default_factory=list)
-    tried: list[CountTrial] = field(init=False, default_factory=list)
-    best: Attempt | None = field(init=False, default=None)
-    closest: Attempt | None = field(init=False, default=None)
-    stopped: bool = field(init=False, default=False)
+    path: TrainingPath | None = field(init=False, default=None)  # of the compactor
+    attempts: list[Attempt] = field(init=False, default_factory=list)  # in order, without their containers
+    tried: list[CountTrial] = field(init=False, default_factory=list)  # scenes evaluated before any encoding
+    best: Attempt | None = field(init=False, default=None)  # of those that meet the goal
+    closest: Attempt | None = field(init=False, default=None)  # of those that miss it
+    stopped: bool = field(init=False, default=False)  # from outside, by StopSearch
     _progress: SearchNote = field(init=False)  # the receiver of the work's context
     _pruned: list[Attempt] = field(init=False, default_factory=list)  # losses at points 1, 2 and so on
     _whole: Scene | None = field(init=False, default=None)
@@ -171,17 +116,15 @@ class Search:
         if work.time is not None and self.photographs:
             most = work.time.scoring_views(max(self.first[0], 1))
             self.compactor = replace(self.compactor, supervision=supervision.with_scoring(most))
-        self.compare = SearchEvaluation.of(work.splats, work.views, supervision)
+        self.compare = SearchEvaluation(work.splats, None if work.views is None else supervision.eval_views)
         self.path = TrainingPath(self.compactor, keep_states=not self.tunes)
 
     @property
     def encode_settings(self) -> EncodeSettings:
-        """Settings of the encoder, with the goal."""
         return self.work.settings.encode
 
     @property
     def tunes(self) -> bool:
-        """Whether the settings ask for fine-tuning."""
         return bool(self.work.settings.finetune.enabled)
 
     @property
@@ -209,32 +152,26 @@ class Search:
             return 0
         expected = (BYTES_PER_GAUSSIAN + BYTES_OF_SH * (splats.sh_degree > 0)) * len(splats)
         share = max((self.target_size - self._overhead) / expected, 1 / len(splats))
-        return max(0, round(math.log(share) / math.log(KEEP)))
+        return max(0, round(math.log(share) / math.log(curves.KEEP)))
 
     @property
     def first(self) -> tuple[int, float]:
         """Point of the first trained container, and decibels added to ``quality_offset_db`` there."""
         if self.goal.by_size:
             return self.number_for_size, self.plan.offset_db
-        may_step = self.plan.containers > 1 and len(self.work.splats) >= SMALL_SCENE
-        number, offset_db = first_point(self.goal, self.plan.number, self.plan.offset_db, may_step=may_step)
+        may_step = self.plan.containers > 1 and len(self.work.splats) >= curves.SMALL_SCENE
+        number, offset_db = curves.first_point(self.goal, self.plan.number, self.plan.offset_db, may_step=may_step)
         return min(number, last_number(len(self.work.splats))), offset_db
 
     @property
     def whole(self) -> Scene:
         """The scene with all its Gaussians, whose sensitivity is measured once."""
         if self._whole is None:
-            settings = self.encode_settings
-            self._whole = Scene(measure(self.work, self.work.splats, settings), settings)
+            self._whole = Scene(measure(self.work, self.work.splats, self.encode_settings), self.encode_settings)
         return self._whole
 
     def run(self) -> Attempt:
-        """Search, and return the best attempt.
-
-        Raises:
-            StopSearch: the search was stopped before any container met the goal.
-            UnsupportedError: no container meets the goal.
-        """
+        """Search, and return the best attempt; raise StopSearch or UnsupportedError if no container met the goal."""
         try:
             if self.path is None:
                 self._search_all_gaussians()
@@ -288,7 +225,8 @@ class Search:
             self._search_all_gaussians()
             return
         if limited is None:
-            self._prune_while(path, is_prunable, PRUNABLE_POINTS)
+            # Not beyond a scene whose rendering failed.
+            self._prune_while(path, lambda scene: (scene.drop or 0.0) <= PRUNABLE_DROP, PRUNABLE_POINTS)
         else:  # what each point loses is not worth the time to measure it
             self._prune_to(path, min(first - 1, PRUNABLE_POINTS))
         if limited is not None and not self._recovers(path):
@@ -307,10 +245,8 @@ class Search:
 
     def _first_that_fails(self, path: TrainingPath, number: int) -> int:
         """Train along the path from point ``number`` on, up to the first that misses the goal before any encoding.
-
         Photographs may show more than the scene does: training then makes it better than it was, and a container of
-        point ``number`` would use up little of what may be lost.
-        """
+        point ``number`` would use up little of what may be lost."""
         last = last_number(len(path.whole))
         while number < last:
             for passed in (True, False):  # a few steps show whether the scene is far from the limit
@@ -325,9 +261,7 @@ class Search:
 
     def _recovers(self, path: TrainingPath) -> bool:
         """Train up to the first point, and return whether fine-tuning can be expected to recover what is still lost.
-
-        The larger and the more detailed a scene is, the less is recovered in a time.
-        """
+        The larger and the more detailed a scene is, the less is recovered in a time."""
         allowed = self.goal.psnr_drop
         if allowed is None:  # PSNR does not tell what becomes of other goals
             return True
@@ -336,10 +270,8 @@ class Search:
 
     def _search_without_photographs(self, path: TrainingPath) -> None:
         """Encode all Gaussians, then as few of them as pruning alone serves the goal with, trained if settings say so.
-
         For a size, pruning without training loses more than it saves, unless all Gaussians miss it. A scene whose
-        Gaussians are all needed keeps them.
-        """
+        Gaussians are all needed keeps them."""
         trains, most = self.trains and self.plan.containers > 0, self.encode_settings.max_encodes
         self._search_all_gaussians(tunes=False, most=min(ENCODES, most) if trains else most)
         whole, fits = self.best, self.goal.by_size and self.attempts[0].bytes <= self.target_size
@@ -361,17 +293,15 @@ class Search:
 
     def _lambda_for_size(self, number: int) -> float:
         """Return the lambda at which a point should have the target size, by containers of all Gaussians."""
-        wanted = self.target_size / KEEP ** (SIZE_BY_COUNT * number)
+        wanted = self.target_size / curves.KEEP ** (SIZE_BY_COUNT * number)
         made = sorted((attempt.bytes, attempt.rd_lambda) for attempt in self.attempts if attempt.rd_lambda is not None)
         sizes, lambdas = np.log2([size for size, _ in made]), np.log2([rd_lambda for _, rd_lambda in made])
         return float(2.0 ** np.interp(math.log2(wanted), sizes, lambdas))
 
     def _encode_latest(self, path: TrainingPath) -> None:
         """Encode the latest point of the path without further training, or all Gaussians, where a search was stopped.
-
         For a quality it is the latest trained point that leaves at least half of the error to the encoder: most do not,
-        as they are still to be fine-tuned.
-        """
+        as they are still to be fine-tuned."""
         latest, self.stopped = len(path.points) - 1, False
         self._progress.progress = ignore_stop_search(self._progress.progress)
         if not self.goal.by_size and path.points[latest].trained and latest not in self._margins:
@@ -424,8 +354,8 @@ class Search:
 
     def _train(self, path: TrainingPath, number: int, *, passed: bool) -> None:
         """Train the last point of the path, on the way to point ``number``."""
-        limited, points = self.work.time, number + 2 - len(path.points)
-        points += 2 * passed  # the last one takes three times as many steps
+        # The last point takes three times as many steps.
+        limited, points = self.work.time, number + 2 - len(path.points) + 2 * passed
         deadline = None if limited is None else limited.for_point(points, self._containers_left)
         path.train(passed=passed, deadline=deadline)
 
@@ -465,10 +395,9 @@ class Search:
         changes = {name: factor * getattr(finetune, name) for name, factor in COMPLETING.items()}
         changes["steps"] = max(1, round(changes["steps"]))
         tuner = make_tuner(self.work, finetune.model_copy(update=changes), compactor)
-        if self.work.time is None:
-            return tuner
-        seconds = self.compare.seconds if compactor.supervision.captured else 0.0
-        tuner.ending_seconds = self.work.time.ending_seconds + seconds  # it evaluates in the same images of a capture
+        if self.work.time is not None:  # it evaluates in the same images of a capture
+            seconds = self.compare.seconds if compactor.supervision.captured else 0.0
+            tuner.ending_seconds = self.work.time.ending_seconds + seconds
         return tuner
 
     @property
@@ -516,17 +445,12 @@ class Search:
         if self.plan.containers == 0:  # there is no time for training
             self._prune_to(path, max(first, 1))
         with suppress(NoFurtherError):
-            along_path(self.goal, encode_at, first, last, self.plan.containers, near)
+            curves.along_path(self.goal, encode_at, first, last, self.plan.containers, near)
         if self.goal.by_size and self.best is None and len(path.points) > 1:  # lambda alone makes it small enough
             self._along_lambda(self._untrained(path, path.points[-1]), most=self.encode_settings.max_encodes)
 
     def _attempt(self, scene: Scene, settings: EncodeSettings, tuner: Tuner | None) -> Attempt:
-        """Make a container, evaluate it, and keep it if it serves the goal best so far.
-
-        Raises:
-            NoFurtherError: there is no time for another one.
-            StopSearch: the search was stopped.
-        """
+        """Make a container, evaluate it, and keep it if it serves the goal best so far, unless there is no time."""
         if self.stopped:
             raise StopSearch
         self._check_time(trained=tuner is not None)
@@ -536,7 +460,7 @@ class Search:
         size = stored_sizes(made.encoded.files, packed=self.work.packed)[0]
         images = (len(data) for name, data in made.encoded.files.items() if name.endswith(".webp"))
         self._overhead = size - sum(images)
-        attempt = Attempt(len(scene), made.encoded.rd_lambda, size, container=made)
+        attempt = Attempt(len(scene.measured.splats), made.encoded.rd_lambda, size, container=made)
         if not self.goal.by_size:
             attempt = attempt.with_evaluation(self._evaluate(made))
         if tuner is None:
@@ -586,8 +510,7 @@ class Search:
             self.work.context.progress("evaluate", 0.0)
         except StopSearch:
             self.stopped = True
-        most = ReadOptions.allowing(len(self.work.original))
-        threads = self.work.context.threads
+        most, threads = ReadOptions.allowing(len(self.work.original)), self.work.context.threads
         return self.compare(read_scene(made.encoded.files, most, threads=threads), Context(threads))
 
     def _evaluated(self, best: Attempt) -> Attempt:
@@ -598,10 +521,8 @@ class Search:
         return evaluated
 
     def _loss(self, made: Container) -> float:
-        """Return the drop of PSNR of a container, decibels; infinite if a rendering failed.
-
-        If the photographs equal the scene's renderings, every drop is infinite. It is then a large number minus PSNR.
-        """
+        """Return the drop of PSNR of a container, decibels; infinite if a rendering failed. If the photographs equal
+        the scene's renderings, every drop is infinite. It is then a large number minus PSNR."""
         evaluation = self._evaluate(made)
         drop, psnr = drop_of(evaluation), evaluation.mean.candidate.psnr
         if math.isnan(drop) or math.isnan(psnr):
@@ -633,8 +554,8 @@ class Search:
         if self.goal.psnr_drop is not None and best.against == "renderings":
             return ESTIMATED_DROP
         margin, target = self.goal.margin(best), self.target_size
-        finest = best.rd_lambda == 2.0 ** LOG2_LAMBDA_RANGE[0]
-        limited = codebook_limited(best.made.settings, self.work.splats.sh_degree)
+        finest = best.rd_lambda == 2.0 ** curves.LOG2_LAMBDA_RANGE[0]
+        limited = curves.codebook_limited(best.made.settings, self.work.splats.sh_degree)
         if not target or not finest or limited or margin <= self.goal.limits[0].near:
             return ""
         return f"target_size {target:,} bytes is above the finest container of this scene: {best.bytes:,} bytes"
@@ -664,8 +585,3 @@ class Search:
         if self.plan.containers == 0:
             return "and there was too little time to train a smaller number"
         return "and a smaller number would serve the goal less"
-
-
-def is_prunable(scene: Attempt) -> bool:
-    """Whether a scene may be pruned further without training."""
-    return (scene.drop or 0.0) <= PRUNABLE_DROP  # false where a rendering failed

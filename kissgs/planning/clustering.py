@@ -13,17 +13,10 @@ from kissgs.core.array_types import Float32, Float64, Int, Int32, UInt16
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
 
-BLOCK = 1024
-"""Vectors per matrix product: its result, against some hundred centroids, stays in the processor's cache."""
-
-SEARCHED = 4
-"""Number of near centroids of a centroid whose own near ones are searched for nearer ones."""
-
-PARTNERS = 24
-"""Number of near centroids, the nearest, with whose clusters a cluster may merge."""
-
-TASKS = 64
-"""Number of tasks of an iteration: more than threads, since others may use the processor too."""
+BLOCK = 1024  # vectors per matrix product: its result, against some hundred centroids, stays in the processor's cache
+SEARCHED = 4  # number of near centroids of a centroid whose own near ones are searched for nearer ones
+PARTNERS = 24  # number of near centroids, the nearest, with whose clusters a cluster may merge
+TASKS = 64  # number of tasks of an iteration: more than threads, since others may use the processor too
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +28,6 @@ class Vectors:
     weights: Float32[np.ndarray, " N"]
 
     def take(self, members: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M D"]:
-        """Return a copy of some of the vectors."""
         return self.table[self.rows[members]]
 
     def mean_and_rms(self, pool: Workers) -> tuple[Float32[np.ndarray, " D"], float]:
@@ -71,34 +63,17 @@ class Clustering:
 
         self.sort_members()
         arrays = self._arrays()
-        pool.map(
-            lambda part: kernels.means(*arrays, *part, self.centroids, self.totals, self.errors),
-            self.parts(),
-        )
+        pool.map(lambda part: kernels.means(*arrays, *part, self.centroids, self.totals, self.errors), self.parts())
 
     def sort_members(self) -> None:
-        """Sort the vectors by label again, after labels have changed."""
         self.members, self.edges = sorted_by_label(self.labels, len(self.centroids))
 
     def reassign(self, pool: Workers) -> None:
         """Assign every vector to the nearest of the centroids near its present one."""
         from kissgs.planning import kmeans_kernels as kernels
 
-        data = self.data
-        pool.map(
-            lambda part: kernels.assign_near(
-                data.table,
-                data.rows,
-                self.members,
-                self.edges,
-                self.centroids,
-                self.near,
-                *part,
-                self.labels,
-                self.distances,
-            ),
-            self.parts(),
-        )
+        arrays = self.data.table, self.data.rows, self.members, self.edges, self.centroids, self.near
+        pool.map(lambda part: kernels.assign_near(*arrays, *part, self.labels, self.distances), self.parts())
 
     def refresh_near(self, pool: Workers) -> None:
         """Find the near centroids again, which have moved, among the near ones of the nearest so far."""
@@ -109,10 +84,8 @@ class Clustering:
         self.near = found
 
     def relocate(self, pool: Workers) -> None:
-        """Merge pairs of clusters and split others as long as the error shrinks, each cluster once at most.
-
-        Only labels and lists of near centroids change; :meth:`update` then finds the centroids.
-        """
+        """Merge pairs of clusters and split others as long as the error shrinks, each cluster once at most. Only labels
+        and lists of near centroids change; :meth:`update` then finds the centroids."""
         from kissgs.planning import kmeans_kernels as kernels
 
         arrays, count = self._arrays(), len(self.centroids)
@@ -160,27 +133,21 @@ def sorted_by_label(
 
 # ``ShMetric``: errors of view-dependent colour, measured in the directions from which cameras see each Gaussian.
 
+# Weight of all directions alike, beside those from which cameras see a Gaussian; both add up to 1. It grows with the
+# view uncertainty, since that shrinks the measured means, and is 1 for Gaussians that no capture has seen.
 UNIFORM_WEIGHT = 0.3
-"""Weight of all directions alike, beside those from which cameras see a Gaussian; both add up to 1. It grows with the
-view uncertainty, since that shrinks the measured means, and is 1 for Gaussians that no capture has seen."""
-
-NEIGHBORS = 32
-"""Number of codebook entries, the nearest to a Gaussian's present one, that are compared."""
-
-SPHERE = 4 * np.pi
-"""Area of the unit sphere: a form is the identity where all directions count alike."""
+NEIGHBORS = 32  # number of codebook entries, the nearest to a Gaussian's present one, that are compared
+SPHERE = 4 * np.pi  # area of the unit sphere: a form is the identity where all directions count alike
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShMetric:
-    """Quadratic forms of the errors of shN, one per Gaussian, after base colours have compensated the mean error.
-
-    The colour error in direction d is that of shN times the harmonics at d. Its mean square over the directions from
-    which a Gaussian is seen, less the square of its mean, which the base colour takes up, is a form of the covariance
-    of the harmonics. Products of harmonics are sums of harmonics of up to twice the degree, so the means of these give
-    all covariances. What the base colour's change costs in all other directions is left out: counting it made
-    images worse, those of the capture and those from elsewhere.
-    """
+    """Quadratic forms of the errors of shN, one per Gaussian, after base colours have compensated the mean error. The
+    colour error in direction d is that of shN times the harmonics at d. Its mean square over the directions from which
+    a Gaussian is seen, less the square of its mean, which the base colour takes up, is a form of the covariance of the
+    harmonics. Products of harmonics are sums of harmonics of up to twice the degree, so the means of these give all
+    covariances. What the base colour's change costs in all other directions is left out: counting it made images worse,
+    those of the capture and those from elsewhere."""
 
     sensitivity: Sensitivity  # with the means of harmonics to twice the scene's degree
     degree: int
@@ -262,9 +229,7 @@ def _blocks(
     state: Clustering, part: tuple[int, int]
 ) -> Iterator[tuple[Int32[np.ndarray, " n"], Int[np.ndarray, " edges"]]]:
     """Yield the vectors of a range of clusters in blocks, sorted by cluster, and where each cluster's begin in a block.
-
-    A form takes a kilobyte, and a single cluster may have most of the vectors.
-    """
+    A form takes a kilobyte, and a single cluster may have most of the vectors."""
     edges = state.edges[part[0] : part[1] + 1]
     for first in range(int(edges[0]), int(edges[-1]), BLOCK):
         last = min(first + BLOCK, int(edges[-1]))
@@ -273,11 +238,9 @@ def _blocks(
 
 @cache
 def _products(degree: int) -> Float32[np.ndarray, "J P"]:
-    """Return the products of all pairs of harmonics to ``degree`` as sums of the harmonics to twice the degree.
-
-    Column a · K + b has the coefficients of the product of harmonics a + 1 and b + 1, without the constant one: that is
-    1 / SPHERE for a = b, and 0 else.
-    """
+    """Return the products of all pairs of harmonics to ``degree`` as sums of the harmonics to twice the degree. Column
+    a · K + b has the coefficients of the product of harmonics a + 1 and b + 1, without the constant one: that is 1 /
+    SPHERE for a = b, and 0 else."""
     from kissgs.core.harmonics_kernel import write_harmonics_of
 
     number, count = (degree + 1) ** 2 - 1, (2 * degree + 1) ** 2 - 1

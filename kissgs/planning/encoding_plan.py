@@ -66,18 +66,8 @@ class Encoded:
 
     @classmethod
     def of(cls, plan: EncodingPlan, files: dict[str, bytes]) -> Encoded:
-        """Return the files of a plan with the plan's figures."""
-        scene = plan.scene
-        return cls(
-            files=files,
-            order=plan.grid.cells[plan.grid.mask],
-            form_error=plan.form_error,
-            invisible=scene.count - scene.visible,
-            pruned_by_rd=scene.visible - int(plan.grid.mask.sum()),
-            clipped_colors=plan.clipped_colors,
-            errors=plan.errors,
-            rd_lambda=plan.rd_lambda,
-            codebook_side=plan.codebook.side,
-            note=plan.note,
-            coarse=plan.coarse,
-        )
+        names = ("form_error", "clipped_colors", "errors", "rd_lambda", "note", "coarse")
+        figures: dict[str, Any] = {name: getattr(plan, name) for name in names}
+        order, scene, side = plan.grid.cells[plan.grid.mask], plan.scene, plan.codebook.side
+        invisible, pruned = scene.count - scene.visible, scene.visible - len(order)
+        return cls(files, order, invisible=invisible, pruned_by_rd=pruned, codebook_side=side, **figures)

@@ -12,9 +12,7 @@ from kissgs.core.numba_kernels import compiled
 @compiled("void(uint16[:, ::1], uint64[::1])")
 def hilbert_keys(cells: np.ndarray, keys: np.ndarray) -> None:
     """Write the position of every cell ``(N, 3)`` uint16 along the 3D Hilbert curve of order 16 to ``keys`` ``(N,)``.
-
-    Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707 (2004).
-    """
+    Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707 (2004)."""
     for n in range(cells.shape[0]):
         x0 = np.uint32(cells[n, 0])
         x1 = np.uint32(cells[n, 1])
@@ -88,10 +86,8 @@ def _mix(state: np.uint64) -> np.uint64:
 @compiled("void(float32[:, ::1], int32[::1], float32[:, ::1], int32[::1], float64[::1])")
 def _sort_four(items: np.ndarray, placed: np.ndarray, target: np.ndarray, cells: np.ndarray, score: np.ndarray) -> None:
     """Permute the four items in ``cells`` so that the sum of their scalar products with the cells' targets is largest.
-
-    This permutation has the smallest squared distance, since the squares of items and targets do not depend on it.
-    The sums before and after are added to ``score``.
-    """
+    This permutation has the smallest squared distance, since the squares of items and targets do not depend on it. The
+    sums before and after are added to ``score``."""
     product = np.empty((4, 4), dtype=np.float32)
     for i in range(4):
         item = placed[cells[i]]
@@ -135,11 +131,9 @@ def plas_blocks(
     seed: np.uint64,
     threshold: float,
 ) -> float:
-    """Move the items of some blocks of a shifted tiling towards their target, in random groups of four.
-
-    Shuffles of a block depend on ``seed`` and the block's number alone, not on threads. A block ends after a pass that
-    reduces its squared distance by less than the share ``threshold``. Return the reduction of all squared distances.
-    """
+    """Move the items of some blocks of a shifted tiling towards their target, in random groups of four. Shuffles of a
+    block depend on ``seed`` and the block's number alone, not on threads. A block ends after a pass that reduces its
+    squared distance by less than the share ``threshold``. Return the reduction of all squared distances."""
     side, down, right, size, first, last = tiling
     per_row = side // size
     cells = np.empty(size * size, dtype=np.int32)
@@ -209,10 +203,8 @@ def nearest_forms(
 
 @compiled("void(float64[:, ::1], float64[:, ::1], uint8[::1])")
 def largest_w(quats: np.ndarray, rotations: np.ndarray, forms: np.ndarray) -> None:
-    """Write the form of largest w of each quaternion ``(N, 4)`` to ``forms``; among equals, the first of the table.
-
-    w is compared in units of 1e-9: without rounding, equal forms would differ. ``rotations`` is ``(24, 4)``.
-    """
+    """Write the form of largest w of each quaternion ``(N, 4)`` to ``forms``; among equals, the first of the table. w
+    is compared in units of 1e-9: without rounding, equal forms would differ. ``rotations`` is ``(24, 4)``."""
     for n in range(quats.shape[0]):
         w, x, y, z = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
         best = least = np.rint(w * 1e9)  # the first form is the identity
@@ -297,9 +289,7 @@ def sort_keys(
     passes: int,
 ) -> None:
     """Sort ``keys`` stably by their lowest 12 · ``passes`` bits, and write the permutation to ``order``, by radix sort.
-
-    ``passes`` is even, so that the result ends in ``keys`` and ``order``; the others are scratch.
-    """
+    ``passes`` is even, so that the result ends in ``keys`` and ``order``; the others are scratch."""
     count = keys.shape[0]
     counts = np.zeros((passes, 4096), np.int64)
     for n in range(count):
@@ -327,7 +317,6 @@ def sort_keys(
 
 @njit(nogil=True, error_model="numpy")
 def _bits_between(pixels: np.ndarray, bits: np.ndarray, a: int, b: int) -> int:
-    """Return the bits of pixel ``a`` beside pixel ``b``."""
     total = 0
     for channel in range(pixels.shape[1]):
         total += bits[channel, np.uint8(pixels[a, channel] - pixels[b, channel])]
@@ -343,10 +332,8 @@ def near_pixels(
     near: Int32[np.ndarray, "N k"],
 ) -> None:
     """Find the pixels that take the fewest bits beside each pixel, among those that are near it on some curves.
-
     ``bits`` are those of each difference modulo 256, ``curves`` permutations, and ``reach`` places on a curve in both
-    directions. ``near`` has the fewest bits first, and is filled up with the pixel itself.
-    """
+    directions. ``near`` has the fewest bits first, and is filled up with the pixel itself."""
     count, most = near.shape
     best = np.empty((count, most), np.int64)
     for n in range(count):
@@ -474,9 +461,7 @@ def improve(
     order: Int32[np.ndarray, " N"],
 ) -> None:
     """Reorder pixels such that each takes fewer bits beside the one before it; the first and the last one stay.
-
-    ``bits`` are equal for a difference and its negative.
-    """
+    ``bits`` are equal for a difference and its negative."""
     places = np.empty(len(order), np.int32)
     for place in range(len(order)):
         places[order[place]] = place

@@ -24,8 +24,7 @@ CELL_ITERATIONS = 4
 START_ITERATIONS = 1
 SAMPLES_PER_CENTROID = 64
 
-CANDIDATES = 4
-"""Centroids of nearby cells among which the nearest ones are found, in multiples of the number to be found."""
+CANDIDATES = 4  # centroids of nearby cells that are compared, in multiples of those to be found
 
 
 def start(data: Vectors, spread: float, size: int, settings: EncodeSettings, pool: Workers) -> Clustering:
@@ -85,10 +84,8 @@ def allocate(
     errors: Float64[np.ndarray, " J"], counts: Int[np.ndarray, " J"], size: int, tolerance: float
 ) -> Int[np.ndarray, " J"]:
     """Return the number of centroids of each coarse cluster: in proportion to sqrt(error × count), at most its vectors.
-
     A cluster gets at least one, and only one if its mean squared error is within ``tolerance``. The sum is at most
-    ``size``.
-    """
+    ``size``."""
     limit = np.where(errors > tolerance * counts, counts, np.minimum(counts, 1))
     demand = np.sqrt(errors * counts)
     shares = np.minimum(counts, 1)
@@ -176,17 +173,12 @@ def near_centroids(
 # for each centroid. Sums run in a fixed order in float64, each cluster belongs to one task, and all random numbers come
 # from one seed: the result does not depend on the number of threads.
 
-METRIC_ITERATIONS = 3
-"""Iterations under a metric, after those of the Euclidean distance."""
-
-OUTLIERS = 1e-3
-"""Share of entries, at either end of a dimension, that may be clipped so that the step of the others stays small."""
+METRIC_ITERATIONS = 3  # iterations under a metric, after those of the Euclidean distance
+OUTLIERS = 1e-3  # share of entries at either end of a dimension that may be clipped, for a smaller step
 
 
 @dataclass(frozen=True, slots=True)
 class Clusters:
-    """Result of a clustering."""
-
     centroids: Float32[np.ndarray, "K D"]
     labels: Int32[np.ndarray, " N"]  # centroid of each vector
     step: float  # step of the lattice that the centroids lie on; 0 for none
@@ -205,11 +197,8 @@ def fit(
     metric: ShMetric | None = None,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Clusters:
-    """Find at most ``size`` centroids of small weighted squared error.
-
-    They are rounded to steps of ``lattice`` times their root mean square error, 0 for none; see
-    :func:`_round_to_lattice` for ``from_zero``.
-    """
+    """Find at most ``size`` centroids of small weighted squared error. They are rounded to steps of ``lattice`` times
+    their root mean square error, 0 for none; see :func:`_round_to_lattice` for ``from_zero``."""
     # The kernels take contiguous, writeable arrays only, although they do not write to these.
     data = Vectors(
         np.require(table, requirements=("C", "W")),
@@ -271,9 +260,7 @@ def _mean_square_error(state: Clustering, metric: ShMetric | None, pool: Workers
 
 def _round_to_lattice(centroids: np.ndarray, step: float, tolerance: float, from_zero: bool) -> float:
     """Round in place to multiples of the step that is returned, counted from 0 or from each dimension's smallest value.
-
-    In the latter case a constant dimension keeps its value, and there are at most 255 steps.
-    """
+    In the latter case a constant dimension keeps its value, and there are at most 255 steps."""
     low = np.zeros(centroids.shape[1])
     step = max(step, 2 * tolerance)
     if not from_zero:

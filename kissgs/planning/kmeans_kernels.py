@@ -16,9 +16,7 @@ def sort_by_label(
     labels: Int32[np.ndarray, " N"], edges: Int64[np.ndarray, " K"], members: Int32[np.ndarray, " N"]
 ) -> None:
     """Write the numbers of the vectors, sorted by label, to ``members``; vectors of equal label keep their order.
-
-    ``edges`` are the numbers of vectors of smaller labels; they are modified.
-    """
+    ``edges`` are the numbers of vectors of smaller labels; they are modified."""
     for n in range(labels.shape[0]):
         label = labels[n]
         members[edges[label]] = n
@@ -64,10 +62,7 @@ def means(
                 centroids[k, d] = total[d] / weight
 
 
-@compiled(
-    "void(float32[:, ::1], uint16[:, ::1], int64, int64, int64, uint16[:, ::1])",
-    fastmath=_FAST,
-)
+@compiled("void(float32[:, ::1], uint16[:, ::1], int64, int64, int64, uint16[:, ::1])", fastmath=_FAST)
 def find_near(
     centroids: Float32[np.ndarray, "K D"],
     near: UInt16[np.ndarray, "K k"],
@@ -76,11 +71,9 @@ def find_near(
     last: int,
     found: UInt16[np.ndarray, "K k"],
 ) -> None:
-    """Find near centroids of the centroids ``first`` to ``last`` in the lists of them and of those near to them.
-
-    A neighbour's neighbour is probably a neighbour (NN-descent: Dong, Moses and Li, WWW 2011). The lists of ``others``
-    near ones are searched; ``found`` receives the centroid itself, then others by rising distance.
-    """
+    """Find near centroids of the centroids ``first`` to ``last`` in the lists of them and of those near to them. A
+    neighbour's neighbour is probably a neighbour (NN-descent: Dong, Moses and Li, WWW 2011). The lists of ``others``
+    near ones are searched; ``found`` receives the centroid itself, then others by rising distance."""
     count = near.shape[1]
     seen = np.full(near.shape[0], -1, dtype=np.int32)
     best = np.empty(count, dtype=np.float32)
@@ -111,10 +104,8 @@ def find_near(
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 def _lowest(vector: np.ndarray, columns: np.ndarray, norms: np.ndarray, scores: np.ndarray) -> tuple[int, float]:
-    """Return the first column of the smallest score, its scalar product with a vector plus its norm, and the score.
-
-    The loops over columns are what the compiler turns into vector code.
-    """
+    """Return the first column of the smallest score, its scalar product with a vector plus its norm, and the score. The
+    loops over columns are what the compiler turns into vector code."""
     dimensions, count = columns.shape
     thirds = dimensions - dimensions % 3
     for j in range(count):
@@ -179,8 +170,7 @@ def assign_near(
 
 
 @compiled(
-    "void(float32[:, ::1], int32[::1], int64[::1], float32[:, ::1], uint16[:, ::1], int64, int32[::1])",
-    fastmath=_FAST,
+    "void(float32[:, ::1], int32[::1], int64[::1], float32[:, ::1], uint16[:, ::1], int64, int32[::1])", fastmath=_FAST
 )
 def assign_by_form(
     vectors: Float32[np.ndarray, "n P+D"],  # upper triangle of the form of each, row by row, and the form times it
@@ -192,9 +182,7 @@ def assign_by_form(
     labels: Int32[np.ndarray, " N"],  # receives the centroids
 ) -> None:
     """Assign vectors of some clusters to that of their cluster's near centroids at which their own form is smallest.
-
-    The form of a difference x - c is that of c less twice the product of c with the form times x, and a constant.
-    """
+    The form of a difference x - c is that of c less twice the product of c with the form times x, and a constant."""
     dimensions, count = centroids.shape[1], near.shape[1]
     triangle = vectors.shape[1] - dimensions
     columns = np.empty((vectors.shape[1], count), dtype=np.float32)
@@ -331,10 +319,8 @@ def relocate(
     labels: Int32[np.ndarray, " N"],  # cluster of each vector; modified
     near: UInt16[np.ndarray, "K k"],  # near centroids of each, itself first; modified
 ) -> None:
-    """Merge clusters into their partners and give their numbers to halves of others, while that lowers the error.
-
-    A cluster takes part once at most.
-    """
+    """Merge clusters into their partners and give their numbers to halves of others, while that lowers the error. A
+    cluster takes part once at most."""
     count = near.shape[1]
     used = np.zeros(near.shape[0], dtype=np.bool_)
     row = np.empty(count, dtype=np.uint16)

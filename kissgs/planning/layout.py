@@ -28,8 +28,7 @@ from kissgs.settings import EncodeSettings
 MIN_BLOCK = 8
 MIN_CONFIGURATIONS = 4
 CHANNELS_PER_TASK = 4
-CONVERGED = 1e-4
-"""Share of its squared distance by which a pass must reduce a block's, or be its last."""
+CONVERGED = 1e-4  # share of its squared distance by which a pass must reduce a block's, or be its last
 
 
 def plas(
@@ -45,28 +44,20 @@ def plas(
     side = round(len(items) ** 0.5)
     placed = np.arange(len(items), dtype=np.int32)
     rng = np.random.Generator(np.random.PCG64(seed))
-    radii = _radii(start_radius or side // 2 - 1, decay)
+    start = start_radius or side // 2 - 1
+    radii, smaller = [max(start, 1)], float(start)
+    while (smaller := smaller * decay) >= 1:
+        radii.append(int(smaller))
     for step, radius in enumerate(radii):
         report(step / len(radii))
         width = min(side - 1, 2 * radius + 1)
         target = box_blur(items[placed].reshape(side, side, -1), width // 2, pool).reshape(len(items), -1)
         size = max(min(width + 1, side) // 2 * 2, MIN_BLOCK)
-        configuration = 0
-        while True:
+        for configuration in range(1, 3 * MIN_CONFIGURATIONS + 1):
             gained = _improve(items, placed, target, side, size, rng, pool)
-            configuration += 1
             if configuration >= MIN_CONFIGURATIONS and gained <= 0:
                 break
-            if configuration >= 3 * MIN_CONFIGURATIONS:
-                break
     return placed
-
-
-def _radii(start: int, decay: float) -> list[int]:
-    radii, radius = [max(start, 1)], float(start)
-    while (radius := radius * decay) >= 1:
-        radii.append(int(radius))
-    return radii
 
 
 def _improve(
@@ -121,8 +112,7 @@ def box_blur(image: Float32[np.ndarray, "H W C"], radius: int, pool: Workers) ->
 # and the fourth the column. Four sorts take milliseconds where PLAS, which moves
 # vectors until neighbours are as similar as possible, takes seconds.
 
-BLOCK = 8
-"""Side of a block, cells; sides of codebooks are multiples of it."""
+BLOCK = 8  # side of a block, cells; sides of codebooks are multiples of it
 
 
 def principal_axes(vectors: Float32[np.ndarray, "N D"], number: int) -> Float32[np.ndarray, "N axes"]:
@@ -152,11 +142,8 @@ def axes_order(coordinates: Float32[np.ndarray, "cells axes"]) -> Int[np.ndarray
 # through space, planes are smaller than with any two-dimensional arrangement that was measured. The grid is described
 # in docs/reference/format.md.
 
-PLAS_HIGH, PLAS_LOW = 1.0, 0.2
-"""Weights of the high and the low position bytes in PLAS, as in the paper's public encoder."""
-
-CURVE_BITS = 48
-"""Bits of a position along the Hilbert curve."""
+PLAS_HIGH, PLAS_LOW = 1.0, 0.2  # weights of high and low position bytes, as in the paper's public encoder
+CURVE_BITS = 48  # bits of a position along the Hilbert curve
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,18 +177,19 @@ def layout_grid(
     classes: Integer[np.ndarray, " M"] | None = None,
     groups: UInt16[np.ndarray, " N"] | None = None,
 ) -> Grid:
-    """Assign a cell to every Gaussian of ``kept``.
-
-    With ``classes`` and the Hilbert order, the Gaussians of class 0 come first, then those of class 1 and so on, each
-    class along its own curve. With ``groups``, all this is done for group 0, then for group 1 and so on.
-    """
+    """Assign a cell to every Gaussian of ``kept``. With ``classes`` and the Hilbert order, the Gaussians of class 0
+    come first, then those of class 1 and so on, each class along its own curve. With ``groups``, all this is done for
+    group 0, then for group 1 and so on."""
     side = grid_side(len(kept))
     if len(kept) == 0:
         nothing = np.zeros(side * side, dtype=np.int32)
         return Grid(side, nothing, nothing.astype(bool), nothing)
     levels = quantize_means(selected(means, kept), bits=bits, pool=pool).levels
     if settings.order != "plas":
-        order = hilbert_order(levels, _with_groups(classes, groups, kept), pool)
+        if groups is not None:  # which follow one another, and the classes within each
+            own = groups[kept]
+            classes = own if classes is None else own * np.uint16(classes.max(initial=0) + 1) + classes
+        order = hilbert_order(levels, classes, pool)
         order = np.concatenate([order, np.repeat(order[-1:], side * side - len(order))])
         mask = np.arange(side * side) < len(kept)
     else:
@@ -210,16 +198,6 @@ def layout_grid(
     rank = np.empty(len(kept), dtype=np.int32)
     rank[order[mask]] = np.arange(len(kept), dtype=np.int32)
     return Grid(side, kept.astype(np.int32, copy=False).take(order), mask, rank[order])
-
-
-def _with_groups(
-    classes: Integer[np.ndarray, " M"] | None, groups: UInt16[np.ndarray, " N"] | None, kept: Int[np.ndarray, " M"]
-) -> Integer[np.ndarray, " M"] | None:
-    """Return classes such that the groups follow one another, and the classes within each."""
-    if groups is None:
-        return classes
-    own = groups[kept]
-    return own if classes is None else own * np.uint16(classes.max(initial=0) + 1) + classes
 
 
 def _plas_order(

@@ -15,26 +15,10 @@ from kissgs.core.positions import coarse_note
 from kissgs.core.resources import Workers, blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS, Splats
-from kissgs.planning import rd_fields
+from kissgs.planning import quantize, rd_fields
 from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import hilbert_order, layout_grid
-from kissgs.planning.quantize import (
-    EVEN_LEVELS,
-    MEANS_TOP,
-    ByteTables,
-    ContainerModel,
-    Planning,
-    Quantized,
-    Rows,
-    clip_outliers,
-    half_steps,
-    log_extent,
-    means_bits,
-    quantize,
-    quantize_means,
-    selected,
-    sorted_order,
-)
+from kissgs.planning.quantize import EVEN_LEVELS, ByteTables, ContainerModel, Planning, Quantized, Rows, selected
 from kissgs.planning.rate_distortion import ColorRefit, plan_rate_distortion
 from kissgs.planning.rd_fields import OUTLIERS, largest_errors
 from kissgs.planning.rotation_forms import SHAPE_COLUMNS, choose_forms
@@ -46,34 +30,19 @@ from kissgs.settings import EncodeSettings
 # WebP codes the differences of a pixel from the one on its left, which then take fewer bits for what resembles that of
 # neighbours: high bytes of positions and base colours.
 
-BLOCK, SMALLEST = 1 << 13, 64
-"""Largest and smallest number of Gaussians that are reordered together: reversals in larger blocks take longer, and
-smaller ones have too few differences to count."""
-
-ROUNDS, PASSES = 2, 2
-"""Number of times that bits are counted and near Gaussians found, each time in blocks that begin elsewhere, and the
-largest number of passes of the local search in each."""
-
-NEAR, REACH = 8, 16
-"""Number of Gaussians that each one may be joined to, and places on the curves among which they are found."""
-
-CURVES = ((0, 1, 2, 0), (1, 2, 0, 21845), (2, 0, 1, 43690))
-"""Axes and shift of the Hilbert curves on which near Gaussians are found: where one has a gap, another has none."""
-
-SMOOTHING = ((-2, 1 / 9), (-1, 2 / 9), (0, 3 / 9), (1, 2 / 9), (2, 1 / 9))
-"""Shifts and weights of the average of the counts of similar differences."""
-
-UNIT = 256
-"""Fractions of a bit that the local search counts in, so that no rounding of a machine changes the order."""
+BLOCK, SMALLEST = 1 << 13, 64  # Gaussians reordered together; fewer have too few differences to count
+ROUNDS, PASSES = 2, 2  # rounds of counting bits, in blocks that begin elsewhere, and most passes in each
+NEAR, REACH = 8, 16  # Gaussians that each may be joined to, and places on the curves where they are found
+CURVES = ((0, 1, 2, 0), (1, 2, 0, 21845), (2, 0, 1, 43690))  # axes and shift: where one has a gap, another has none
+SMOOTHING = ((-2, 1 / 9), (-1, 2 / 9), (0, 3 / 9), (1, 2 / 9), (2, 1 / 9))  # average of counts: shifts, weights
+UNIT = 256  # fractions of a bit that the local search counts in, so that no rounding of a machine changes the order
 
 
 def refine_order(
     plan: EncodingPlan, groups: UInt16[np.ndarray, " N"] | None, pool: Workers, progress: Progress
 ) -> EncodingPlan:
     """Reorder a plan along the Hilbert curve within each class, and within each of ``groups``; reports "reorder".
-
-    Padding, at the end, repeats the last Gaussian, which stays.
-    """
+    Padding, at the end, repeats the last Gaussian, which stays."""
     count = len(plan.classes)
     if count == 0:
         return plan
@@ -82,11 +51,11 @@ def refine_order(
     means, colors = (plan.fields[name].levels[:count] for name in ("means", "f_dc"))
     order = refined_order(means, colors, runs, pool, lambda fraction: progress("reorder", fraction))
     cells = np.concatenate([order, np.arange(count, len(plan.grid.cells), dtype=np.int32)])
-    fields = {name: field.take(cells) for name, field in plan.fields.items() if name != "f_rest_centroids"}
+    rows = {name: field.take(cells) for name, field in plan.fields.items() if name != "f_rest_centroids"}
     return replace(
         plan,
         grid=replace(plan.grid, cells=plan.grid.cells[cells]),
-        fields={name: fields.get(name, field) for name, field in plan.fields.items()},
+        fields={**plan.fields, **rows},
         codebook=replace(plan.codebook, labels=plan.codebook.labels[order]),
         classes=plan.classes[order],
         costs=None if plan.costs is None else plan.costs.take(order),
@@ -100,11 +69,8 @@ def refined_order(
     pool: Workers,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Int32[np.ndarray, " M"]:
-    """Return the index of the Gaussian for every place.
-
-    Gaussians at the same position keep their order, because renderers blend them in it. The first and the last Gaussian
-    of a run stay.
-    """
+    """Return the index of the Gaussian for every place. Gaussians at the same position keep their order, because
+    renderers blend them in it. The first and the last Gaussian of a run stay."""
     pixels, order = _pixels(means, colors), np.arange(len(means), dtype=np.int32)
     ends = np.concatenate([np.flatnonzero(np.diff(runs)) + 1, [len(runs)]]).tolist()
 
@@ -117,8 +83,7 @@ def refined_order(
         def report_done(fraction: float, done: int = done) -> None:
             report((done + fraction) / ROUNDS)
 
-        blocks = _blocks(ends, BLOCK if done % 2 == 0 else BLOCK // 2)
-        pool.map(refine, blocks, report_done)
+        pool.map(refine, _blocks(ends, BLOCK if done % 2 == 0 else BLOCK // 2), report_done)
     return _with_equal_positions_in_order(order, means)
 
 
@@ -129,10 +94,8 @@ def _pixels(means: UInt16[np.ndarray, "M 3"], colors: UInt8[np.ndarray, "M 3"]) 
 
 
 def _blocks(ends: list[int], first_size: int) -> list[slice]:
-    """Return blocks of runs with these ends: in each run, one of at most ``first_size`` places, then larger ones.
-
-    What is left of a run may be too small to count differences in, and is no block.
-    """
+    """Return blocks of runs with these ends: in each run, one of at most ``first_size`` places, then larger ones. What
+    is left of a run may be too small to count differences in, and is no block."""
     blocks = []
     for start, end in pairwise([0, *ends]):
         edges = [start, *range(start + first_size, end, BLOCK), end]
@@ -154,10 +117,8 @@ def _block_order(means: UInt16[np.ndarray, "B 3"], pixels: UInt8[np.ndarray, "B 
 
 
 def _difference_bits(pixels: UInt8[np.ndarray, "B C"]) -> Int32[np.ndarray, "C 256"]:
-    """Return the bits of each difference of a channel from the pixel before, modulo 256, by how often it occurs.
-
-    The counts of differences that are alike are averaged. A difference and its negative take the same bits.
-    """
+    """Return the bits of each difference of a channel from the pixel before, modulo 256, by how often it occurs. The
+    counts of differences that are alike are averaged. A difference and its negative take the same bits."""
     counts = np.stack([np.bincount(channel, minlength=256) for channel in np.diff(pixels, axis=0).T]).astype(np.float64)
     counts += counts[:, -np.arange(256)]
     counts = (counts + sum(weight * np.roll(counts, shift, axis=1) for shift, weight in SMOOTHING)) / 2 + 1
@@ -170,7 +131,7 @@ def _with_equal_positions_in_order(
     """Return an order in which Gaussians of equal position have ascending indices."""
     x, y, z = means[order].T
     keys = x | y.astype(np.uint64) << np.uint64(16) | z.astype(np.uint64) << np.uint64(32)
-    places = sorted_order(keys, 48)
+    places = quantize.sorted_order(keys, 48)
     group = np.cumsum(np.diff(keys, prepend=keys[:1]) > 0)
     shared = np.bincount(group, minlength=1)[group] > 1
     places, group = places[shared], group[shared]
@@ -181,11 +142,8 @@ def _with_equal_positions_in_order(
 
 # Uniform planning: the steps of the settings for all Gaussians, without rendering the scene.
 
-FINEST = 1e-4
-"""Step of values that may take all levels of a table."""
-
-PAPER_TOPS = {"opacities": 255, "scales": 255, "quaternions": 99, "f_dc": 255}
-"""Largest level of each field in the paper, in every channel."""
+FINEST = 1e-4  # step of values that may take all levels of a table
+PAPER_TOPS = {"opacities": 255, "scales": 255, "quaternions": 99, "f_dc": 255}  # largest levels in the paper
 
 
 def plan_uniform(
@@ -194,13 +152,14 @@ def plan_uniform(
     """Plan the Gaussians ``kept``, which may be none, for a container."""
     settings, container, pool = planning.settings, planning.container, planning.pool
     most = 16 if container.tables is None else 32
-    bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance, pool, most=most)
+    bits = settings.means_bits or quantize.means_bits(splats, kept, settings.means_tolerance, pool, most=most)
     grid = layout_grid(splats.means, kept, min(bits, 16), settings, pool, planning.report("order"), None, groups)
     grid = grid.with_padding_last() if container.padding_last else grid
     # Padding repeats Gaussians of the scene; in a scene without any, padding is a neutral Gaussian.
     source, cells = (splats, grid.cells) if len(kept) else (_neutral(splats.sh_degree), grid.cells * 0)
-    clips = settings.shared_step_size and container.tables is None
-    sh0 = clip_outliers(source.sh0, step=settings.sh0_step, share=OUTLIERS) if clips else source.sh0
+    shared, sh0 = settings.shared_step_size, source.sh0
+    if shared and container.tables is None:
+        sh0 = quantize.clip_outliers(sh0, step=settings.sh0_step, share=OUTLIERS)
     shapes, form_error = choose_forms(source, cells, grid.side, planning)
     chosen = cells[grid.mask]
     weights = np.ones(len(chosen), np.float32)
@@ -209,26 +168,22 @@ def plan_uniform(
     size = max(len(chosen) / settings.gaussians_per_codebook_entry, FEW)
     codebook = fit_codebook(source, chosen, weights, size, planning)
     return_free_memory()
-    steps = {
-        "opacities": settings.opacity_step,
-        "scales": settings.scale_step,
-        "quaternions": settings.quat_step,
-        "f_dc": settings.sh0_step,
-    }
+    own = settings.opacity_step, settings.scale_step, settings.quat_step, settings.sh0_step
+    steps = dict(zip(PAPER_TOPS, own, strict=True))
     if container.tables is not None:
-        if not settings.shared_step_size:
+        if not shared:
             steps = dict.fromkeys(steps, FINEST)
         means, colors = source.means[cells], source.sh0[cells]
         fields, errors = _table_fields(means, colors, shapes[:], bits, steps, container.tables)
     else:
         rows: dict[str, Rows] = {name: shapes.field(name) for name in SHAPE_COLUMNS}
         rows["f_dc"] = selected(sh0, cells)
-        fields = {"means": quantize_means(selected(source.means, cells), bits=bits, pool=pool)}
+        fields = {"means": quantize.quantize_means(selected(source.means, cells), bits=bits, pool=pool)}
         for name, step in steps.items():
-            top = 255 if settings.shared_step_size else PAPER_TOPS[name]
-            fields[name] = quantize(rows[name], step=step, shared=settings.shared_step_size, max_top=top, pool=pool)
-        errors = {name: half_steps(field) for name, field in fields.items()}
-        errors["means"] = half_steps(fields["means"], 1 << (16 - bits))
+            top = 255 if shared else PAPER_TOPS[name]
+            fields[name] = quantize.quantize(rows[name], step=step, shared=shared, max_top=top, pool=pool)
+        errors = {name: quantize.half_steps(field) for name, field in fields.items()}
+        errors["means"] = quantize.half_steps(fields["means"], 1 << (16 - bits))
     return EncodingPlan(
         scene=PlannedScene(len(splats), len(kept), splats.sh_degree, splats.origin, splats.antialiased),
         grid=grid,
@@ -252,7 +207,7 @@ def _table_fields(
     """Return the levels by field, and the largest errors, for a container with tables."""
     equal = np.ones(len(means))
     each = {name: step * equal for name, step in steps.items()}
-    unit = log_extent(means) / MEANS_TOP
+    unit = quantize.log_extent(means) / quantize.MEANS_TOP
     wanted = rd_fields.stored_values(values, tables)
     shapes = rd_fields.rounded_shapes(wanted, equal, each, tables)
     fields = {
@@ -275,14 +230,9 @@ def _neutral(sh_degree: int) -> Splats:
     )
 
 
-INVISIBLE_LOGIT = -5.5373
-"""Logit of opacity 1/255, rounded up; no renderer draws Gaussians of this opacity or less."""
-
-SAMPLED = 1 << 18
-"""Number of Gaussians whose sizes are compared with the steps of positions."""
-
-MAX_GROUPS = 1 << 14
-"""Largest number of groups of Gaussians in a container: group and class of steps together are a number of 16 bits."""
+INVISIBLE_LOGIT = -5.5373  # logit of opacity 1/255, rounded up; no renderer draws Gaussians of this opacity or less
+SAMPLED = 1 << 18  # number of Gaussians whose sizes are compared with the steps of positions
+MAX_GROUPS = 1 << 14  # in a container: group and class of steps together are a number of 16 bits
 
 
 def plan_encoding(
@@ -296,11 +246,9 @@ def plan_encoding(
     keep_costs: bool = True,
     groups: UInt16[np.ndarray, " N"] | None = None,
 ) -> EncodingPlan:
-    """Choose order, rotation forms, codebook and levels for a clean scene.
-
-    Without sensitivity, or if no camera saw any Gaussian, planning is uniform, with the steps of the settings. With
-    ``groups``, the Gaussians of each follow one another in the container, the groups in ascending order.
-    """
+    """Choose order, rotation forms, codebook and levels for a clean scene. Without sensitivity, or if no camera saw any
+    Gaussian, planning is uniform, with the steps of the settings. With ``groups``, the Gaussians of each follow one
+    another in the container, the groups in ascending order."""
     if groups is not None and settings.order == "plas":
         raise UnsupportedError("a container with groups of Gaussians needs order=hilbert or order=refined")
     if groups is not None and int(groups.max(initial=0)) >= MAX_GROUPS:
@@ -316,14 +264,10 @@ def plan_encoding(
             plan = plan_uniform(splats, kept, planning, groups)
         if settings.order == "refined":
             plan = refine_order(plan, groups, pool, context.progress)
-        return replace(plan, coarse=_coarse(splats, plan))
-
-
-def _coarse(splats: Splats, plan: EncodingPlan) -> str:
-    """Return the sentence about coarse positions, by at most :data:`SAMPLED` Gaussians."""
-    order, means = plan.grid.cells[plan.grid.mask], plan.fields["means"]
-    some = order[:: 1 + len(order) // SAMPLED]
-    return coarse_note(splats.means[some], splats.scales[some], means.low, means.high, len(order))
+        order, means = plan.grid.cells[plan.grid.mask], plan.fields["means"]
+        some = order[:: 1 + len(order) // SAMPLED]
+        note = coarse_note(splats.means[some], splats.scales[some], means.low, means.high, len(order))
+        return replace(plan, coarse=note)
 
 
 def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndarray, " K"]:

@@ -22,12 +22,10 @@ from kissgs.settings import EncodeSettings
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ByteTables:
-    """Eight-bit levels that stand for the values of tables, as SOG has them.
-
-    Scales, base colours and SH coefficients have one free table of 256 values each, for all their channels. Rotations
-    are three of the quaternion's components, 255 steps from -1/sqrt(2) to 1/sqrt(2), and which one is left out.
-    Positions have 65,536 levels over a range of their own per axis.
-    """
+    """Eight-bit levels that stand for the values of tables, as SOG has them. Scales, base colours and SH coefficients
+    have one free table of 256 values each, for all their channels. Rotations are three of the quaternion's components,
+    255 steps from -1/sqrt(2) to 1/sqrt(2), and which one is left out. Positions have 65,536 levels over a range of
+    their own per axis."""
 
     opacity_logits: Float64[np.ndarray, " 256"]  # opacity logit of each level, ascending
     first_drawn: int  # smallest level of opacity that renderers draw
@@ -43,8 +41,7 @@ class ContainerModel:
     entry_bits: float = 112  # typical size of an entry of the SH codebook, bits, at 45 dimensions
 
 
-EVEN_LEVELS = ContainerModel()
-"""Evenly spaced levels, and a mask that says which cells hold a Gaussian: the default."""
+EVEN_LEVELS = ContainerModel()  # evenly spaced levels, and a mask that says which cells hold a Gaussian: the default
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,25 +63,19 @@ class Planning:
 
 R = TypeVar("R")
 
-BLOCK = 1 << 14
-"""Number of rows of a block: its float64 values stay in the processor's cache."""
+BLOCK = 1 << 14  # number of rows of a block: its float64 values stay in the processor's cache
 
 
 @runtime_checkable
 class Rows(Protocol):
     """Array, or what gives the rows of one when asked: ``values[first:last]`` is ``(last - first, C)``."""
 
-    def __len__(self) -> int:
-        """Return the number of rows."""
-
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """Return some rows."""
+    def __len__(self) -> int: ...
+    def __getitem__(self, rows: slice, /) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Computed:
-    """Rows that a function computes."""
-
     count: int
     of: Callable[[slice], np.ndarray]
 
@@ -130,8 +121,7 @@ def sorted_order(keys: UInt64[np.ndarray, " N"], bits: int = 64) -> Int32[np.nda
 
 # Levels and the values that they stand for; uniform quantisers, and the ranges that decoders need to invert them.
 
-MEANS_TOP = 65_535
-"""Top level of positions. It must occur, because some readers of meta.json divide by it, not by the observed one."""
+MEANS_TOP = 65_535  # top level of positions; it must occur, as some readers of meta.json divide by it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,7 +150,6 @@ class Quantized:
         return self.table[-1].astype(np.float32)
 
     def values(self) -> Float64[np.ndarray, "N C"]:
-        """Return the values that the levels stand for."""
         shared = self.table.shape[1] == 1
         return np.asarray(self.table[self.levels, 0 if shared else np.arange(self.levels.shape[1])])
 
@@ -195,12 +184,12 @@ def quantize(
     max_top: int = 255,
     pool: Workers | None = None,
 ) -> Quantized:
-    """Round to uniform steps of at most ``step``, unless ``max_top`` steps do not span the widest channel.
-
-    One step for all channels has the least error for a given entropy. If it is not shared, every channel spreads
-    ``max_top`` levels over its own range.
-    """
-    low, high = _range(values, pool)
+    """Round to uniform steps of at most ``step``, unless ``max_top`` steps do not span the widest channel. One step for
+    all channels has the least error for a given entropy. If it is not shared, every channel spreads ``max_top`` levels
+    over its own range."""
+    ends = row_range(values, pool) if len(values) else (np.zeros(values[:0].shape[1]),) * 2
+    # The float32 numbers that are written; + 0.0 turns -0.0 into 0.0, so that equal scenes give equal bytes.
+    low, high = (end.astype(np.float32) + np.float32(0) for end in ends)
     extent = high.astype(np.float64) - low
     widest = float(extent.max(initial=0.0))
     top = max_top
@@ -217,11 +206,9 @@ def quantize(
 
 
 def clip_outliers(values: Float[np.ndarray, "N C"], *, step: float, share: float) -> Float[np.ndarray, "N C"]:
-    """Clip outliers that 256 levels of ``step`` cannot span, so that they do not make the step coarse for all.
-
-    Values that the levels span are returned unchanged. Else each channel keeps the span of all but the outermost
-    ``share`` of its values at either end, or the span of the levels if that is larger; values beyond are clipped to it.
-    """
+    """Clip outliers that 256 levels of ``step`` cannot span, so that they do not make the step coarse for all. Values
+    that the levels span are returned unchanged. Else each channel keeps the span of all but the outermost ``share`` of
+    its values at either end, or the span of the levels if that is larger; values beyond are clipped to it."""
     low, high = values.min(axis=0, initial=np.inf), values.max(axis=0, initial=-np.inf)
     if len(values) == 0 or float((high.astype(np.float64) - low).max(initial=0)) <= 255 * step:
         return values
@@ -238,13 +225,12 @@ def clip_outliers(values: Float[np.ndarray, "N C"], *, step: float, share: float
 def quantize_means(
     means: Float32[np.ndarray, "N 3"] | Rows, *, bits: int | Int[np.ndarray, " N"], pool: Workers | None = None
 ) -> Quantized:
-    """Quantise positions to 16-bit levels of their signed logarithm, with one range for all three axes.
-
-    Below 16 ``bits``, of all or of each, levels are multiples of a power of two, so that low bytes compress; the
-    outermost level stays 65535.
-    """
+    """Quantise positions to 16-bit levels of their signed logarithm, with one range for all three axes. Below 16
+    ``bits``, of all or of each, levels are multiples of a power of two, so that low bytes compress; the outermost level
+    stays 65535."""
+    stride = 1 << (16 - bits) if isinstance(bits, int) else np.left_shift(1, 16 - bits.astype(np.int16))
     if len(means) == 0:
-        return Quantized(np.empty((0, 3), np.uint16), np.zeros((MEANS_TOP + 1, 3)), *_strides(bits))
+        return Quantized(np.empty((0, 3), np.uint16), np.zeros((MEANS_TOP + 1, 3)), stride)
     smallest, largest = (end(values) for end, values in zip((np.min, np.max), row_range(means, pool), strict=True))
     ends = signed_log(np.array([smallest, largest])).astype(np.float32) + np.float32(0)
     low, high = np.repeat(ends[:1], 3), np.repeat(ends[1:], 3)
@@ -259,22 +245,15 @@ def quantize_means(
         levels[rows] = found
 
     for_each_block(len(means), work, pool)
-    return Quantized(levels, even_table(low, high, MEANS_TOP), *_strides(bits))
-
-
-def _strides(bits: int | Int[np.ndarray, " N"]) -> tuple[int | Int[np.ndarray, " N"]]:
-    """Return the distance of levels of 16 bits of which only ``bits`` are used."""
-    return (1 << (16 - bits),) if isinstance(bits, int) else (np.left_shift(1, 16 - bits.astype(np.int16)),)
+    return Quantized(levels, even_table(low, high, MEANS_TOP), stride)
 
 
 def means_bits(
     splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float, pool: Workers | None = None, *, most: int = 16
 ) -> int:
     """Return the position bits, 8 to ``most``, with which the median Gaussian moves at most ``tolerance`` of its size.
-
     The step of a signed logarithm grows as 1 + |x|; size is the geometric mean of the two longest axes. More than 16
-    bits of the range of all axes are for containers with a range of each axis, which may be smaller.
-    """
+    bits of the range of all axes are for containers with a range of each axis, which may be smaller."""
     if len(kept) == 0:
         return 16
     ratio = np.empty(len(kept))
@@ -301,11 +280,9 @@ def log_extent(means: Float32[np.ndarray, "N 3"] | Rows, pool: Workers | None = 
 
 
 def observed_range(quantized: Quantized) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
-    """Return the range to write: values of the smallest and the largest level that occur, over all channels.
-
-    A SOG-XT decoder does not know the number of levels: it maps the smallest level of an image to one end and the
-    largest to the other (docs/reference/format.md). An image of a single level decodes to the first everywhere.
-    """
+    """Return the range to write: values of the smallest and the largest level that occur, over all channels. A SOG-XT
+    decoder does not know the number of levels: it maps the smallest level of an image to one end and the largest to the
+    other (docs/reference/format.md). An image of a single level decodes to the first everywhere."""
     if quantized.levels.size == 0:
         return quantized.low, quantized.low
     first, last = int(quantized.levels.min()), int(quantized.levels.max())
@@ -316,18 +293,6 @@ def half_steps(quantized: Quantized, stride: int = 1) -> list[float]:
     """Return half the distance of levels that are multiples of ``stride``, per channel."""
     extent = quantized.table[-1] - quantized.table[0]
     return [float(step) for step in extent / quantized.top * stride / 2]
-
-
-def _range(
-    values: Float[np.ndarray, "N C"] | Rows, pool: Workers | None
-) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
-    """Return each channel's minimum and maximum as the float32 numbers that are written (zeros without rows)."""
-    if len(values) == 0:
-        zeros = np.zeros(values[:0].shape[1], dtype=np.float32)
-        return zeros, zeros
-    low, high = row_range(values, pool)
-    # + 0.0 turns -0.0 into 0.0, so that equal scenes give equal bytes.
-    return low.astype(np.float32) + np.float32(0), high.astype(np.float32) + np.float32(0)
 
 
 def _levels(
@@ -350,27 +315,18 @@ def _levels(
 
 # Tables of at most 256 values that all channels of an attribute share, and the nearest levels.
 
-SIZE = 256
-"""Largest number of values of a table."""
-
-WIDEST = 120
-"""Joined points span at most this fraction of the whole range, which bounds the error where weights are small."""
-
-DIGITS = 6
-"""Significant digits of the values of a table, which its container stores as text."""
-
-MAX_POINTS = 1 << 14
-"""Largest number of lattice points before joining; the lattice is coarser for values that occupy more."""
+SIZE = 256  # largest number of values of a table
+WIDEST = 120  # joined points span at most this fraction of the whole range: a bound of the error
+DIGITS = 6  # significant digits of the values of a table, which its container stores as text
+MAX_POINTS = 1 << 14  # lattice points before joining; beyond, the lattice is coarser
 
 
 def fit_table(
     values: Float[np.ndarray, " V"], weights: Float64[np.ndarray, " V"], step: float, *, with_zero: bool = False
 ) -> Float32[np.ndarray, " levels"]:
-    """Return ascending values of a table for at least one value: the occupied points of a lattice of this ``step``.
-
-    So outliers cost no step of the others. If more than 256 points are occupied, the neighbours whose union adds the
-    least weighted squared error are joined.
-    """
+    """Return ascending values of a table for at least one value: the occupied points of a lattice of this ``step``. So
+    outliers cost no step of the others. If more than 256 points are occupied, the neighbours whose union adds the least
+    weighted squared error are joined."""
     wide = np.asarray(values, np.float64)
     span = float(np.ptp(wide))
     step = max(step, span * 2.0**-40, 1e-30)
@@ -465,6 +421,5 @@ def refit_table(
 def without_unused(
     table: Float32[np.ndarray, " levels"], levels: Integer[np.ndarray, "N C"]
 ) -> tuple[Float32[np.ndarray, " used"], UInt8[np.ndarray, "N C"]]:
-    """Return the table without the values that no level uses, and the levels in it."""
     used, index = np.unique(levels, return_inverse=True)
     return table[used], index.reshape(levels.shape).astype(np.uint8)

@@ -12,6 +12,7 @@ from kissgs.core.positions import signed_log
 from kissgs.core.resources import Workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_C0, Splats
+from kissgs.planning import sh_codebook
 from kissgs.planning.clustering import ShMetric
 from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import layout_grid
@@ -19,45 +20,25 @@ from kissgs.planning.quantize import Planning, Quantized, for_each_block, means_
 from kissgs.planning.rd_criterion import SEEN, Costs, RdCriterion
 from kissgs.planning.rd_fields import RdFields, decoded_entries, decoded_scene, largest_changes, largest_errors
 from kissgs.planning.rotation_forms import choose_forms
-from kissgs.planning.sh_codebook import (
-    SH_SHRINK,
-    Codebook,
-    CodebookErrorModel,
-    codebook_error_model,
-    fit_codebook,
-    nearest_square,
-    sensitivity_weights,
-)
+from kissgs.planning.sh_codebook import Codebook, CodebookErrorModel, sensitivity_weights
 from kissgs.settings import EncodeSettings
 
 # Estimate of a scene's error by lambda, before it is planned, and the lambda for a given error.
 
-DIMENSIONS = 14
-"""Rounded degrees of freedom per Gaussian: opacity, scales, rotation, base colour, position."""
+DIMENSIONS = 14  # rounded degrees of freedom per Gaussian: opacity, scales, rotation, base colour, position
 
+# Measured ratio of the rounding error to H d²/12: RDO quantisation prefers levels of few bits, and the errors of
+# several Gaussians add up in a pixel.
 GROWTH = 2.2
-"""Measured ratio of the rounding error to H d²/12: above 1 because RDO quantisation prefers levels of few bits, and the
-errors of several Gaussians add up in a pixel."""
+PAPER_RATIO = 8  # Gaussians per codebook entry of the paper
+PAPER_SH_GROWTH = 2.0  # measured factor on uncompensated shN errors, which add up in pixels
 
-PAPER_RATIO = 8
-"""Gaussians per codebook entry of the paper."""
-
-PAPER_SH_GROWTH = 2.0
-"""Measured factor on uncompensated shN errors, which add up in pixels."""
-
+# Decibels per unit of view uncertainty by which errors in other views exceed those in measured views, where planning
+# hides them. Not of shN: its codebook hardly adapts to the measured views once sensitivity is shrunk towards the prior.
 OTHER_VIEWS_DB = 9.5
-"""Decibels per unit of view uncertainty by which errors in other views exceed those in the measured views, where
-planning hides them. It does not apply to shN: its codebook hardly adapts to the measured views once sensitivity is
-shrunk towards the prior."""
-
-MIN_ERROR_RATIO = 1.1
-"""Smallest error to aim at, in units of the smallest possible one: the last 0.4 dB would cost far too many bits."""
-
-SH_UNCOMPENSATED, SH_UNCOMPENSATED_GROWTH = 0.14, 1.9
-"""Measured share of shN errors that base colours cannot compensate, and its growth per unit of view uncertainty."""
-
-REFIT_GAIN = 0.17
-"""PSNR gain per iteration of the colour refit, decibels: below the measured mean, so that it holds for most scenes."""
+MIN_ERROR_RATIO = 1.1  # smallest error to aim at over the smallest possible: the last 0.4 dB cost too many bits
+SH_UNCOMPENSATED, SH_UNCOMPENSATED_GROWTH = 0.14, 1.9  # measured share, and growth per unit of view uncertainty
+REFIT_GAIN = 0.17  # PSNR gain per iteration of the colour refit, decibels: less than the measured mean
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +52,6 @@ class ErrorModel:
     view_uncertainty: float
 
     def error_at(self, rd_lambda: float) -> float:
-        """Estimate the mean squared error of the scene planned with ``rd_lambda``."""
         costs, count = self.costs, len(self.costs.color)
         pruned = costs.removal[costs.pruned_by_rd(rd_lambda, self.prune_bits)]
         rounding = GROWTH * DIMENSIONS * (count - len(pruned)) * rd_lambda / (2 * np.log(2))
@@ -82,9 +62,7 @@ class ErrorModel:
 
     def lambda_for(self, error: float) -> float:
         """Return the lambda at which the mean squared error is about ``error``, or 1.1 times the smallest possible one.
-
-        At any lambda, the error of the largest codebook remains.
-        """
+        At any lambda, the error of the largest codebook remains."""
         low, high = np.log(1e-22), np.log(1e-2)
         error = max(error, MIN_ERROR_RATIO * self.error_at(1e-22))
         for _ in range(60):
@@ -110,10 +88,8 @@ def choose_lambda(usual: float, model: ErrorModel, settings: EncodeSettings, ref
 
 def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_model: CodebookErrorModel) -> float:
     """Estimate the mean squared error of the default quality: the smaller one of the presets ``paper`` and ``fast``.
-
     The paper's 100 levels for rotations, 256 for the rest and 65,536 for positions are spread from each channel's
-    smallest to its largest value, so that a single outlier makes them coarse; the steps of ``fast`` are absolute.
-    """
+    smallest to its largest value, so that a single outlier makes them coarse; the steps of ``fast`` are absolute."""
     scene = {"opacities": splats.opacities[:, None], "scales": splats.scales, "sh0": splats.sh0, "means": splats.means}
     ends = {name: row_range(selected(values, kept)) for name, values in scene.items()}
     spans = [np.ptp(np.array(ends[name], np.float64), axis=0) for name in ("opacities", "scales", "sh0")]
@@ -137,13 +113,11 @@ def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_
 
 
 def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs, sh_model: CodebookErrorModel) -> float:
-    """Estimate the mean squared error of rounding to such steps of opacity, scale, rotation, colour and position.
-
-    A Gaussian's error is at most twice that of its removal: one copy too few, and one where there should be none. The
+    """Estimate the mean squared error of rounding to such steps of opacity, scale, rotation, colour and position. A
+    Gaussian's error is at most twice that of its removal: one copy too few, and one where there should be none. The
     Hessian alone overestimates the rotation of long, thin Gaussians, a few of which would then decide. The share of
-    positions is bounded by that of as many other numbers: far from the origin, even 16 bits are coarse, at
-    any lambda.
-    """
+    positions is bounded by that of as many other numbers: far from the origin, even 16 bits are coarse, at any
+    lambda."""
     each = (costs.opacity, costs.scale, costs.rotation, costs.color, costs.position)
     squares = [float(np.sum(np.square(step, dtype=np.float64))) for step in steps]
 
@@ -154,7 +128,7 @@ def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs,
     total = sum(for_each_block(len(costs.color), bounded))
     total += min(float(costs.position.sum()) * squares[-1] / 12, total * 3 / (DIMENSIONS - 3))
     entries = max(len(costs.color) / ratio, 1)
-    return total + PAPER_SH_GROWTH * sh_model.unweighted * (sh_model.entries / entries) ** SH_SHRINK
+    return total + PAPER_SH_GROWTH * sh_model.unweighted * (sh_model.entries / entries) ** sh_codebook.SH_SHRINK
 
 
 def implied_lambda(error: float, count: int) -> float:
@@ -162,14 +136,10 @@ def implied_lambda(error: float, count: int) -> float:
     return 2 * float(np.log(2)) * error / (GROWTH * DIMENSIONS * max(count, 1))
 
 
+# Function that returns better base colours for the decoded Gaussians and their indices in the scene.
 ColorRefit = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
-"""Function that returns better base colours for the decoded Gaussians and their indices in the scene."""
-
-MAX_COMPENSATION = np.float32(0.5 / SH_C0)
-"""Largest change of a base colour that compensates lost SH coefficients: half of a colour's range."""
-
-MANY_PRUNED = 0.2
-"""Share of pruned Gaussians above which the report explains why they were pruned."""
+MAX_COMPENSATION = np.float32(0.5 / SH_C0)  # of lost SH coefficients by a base colour: half of a colour's range
+MANY_PRUNED = 0.2  # share of pruned Gaussians above which the report explains why they were pruned
 
 
 def plan_rate_distortion(
@@ -189,7 +159,7 @@ def plan_rate_distortion(
     costs = Costs.of(sensitivity, splats, pool)
     return_free_memory()
     costs = costs.keep(kept) if len(kept) < len(splats) else costs
-    sh_model = codebook_error_model(splats, kept, sensitivity, settings, pool)
+    sh_model = sh_codebook.codebook_error_model(splats, kept, sensitivity, settings, pool)
     refits = settings.color_refit_iterations if recolor is not None else 0
     prune_bits = settings.prune_threshold_bits * (1 - uncertainty)
     model = ErrorModel(costs, sh_model, prune_bits, settings.gaussians_per_codebook_entry, uncertainty)
@@ -222,7 +192,11 @@ def plan_rate_distortion(
     shapes, form_error = choose_forms(splats, grid.cells, grid.side, planning)
     shapes = shapes.take(grid.mask)
     size = sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry, container.entry_bits)
-    codebook = _codebook(splats, order, sensitivity, size, planning)
+    size = sh_codebook.nearest_square(size) if container.tables is None else size
+    metric = ShMetric.of(sensitivity, splats.sh_degree)
+    codebook = sh_codebook.fit_codebook(
+        splats, order, sensitivity_weights(sensitivity, order, splats), size, planning, metric=metric
+    )
     return_free_memory()
 
     planning.report("rounding")
@@ -258,20 +232,6 @@ def _ranks(order: Int[np.ndarray, " M"], kept: Int[np.ndarray, " M"], count: int
     return place.take(order)
 
 
-def _codebook(
-    splats: Splats,
-    order: Int[np.ndarray, " M"],
-    sensitivity: Sensitivity,
-    size: int,
-    planning: Planning,
-) -> Codebook:
-    """Return the SH codebook of about ``size`` entries, fitted to what cameras see of each colour."""
-    weights = sensitivity_weights(sensitivity, order, splats)
-    metric = ShMetric.of(sensitivity, splats.sh_degree)
-    most = nearest_square(size) if planning.container.tables is None else size
-    return fit_codebook(splats, order, weights, most, planning, metric=metric)
-
-
 def _base_colors(
     splats: Splats,
     order: Int[np.ndarray, " M"],
@@ -281,23 +241,9 @@ def _base_colors(
     recolor: ColorRefit | None,
     pool: Workers,
 ) -> Float32[np.ndarray, "M 3"]:
-    """Return the base colours that fit the decoded shapes and view-dependent colours."""
-    rest = decoded_entries(codebook, splats.shN.shape[1])
-    base = _compensated_colors(splats, order, sensitivity, rest, codebook.labels, pool)
-    if recolor is None:
-        return base
-    return recolor(decoded_scene(fields, base, rest[codebook.labels[: len(order)]]), order)
-
-
-def _compensated_colors(
-    splats: Splats,
-    order: Int[np.ndarray, " M"],
-    sensitivity: Sensitivity,
-    entries: Float32[np.ndarray, "entries K 3"],
-    labels: Int[np.ndarray, " M"],
-    pool: Workers,
-) -> Float32[np.ndarray, "M 3"]:
-    """Return base colours that make up for what the codebook loses of each Gaussian's shN, where cameras see it."""
+    """Return base colours that make up for what the codebook loses of each Gaussian's shN, where cameras see it; or
+    those that ``recolor`` makes of them."""
+    entries, labels = decoded_entries(codebook, splats.shN.shape[1]), codebook.labels
     base = splats.sh0.take(order, axis=0)
 
     def compensate(rows: slice) -> None:
@@ -309,7 +255,7 @@ def _compensated_colors(
 
     if splats.sh_degree > 0:
         for_each_block(len(order), compensate, pool)
-    return base
+    return base if recolor is None else recolor(decoded_scene(fields, base, entries[labels[: len(order)]]), order)
 
 
 def _pruning_note(pruned_by_rd: Bool[np.ndarray, " M"], costs: Costs) -> str:

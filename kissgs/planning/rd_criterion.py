@@ -14,17 +14,10 @@ from kissgs.core.sensitivity import OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.planning.quantize import Computed, Rows, for_each_block, sorted_order
 
-FLOOR = 1e-3
-"""Smallest sensitivity, in units of the median, so that Gaussians that no camera saw keep a bounded error."""
-
-MIX = np.uint64(0x9E3779B97F4A7C15)
-"""Odd multiplier with random bits, for a hash of positions."""
-
-SEEN = 0.1
-"""Coverage below which a Gaussian counts as unseen: no camera saw it, or only from far away."""
-
-MAX_PRUNED = 0.5
-"""Largest share of pruned Gaussians: each removal uncovers others, so removal scores hold for a limited share."""
+FLOOR = 1e-3  # smallest sensitivity, in units of the median, so that Gaussians that no camera saw keep a bounded error
+MIX = np.uint64(0x9E3779B97F4A7C15)  # odd multiplier with random bits, for a hash of positions
+SEEN = 0.1  # coverage below which a Gaussian counts as unseen: no camera saw it, or only from far away
+MAX_PRUNED = 0.5  # share of pruned Gaussians: each removal uncovers others, so scores hold for some
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,11 +49,12 @@ class Costs:
 
         for_each_block(len(splats), measure, pool)
         for cost in (found.opacity, found.scale, found.rotation, found.color, found.position):
-            _raise_to_floor(cost)
+            seen = cost[cost > 0]
+            floor = max(FLOOR * float(np.median(seen, overwrite_input=True)), 1e-30) if len(seen) else 1e-30
+            np.maximum(cost, floor, out=cost)
         return found
 
     def take(self, chosen: Int[np.ndarray, " k"]) -> Costs:
-        """Return the costs of the Gaussians ``chosen``."""
         return Costs(**{name: getattr(self, name).take(chosen) for name in Costs.__slots__})
 
     def of_rounding(self) -> Costs:
@@ -77,10 +71,8 @@ class Costs:
 
     def classes(self, number: int, means: Float32[np.ndarray, "M 3"] | Rows) -> UInt8[np.ndarray, " M"]:
         """Return the sensitivity class of each Gaussian, from 0, the most sensitive; classes have similar sizes.
-
         Gaussians of equal ``means`` are in one class: renderers blend them in stored order, which is by class. No class
-        number below the largest is unused.
-        """
+        number below the largest is unused."""
         count = len(means)
         each = min(number, count)
         classes = np.empty(count, np.uint8)
@@ -107,11 +99,9 @@ class Costs:
     def pruned_by_rd(
         self, rd_lambda: float, threshold_bits: float, default_lambda: float | None = None
     ) -> Bool[np.ndarray, " M"]:
-        """Return which Gaussians' removal costs less than ``threshold_bits``; at most :data:`MAX_PRUNED` of all.
-
-        For Gaussians that no camera saw from nearby, only the excess over the lambda of the default quality counts, so
-        that up to it all of them are kept.
-        """
+        """Return which Gaussians' removal costs less than ``threshold_bits``; at most :data:`MAX_PRUNED` of all. For
+        Gaussians that no camera saw from nearby, only the excess over the lambda of the default quality counts, so that
+        up to it all of them are kept."""
         unseen = 0.0 if default_lambda is None else min(default_lambda, rd_lambda) * (self.coverage < SEEN)
         pruned = self.removal < threshold_bits * (rd_lambda - unseen)
         most = int(MAX_PRUNED * len(pruned))
@@ -123,16 +113,8 @@ class Costs:
 def _rows_of(sensitivity: Sensitivity, rows: slice) -> Sensitivity:
     """Return the sensitivity of some Gaussians, without a copy."""
     values: dict[str, Any] = {field.name: getattr(sensitivity, field.name) for field in fields(sensitivity)}
-    for name, value in values.items():
-        if isinstance(value, np.ndarray):
-            values[name] = value[rows]
+    values |= {name: each[rows] for name, each in values.items() if isinstance(each, np.ndarray)}
     return Sensitivity(**values)
-
-
-def _raise_to_floor(cost: Float64[np.ndarray, " M"]) -> None:
-    seen = cost[cost > 0]
-    floor = max(FLOOR * float(np.median(seen, overwrite_input=True)), 1e-30) if len(seen) else 1e-30
-    np.maximum(cost, floor, out=cost)
 
 
 def _position_keys(means: Float32[np.ndarray, "M 3"] | Rows) -> UInt64[np.ndarray, " M"]:
@@ -167,8 +149,7 @@ def _join_equal(key: UInt64[np.ndarray, " M"], classes: UInt8[np.ndarray, " M"])
 # class has its own step, a multiple of the finest class's, so that the decoder needs no classes. WebP's entropy codes,
 # which vary over an image, spend no bits on a class's unused levels.
 
-ROUNDED = ("opacity", "scale", "rotation", "color", "position")
-"""Attributes of :class:`Costs` that are rounded to steps."""
+ROUNDED = ("opacity", "scale", "rotation", "color", "position")  # attributes of Costs that are rounded to steps
 
 
 def step(cost: float, rd_lambda: float) -> float:

@@ -13,29 +13,8 @@ from kissgs.core.array_types import Float, Float32, Float64, Int, Integer, UInt8
 from kissgs.core.positions import signed_exp, signed_log
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
-from kissgs.planning import rotation_forms
-from kissgs.planning.quantize import (
-    MEANS_TOP,
-    SIZE,
-    ByteTables,
-    Computed,
-    Planning,
-    Quantized,
-    Rows,
-    clip_outliers,
-    even_table,
-    fit_table,
-    for_each_block,
-    log_extent,
-    means_bits,
-    nearest_levels,
-    quantize_means,
-    refit_table,
-    row_range,
-    selected,
-    table_field,
-    without_unused,
-)
+from kissgs.planning import quantize, rotation_forms
+from kissgs.planning.quantize import ByteTables, Computed, Planning, Quantized, Rows, for_each_block, selected
 from kissgs.planning.rd_criterion import RdCriterion
 from kissgs.planning.rotation_forms import KEPT, PERMUTATIONS, SHAPE_COLUMNS, StoredShapes
 from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook
@@ -44,29 +23,22 @@ from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook
 #
 # Every sensitivity class has its own step, and within a class, frequent levels are preferred where the error is small.
 
+# Largest step of each attribute and largest change by rounding, at any lambda: the Hessian does not hold for larger
+# errors. UNSEEN, the steps of fast, is for Gaussians that no camera saw; VIRTUAL for those that virtual cameras saw,
+# because others may come closer; CAPTURED for those that a capture's cameras saw. A Gaussian smaller than a pixel has
+# no derivative by its size, but would become a visible blob from nearby, so scales may grow less than shrink.
 UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
 VIRTUAL = {"opacities": 0.4, "scales": 0.13, "growth": 0.12, "quaternions": 0.04, "f_dc": 0.2}
 CAPTURED = {"opacities": 2.0, "scales": 0.6, "growth": 0.3, "quaternions": 0.25, "f_dc": 0.5}
-"""Largest step of each attribute and largest change by rounding, at any lambda.
-
-``UNSEEN``, the steps of ``fast``, is for Gaussians that no camera saw; ``VIRTUAL`` for those that virtual cameras saw,
-because other cameras may come closer; ``CAPTURED`` for those that a capture's cameras saw. The Hessian does not hold
-for larger errors. A Gaussian smaller than a pixel has no derivative by its size, but would become a visible blob from
-nearby, so scales may grow less than they may shrink (``growth``).
-"""
-
-STEP_GROWTH_POWER = 1 / 3
-"""Exponent with which these bounds grow with ``step_growth``, measured with cameras that the encoder did not use."""
+STEP_GROWTH_POWER = 1 / 3  # of step_growth, by which these bounds grow; measured with other cameras
 
 
 def largest_changes(
     coverage: Float[np.ndarray, " M"], captured: Float[np.ndarray, " M"], step_growth: float
 ) -> dict[str, Computed]:
-    """Return the largest change by rounding of each attribute of each Gaussian, rows of float64.
-
-    Optimal steps grow as the root of lambda. These bounds grow more slowly: they protect views in which a change is
-    more visible than in the measured ones, where pruning or coarser colours would be the smaller loss.
-    """
+    """Return the largest change by rounding of each attribute of each Gaussian, rows of float64. Optimal steps grow as
+    the root of lambda. These bounds grow more slowly: they protect views in which a change is more visible than in the
+    measured ones, where pruning or coarser colours would be the smaller loss."""
 
     def change(name: str, rows: slice) -> Float64[np.ndarray, " n"]:
         seen, by_capture = coverage[rows].astype(np.float64), captured[rows].astype(np.float64)
@@ -77,23 +49,16 @@ def largest_changes(
     return {name: Computed(len(coverage), partial(change, name)) for name in CAPTURED}
 
 
-UNUSED_COUNT = 0.05
-"""Count that an unused level has in the estimate of its bits."""
-
-ROUNDS = 3
-"""Number of iterations of counting levels and choosing by the counts."""
-
-CHUNK = 1 << 14
-"""Gaussians per task."""
+UNUSED_COUNT = 0.05  # count that an unused level has in the estimate of its bits
+ROUNDS = 3  # number of iterations of counting levels and choosing by the counts
+CHUNK = 1 << 14  # Gaussians per task
 
 
 def quantize_by_steps(
-    values: Float[np.ndarray, "M C"] | Rows,
-    steps: Float64[np.ndarray, " M"] | Rows,
-    pool: Workers | None = None,
+    values: Float[np.ndarray, "M C"] | Rows, steps: Float64[np.ndarray, " M"] | Rows, pool: Workers | None = None
 ) -> Quantized:
     """Round to the nearest multiples of each Gaussian's own step, the same for all its channels."""
-    smallest, largest = row_range(values, pool)
+    smallest, largest = quantize.row_range(values, pool)
     low32 = smallest.astype(np.float32) + np.float32(0)
     low = low32.astype(np.float64)
     extent = largest.astype(np.float64) - low
@@ -113,7 +78,7 @@ def quantize_by_steps(
 
     for_each_block(count, round_to_levels, pool)
     high = np.where(extent > 0, low + top * finest, low).astype(np.float32)
-    return Quantized(levels, even_table(low32, high, top), stride)
+    return Quantized(levels, quantize.even_table(low32, high, top), stride)
 
 
 def rdo_quantize(
@@ -126,10 +91,8 @@ def rdo_quantize(
     pool: Workers,
     tables: ByteTables | None = None,
 ) -> dict[str, Quantized]:
-    """Choose the levels of opacities, scales and quaternions jointly by squared error plus lambda · bits.
-
-    With ``tables``, the values of the scales' table move to the mean of what they stand for.
-    """
+    """Choose the levels of opacities, scales and quaternions jointly by squared error plus lambda · bits. With
+    ``tables``, the values of the scales' table move to the mean of what they stand for."""
     from kissgs.planning import rdo_kernels
 
     classes = criterion.classes
@@ -143,36 +106,22 @@ def rdo_quantize(
         if tables is not None:
             ends[0] = tables.first_drawn, tables.last_drawn
 
-        def choose(
-            rows: slice,
-            rate_table: Float64[np.ndarray, "classes C 256"] = rate_table,
-            values_of_levels: Float64[np.ndarray, "C 256"] = values_of_levels,
-            ends: Int[np.ndarray, "C 2"] = ends,
-        ) -> None:
+        of_levels = values_of_levels, ends, rate_table
+
+        def choose(rows: slice, of_levels: tuple[np.ndarray, np.ndarray, np.ndarray] = of_levels) -> None:
             chosen = levels[rows].astype(np.int64)
             missing = np.full(len(chosen), -1) if omitted is None else omitted[rows].astype(np.int64)
-            rdo_kernels.choose_levels(
-                values[rows],
-                np.tile(np.arange(4), (len(chosen), 1)) if omitted is None else KEPT[missing],
-                missing,
-                hessians[rows],
-                forms[rows],
-                PERMUTATIONS,
-                classes[rows].astype(np.int64),
-                values_of_levels,
-                ends,
-                rate_table,
-                _bounds(largest, rows, levels.shape[1]),
-                floor,
-                chosen,
-            )
+            stored = np.tile(np.arange(4), (len(chosen), 1)) if omitted is None else KEPT[missing]
+            own = hessians[rows], forms[rows], PERMUTATIONS, classes[rows].astype(np.int64)
+            bounds = _bounds(largest, rows, levels.shape[1])
+            rdo_kernels.choose_levels(values[rows], stored, missing, *own, *of_levels, bounds, floor, chosen)
             levels[rows] = chosen
 
         for_each_block(len(levels), choose, pool, block=CHUNK)
         if criterion.costs is not None and tables is not None:
             bounds = largest["scales"][:], largest["growth"][:]
             table = parts["scales"].table[:, 0].astype(np.float32)
-            moved = refit_table(table, levels[:, 1:4], values[:][:, 1:4], criterion.costs.scale, bounds)
+            moved = quantize.refit_table(table, levels[:, 1:4], values[:][:, 1:4], criterion.costs.scale, bounds)
             parts = {**parts, "scales": replace(parts["scales"], table=moved.astype(np.float64)[:, None])}
     chosen = np.split(levels, [1, 4], axis=1)
     found = {name: replace(parts[name], levels=own) for name, own in zip(SHAPE_COLUMNS, chosen, strict=True)}
@@ -185,7 +134,7 @@ def _values_of_levels(fields: list[Quantized]) -> tuple[Float64[np.ndarray, "C 2
     for field in fields:
         for column in range(field.levels.shape[1]):
             table = field.table[:, column % field.table.shape[1]]
-            values.append(np.pad(table, (0, SIZE - len(table)), mode="edge"))
+            values.append(np.pad(table, (0, quantize.SIZE - len(table)), mode="edge"))
             ends.append((0, field.top if table[-1] > table[0] else 0))
     return np.stack(values), np.array(ends)
 
@@ -203,19 +152,15 @@ def _bounds(
 
 
 def level_bits(
-    levels: Integer[np.ndarray, "M C"],
-    classes: Integer[np.ndarray, " M"],
-    pool: Workers | None = None,
+    levels: Integer[np.ndarray, "M C"], classes: Integer[np.ndarray, " M"], pool: Workers | None = None
 ) -> Float64[np.ndarray, "classes C 256"]:
     """Estimate the bits of every level of every channel in every class from the counts of ``levels``."""
     number = int(classes.max()) + 1
 
     def counted(rows: slice) -> Int[np.ndarray, "classes C 256"]:
         base = classes[rows].astype(np.int64) * 256
-        return np.stack(
-            [np.bincount(base + column, minlength=number * 256).reshape(number, 256) for column in levels[rows].T],
-            axis=1,
-        )
+        counts = [np.bincount(base + column, minlength=number * 256) for column in levels[rows].T]
+        return np.stack([each.reshape(number, 256) for each in counts], axis=1)
 
     likely = np.sum(for_each_block(len(levels), counted, pool), axis=0) + UNUSED_COUNT
     return np.asarray(np.log2(likely.sum(axis=2, keepdims=True)) - np.log2(likely))
@@ -225,10 +170,8 @@ def level_bits(
 
 
 def stored_values(values: Float64[np.ndarray, "M 8"], tables: ByteTables) -> Float64[np.ndarray, "M 8"]:
-    """Return opacity logits, log-scales and quaternions in the form in which they are quantised.
-
-    Logits are clipped to those of the levels that may be used; beyond, opacities differ by less than 1/255.
-    """
+    """Return opacity logits, log-scales and quaternions in the form in which they are quantised. Logits are clipped to
+    those of the levels that may be used; beyond, opacities differ by less than 1/255."""
     lowest, highest = tables.opacity_logits[[tables.first_drawn, tables.last_drawn]]
     opacities = np.clip(values[:, :1], lowest, highest)
     return np.concatenate([opacities, values[:, 1:4], shape_quats(values[:, 4:])], axis=1)
@@ -240,26 +183,21 @@ def rounded_shapes(
     steps: Mapping[str, Float64[np.ndarray, " M"]],
     tables: ByteTables,
 ) -> dict[str, Quantized]:
-    """Round opacity, log-scales and quaternion of :func:`stored_values` to steps of each Gaussian's own.
-
-    ``weights`` are squared image errors per squared unit of the log-scales.
-    """
+    """Round opacity, log-scales and quaternion of :func:`stored_values` to steps of each Gaussian's own. ``weights``
+    are squared image errors per squared unit of the log-scales."""
     quats = values[:, 4:]
-    opacities = nearest_levels(tables.opacity_logits, _on_lattice(values[:, :1], steps["opacities"]))
+    opacities = quantize.nearest_levels(tables.opacity_logits, _on_lattice(values[:, :1], steps["opacities"]))
     finest = float(steps["scales"].min())
     scales = _on_lattice(values[:, 1:4], np.clip(np.rint(steps["scales"] / finest), 1, 255) * finest)
-    scale_table = fit_table(scales.ravel(), np.repeat(weights, 3), finest)
+    scale_table = quantize.fit_table(scales.ravel(), np.repeat(weights, 3), finest)
     omitted = rotation_forms.omitted_components(quats)
     small = rotation_forms.stored_components(quats, omitted)
+    strides = np.clip(np.rint(steps["quaternions"] / rotation_forms.STEP), 1, 64).astype(np.int64)
+    drawn = np.clip(opacities, tables.first_drawn, tables.last_drawn)
     return {
-        "opacities": Quantized(
-            np.clip(opacities, tables.first_drawn, tables.last_drawn), tables.opacity_logits[:, None]
-        ),
-        "scales": Quantized(nearest_levels(scale_table, scales), scale_table.astype(np.float64)[:, None]),
-        "quaternions": Quantized(
-            rotation_forms.lattice_levels(small, rotation_forms.strides(steps["quaternions"])),
-            rotation_forms.TABLE[:, None],
-        ),
+        "opacities": Quantized(drawn, tables.opacity_logits[:, None]),
+        "scales": Quantized(quantize.nearest_levels(scale_table, scales), scale_table.astype(np.float64)[:, None]),
+        "quaternions": Quantized(rotation_forms.lattice_levels(small, strides), rotation_forms.TABLE[:, None]),
         "omitted": Quantized(omitted[:, None], np.arange(4.0)[:, None]),
     }
 
@@ -272,8 +210,8 @@ def finished_shapes(
     hidden = logits <= tables.opacity_logits[1]
     opacities[hidden, 0] = np.rint(255 / (1 + np.exp(-logits[hidden])))
     scales = fields["scales"]
-    used = without_unused(scales.table[:, 0].astype(np.float32), scales.levels)
-    return {**fields, "opacities": replace(fields["opacities"], levels=opacities), "scales": table_field(*used)}
+    used = quantize.table_field(*quantize.without_unused(scales.table[:, 0].astype(np.float32), scales.levels))
+    return {**fields, "opacities": replace(fields["opacities"], levels=opacities), "scales": used}
 
 
 def color_field(
@@ -282,23 +220,21 @@ def color_field(
     """Return the levels of base colours, each Gaussian's rounded to a step of its own."""
     finest = float(steps.min())
     rounded = _on_lattice(base, np.clip(np.rint(steps / finest), 1, 255) * finest)
-    table = fit_table(rounded.ravel(), np.repeat(weights, 3), finest)
-    return table_field(*without_unused(table, nearest_levels(table, rounded)))
+    table = quantize.fit_table(rounded.ravel(), np.repeat(weights, 3), finest)
+    return quantize.table_field(*quantize.without_unused(table, quantize.nearest_levels(table, rounded)))
 
 
 def means_field(means: Float32[np.ndarray, "M 3"], steps: float | Float64[np.ndarray, " M"]) -> Quantized:
-    """Return 16-bit levels of the positions' signed logarithms, with a range per axis.
-
-    Levels are multiples of a power of two, up to 256, of about the step of each Gaussian, so that low bytes compress.
-    """
+    """Return 16-bit levels of the positions' signed logarithms, with a range per axis. Levels are multiples of a power
+    of two, up to 256, of about the step of each Gaussian, so that low bytes compress."""
     logs = signed_log(means)
     low, high = (_as_text(end.astype(np.float32)) for end in (logs.min(axis=0), logs.max(axis=0)))
-    table = even_table(low, high, MEANS_TOP)
+    table = quantize.even_table(low, high, quantize.MEANS_TOP)
     extent = high.astype(np.float32).astype(np.float64) - low.astype(np.float32)
-    unit = np.where(extent > 0, extent, np.inf) / MEANS_TOP
+    unit = np.where(extent > 0, extent, np.inf) / quantize.MEANS_TOP
     exponents = np.log2(np.maximum(np.reshape(steps, (-1, 1)) / unit, 1))
     every = np.exp2(np.clip(np.floor(exponents + 0.5), 0, 8))
-    levels = np.clip(np.rint((logs - low.astype(np.float32)) / unit / every) * every, 0, MEANS_TOP)
+    levels = np.clip(np.rint((logs - low.astype(np.float32)) / unit / every) * every, 0, quantize.MEANS_TOP)
     stride = np.broadcast_to(every, levels.shape).astype(np.int64)
     return Quantized(levels.astype(np.uint16), table, stride)
 
@@ -327,8 +263,7 @@ def _on_lattice(values: Float64[np.ndarray, "M C"], steps: Float[np.ndarray, " M
 
 # Levels of every attribute at one lambda, in the values that the container can hold.
 
-OUTLIERS = 1e-4
-"""Share of base colours, at either end of a channel, that may be clipped so that the step of the others stays small."""
+OUTLIERS = 1e-4  # share of base colours at either end of a channel that may be clipped, for a smaller step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -340,7 +275,6 @@ class RdFields:
     largest: Mapping[str, Rows]  # see largest_changes
 
     def shapes(self, values: StoredShapes, hessians: Rows) -> dict[str, Quantized]:
-        """Quantise opacity, log-scales and rotation."""
         criterion, tables, pool = self.criterion, self.planning.container.tables, self.planning.pool
         wanted: StoredShapes | Float64[np.ndarray, "M 8"] = values
         steps = {
@@ -351,10 +285,8 @@ class RdFields:
             fields = {name: quantize_by_steps(values.field(name), steps[name], pool) for name in SHAPE_COLUMNS}
         else:
             logits = values.field("opacities")[:][:, 0].astype(np.float64)
-            wanted = stored_values(values[:], tables)
-            fields = rounded_shapes(
-                wanted, criterion.costs.scale, {name: some[:] for name, some in steps.items()}, tables
-            )
+            wanted, each = stored_values(values[:], tables), {name: some[:] for name, some in steps.items()}
+            fields = rounded_shapes(wanted, criterion.costs.scale, each, tables)
         if self.planning.settings.rdo_quantization:
             fields = rdo_quantize(wanted, fields, hessians, values.forms, criterion, self.largest, pool, tables)
             if tables is None:
@@ -362,20 +294,18 @@ class RdFields:
         return fields if tables is None else finished_shapes(fields, logits, tables)
 
     def means(self, splats: Splats, order: Int[np.ndarray, " M"], coarser: Int[np.ndarray, " M"]) -> Quantized:
-        """Quantise the positions of the Gaussians ``order``, with the bits that lambda asks for in each class.
-
-        A Gaussian has at most ``coarser`` bits less than :func:`means_bits` gives for ``means_tolerance``.
-        """
+        """Quantise the positions of the Gaussians ``order``, with the bits that lambda asks for in each class. A
+        Gaussian has at most ``coarser`` bits less than :func:`means_bits` gives for ``means_tolerance``."""
         means, criterion, pool = selected(splats.means, order), self.criterion, self.planning.pool
-        usual = means_bits(splats, order, self.planning.settings.means_tolerance, pool)
+        usual = quantize.means_bits(splats, order, self.planning.settings.means_tolerance, pool)
         most = np.clip(16 - usual + coarser, 0, 8)
-        unit = max(log_extent(means, pool), 1e-30) / MEANS_TOP
+        unit = max(quantize.log_extent(means, pool), 1e-30) / quantize.MEANS_TOP
         steps = criterion.steps["position"]
         if self.planning.container.tables is not None:
             each = np.array(steps)[criterion.classes]
             return means_field(means[:], np.minimum(each, unit * 2.0**most / np.sqrt(2)))
         coarse = np.array([min(max(np.floor(np.log2(step / unit) + 0.5), 0), 8) for step in steps]).astype(np.int8)
-        return quantize_means(means, bits=16 - np.minimum(coarse[criterion.classes], most), pool=pool)
+        return quantize.quantize_means(means, bits=16 - np.minimum(coarse[criterion.classes], most), pool=pool)
 
     def colors(self, base: Float32[np.ndarray, "M 3"]) -> tuple[Quantized, int]:
         """Quantise base colours; return them and the number of clipped outliers."""
@@ -383,7 +313,7 @@ class RdFields:
         steps = criterion.each_step("color", self.largest["f_dc"])
         if self.planning.container.tables is not None and criterion.costs is not None:
             return color_field(base.astype(np.float64), steps[:], criterion.costs.color), 0
-        clipped = clip_outliers(base, step=min(criterion.steps["color"]), share=OUTLIERS)
+        clipped = quantize.clip_outliers(base, step=min(criterion.steps["color"]), share=OUTLIERS)
         levels = quantize_by_steps(clipped, steps, self.planning.pool)
         return levels, 0 if clipped is base else int((clipped != base).any(axis=1).sum())
 
@@ -404,7 +334,6 @@ def decoded_entries(codebook: Codebook, coefficients: int) -> Float32[np.ndarray
 def decoded_scene(
     fields: dict[str, Quantized], sh0: Float32[np.ndarray, "M 3"], shN: Float32[np.ndarray, "M K 3"]
 ) -> Splats:
-    """Return the decoded scene."""
     quats = decoded_quats(fields)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     return Splats(

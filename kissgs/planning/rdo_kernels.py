@@ -11,10 +11,8 @@ from kissgs.core.numba_kernels import compiled
 
 @njit(nogil=True, error_model="numpy")
 def _form_hessian(packed: np.ndarray, order: np.ndarray, floor: np.ndarray, hessian: np.ndarray) -> None:
-    """Unpack a Hessian of :class:`kissgs.Sensitivity` for a form with its axes in ``order``, ``(3,)``.
-
-    ``floor``: ``(3,)`` is added to the diagonal: opacity, scales, rotation.
-    """
+    """Unpack a Hessian of :class:`kissgs.Sensitivity` for a form with its axes in ``order``, ``(3,)``. ``floor``:
+    ``(3,)`` is added to the diagonal: opacity, scales, rotation."""
     hessian[0, 0] = packed[0] + floor[0]
     for i in range(3):
         hessian[0, 1 + i] = hessian[1 + i, 0] = packed[1 + order[i]]
@@ -24,10 +22,8 @@ def _form_hessian(packed: np.ndarray, order: np.ndarray, floor: np.ndarray, hess
 
 @njit(nogil=True, error_model="numpy")
 def _rotation_vectors(quat: np.ndarray, vectors: np.ndarray) -> None:
-    """Write the derivative of the rotation vector by each component of a quaternion, ``(4, 3)``.
-
-    A change dq of a quaternion q turns by the vector 2 Im(conj(q) dq) / |q|².
-    """
+    """Write the derivative of the rotation vector by each component of a quaternion, ``(4, 3)``. A change dq of a
+    quaternion q turns by the vector 2 Im(conj(q) dq) / |q|²."""
     w, x, y, z = quat[0], quat[1], quat[2], quat[3]
     scale = 2 / (w * w + x * x + y * y + z * z)
     w, x, y, z = scale * w, scale * x, scale * y, scale * z
@@ -49,9 +45,7 @@ def _start(
     error: np.ndarray,
 ) -> float:
     """Write the error (opacity, scales, rotation vector) of the levels, and its derivatives by the stored components.
-
-    Return the sum of the squares of the components. Where one is left out, the others move it.
-    """
+    Return the sum of the squares of the components. Where one is left out, the others move it."""
     for j in range(4):
         error[j] = tables[j, levels[j]] - values[j]
     error[4:] = 0.0
@@ -91,11 +85,9 @@ def choose_levels(
     floor: Float64[np.ndarray, " 3"],  # added to the Hessians' diagonals: opacity, scales, rotation
     levels: Int64[np.ndarray, "N C"],  # modified
 ) -> None:
-    """Choose the levels of each Gaussian's opacity, log-scales and quaternion by squared error plus lambda · bits.
-
-    They are chosen one after the other, each given the others, because an error of the opacity can compensate one of a
-    scale.
-    """
+    """Choose the levels of each Gaussian's opacity, log-scales and quaternion by squared error plus lambda · bits. They
+    are chosen one after the other, each given the others, because an error of the opacity can compensate one of a
+    scale."""
     columns = levels.shape[1]
     hessian, jacobian, error = np.zeros((7, 7), np.float64), np.zeros((8, 7), np.float64), np.empty(7, np.float64)
     vectors = np.empty((4, 3), np.float64)

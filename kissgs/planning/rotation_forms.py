@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, UInt8
+from kissgs.core.array_types import Bool, Float32, Float64, Int, UInt8
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.planning.layout import box_blur
@@ -15,13 +15,11 @@ from kissgs.planning.quantize import Computed, Planning, for_each_block, selecte
 
 # Rotations as three components of a quaternion, a byte each; the fourth, not negative, follows from the length 1.
 
-TABLE = (np.arange(256) / 255 - 0.5) * np.sqrt(2)
-"""Value of each level; 0 lies between the levels 127 and 128."""
+TABLE = (np.arange(256) / 255 - 0.5) * np.sqrt(2)  # value of each level; 0 lies between the levels 127 and 128
 
 STEP = float(TABLE[1] - TABLE[0])
 
-KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""The three stored components, by the index of the missing one in w, x, y, z."""
+KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # by the index of the missing one in w, x, y, z
 
 
 def omitted_components(quats: Float64[np.ndarray, "N 4"]) -> UInt8[np.ndarray, " N"]:
@@ -39,7 +37,6 @@ def with_sign(quats: Float64[np.ndarray, "N 4"], omitted: UInt8[np.ndarray, " N"
 def stored_components(
     quats: Float64[np.ndarray, "N 4"], omitted: UInt8[np.ndarray, " N"]
 ) -> Float64[np.ndarray, "N 3"]:
-    """Return the three components that are stored."""
     return np.take_along_axis(quats, KEPT[omitted], axis=1)
 
 
@@ -70,16 +67,12 @@ def whole(
     return quats
 
 
-def strides(step: Float[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
-    """Return the multiple of the levels' distance nearest to each step, from 1 to 64."""
-    return np.clip(np.rint(step / STEP), 1, 64).astype(np.int64)
-
-
 # Choice among the 48 equivalent (rotation, scales) forms of a Gaussian, which all have the same covariance.
 #
 # The axes of an ellipsoid can be ordered in 6 and directed in 4 right-handed ways, and q and -q are one rotation:
 # 6 × 4 × 2 = 48. PRAS is the paper's name (section on permutation-rotation sorting) for choosing among them.
 
+# Quaternion g of each form, w x y z, the rotations of the cube: the new rotation is the Hamilton product q g.
 _A, _H = 0.5**0.5, 0.5
 ROTATIONS: Float64[np.ndarray, "24 4"] = np.array(
     [
@@ -92,15 +85,11 @@ ROTATIONS: Float64[np.ndarray, "24 4"] = np.array(
     ],
     dtype=np.float64,
 )
-"""Quaternion g of each form, w x y z, the rotations of the cube: the new rotation is the Hamilton product q g."""
-
+# Scale order of each form, (24, 3): the new scales are the old ones at these indices.
 PERMUTATIONS = np.repeat([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)], 4, axis=0).astype(np.int64)
-"""Scale order of each form, ``(24, 3)``: the new scales are the old ones at these indices."""
-
 CHUNK = 1 << 16
 
-SHAPE_COLUMNS = {"opacities": slice(0, 1), "scales": slice(1, 4), "quaternions": slice(4, 8)}
-"""Columns of opacity logit, log-scales and quaternion, by field of the container."""
+SHAPE_COLUMNS = {"opacities": slice(0, 1), "scales": slice(1, 4), "quaternions": slice(4, 8)}  # by field
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +114,6 @@ class StoredShapes:
         return np.concatenate([opacities, scales, quats / quats[:, :1] if self.w_is_one else quats], axis=1)
 
     def take(self, chosen: Int[np.ndarray, " K"] | Bool[np.ndarray, " M"]) -> StoredShapes:
-        """Return the rows ``chosen``."""
         return StoredShapes(self.splats, self.index[chosen], self.forms[chosen], self.w_is_one)
 
     def field(self, name: str) -> Computed:
@@ -138,11 +126,9 @@ class StoredShapes:
 def choose_forms(
     splats: Splats, cells: Int[np.ndarray, " cells"], side: int, planning: Planning
 ) -> tuple[StoredShapes, float]:
-    """Choose the form of rotation and log-scales of the Gaussian in each of ``cells``, as the settings say.
-
-    Where the container stores whole quaternions, which decoders normalise, those of canonical forms have w = 1: x, y
-    and z hold the whole rotation, and w takes no bits.
-    """
+    """Choose the form of rotation and log-scales of the Gaussian in each of ``cells``, as the settings say. Where the
+    container stores whole quaternions, which decoders normalise, those of canonical forms have w = 1: x, y and z hold
+    the whole rotation, and w takes no bits."""
     settings, pool, report = planning.settings, planning.pool, planning.report("forms")
     if settings.rotation_form == "canonical":
         forms = np.empty(len(cells), np.uint8)
@@ -184,10 +170,8 @@ def apply_forms(
 
 
 def canonical_forms(quats: Float64[np.ndarray, "N 4"]) -> UInt8[np.ndarray, " N"]:
-    """Return the form of largest w, which has the smallest rotation angle; among equals, the first of the table.
-
-    All rotations are then within 63° of the identity: w is at least 0.85 and x, y, z use 40 % of their range.
-    """
+    """Return the form of largest w, which has the smallest rotation angle; among equals, the first of the table. All
+    rotations are then within 63° of the identity: w is at least 0.85 and x, y, z use 40 % of their range."""
     from kissgs.planning import kernels
 
     forms = np.empty(len(quats), np.uint8)
@@ -204,11 +188,9 @@ def pras_forms(
     decay: float,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> UInt8[np.ndarray, " N"]:
-    """Choose forms that make neighbours on the grid similar: the closest to 8-bit proxies, blurred less and less.
-
-    One proxy range serves the scales of all three axes, so that permuting them changes no proxy. All forms are those of
-    the input, not of an intermediate form, so that rounding errors do not add up.
-    """
+    """Choose forms that make neighbours on the grid similar: the closest to 8-bit proxies, blurred less and less. One
+    proxy range serves the scales of all three axes, so that permuting them changes no proxy. All forms are those of the
+    input, not of an intermediate form, so that rounding errors do not add up."""
     from kissgs.planning import kernels
 
     count = len(quats)
@@ -217,7 +199,6 @@ def pras_forms(
     quat_proxy = (quats * 127.5).astype(np.float32)
     scale_proxy = ((scales - low) * (255 / max(high - low, 1e-30))).astype(np.float32)
     rotations = ROTATIONS.astype(np.float32)
-    edges = range(0, count, CHUNK)
     radius = side / 2 - 1
     while radius >= 1:
         report(1 - np.log(radius) / np.log(side / 2))
@@ -225,13 +206,12 @@ def pras_forms(
         proxy = np.rint(current).astype(np.float32)
         target = box_blur(proxy.reshape(side, side, 7), int(radius), pool).reshape(-1, 7)
 
-        def choose(first: int, target: np.ndarray = target) -> None:
-            rows = slice(first, min(first + CHUNK, count))
+        def choose(rows: slice, target: np.ndarray = target) -> None:
             kernels.nearest_forms(
                 quat_proxy[rows], scale_proxy[rows], target[rows], rotations, PERMUTATIONS, forms[rows]
             )
 
-        pool.map(choose, edges)
+        for_each_block(count, choose, pool, block=CHUNK)
         radius *= decay
     return forms
 

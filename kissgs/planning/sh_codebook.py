@@ -19,24 +19,15 @@ from kissgs.planning.quantize import Planning, Quantized, fit_table, half_steps,
 from kissgs.settings import EncodeSettings
 
 COEFFICIENTS = SH_REST_COUNTS[-1]
-MIN_SIDE = 8
-"""Smallest side of a codebook in SOG-XT."""
+MIN_SIDE = 8  # smallest side of a codebook in SOG-XT
+WEIGHT_FLOOR, WEIGHT_CEILING = 0.1, 20.0  # in units of the median: none is ignored, none dominates
 
-WEIGHT_FLOOR, WEIGHT_CEILING = 0.1, 20.0
-"""Bounds of weights, in units of the median, so that no Gaussian is ignored and none dominates."""
-
+# Exponents of the codebook's weights: colour sensitivity to the power of 1 - SENSITIVITY_SHRINK · view uncertainty,
+# times (opacity × cross-section) to the power of SIZE_POWER · view uncertainty (size_weights).
 SENSITIVITY_SHRINK, SIZE_POWER = 0.55, 0.64
-"""Exponents of the codebook's weights: colour sensitivity to the power of 1 - SENSITIVITY_SHRINK · view uncertainty,
-times (opacity × cross-section) to the power of SIZE_POWER · view uncertainty (:func:`size_weights`)."""
-
-SH_WEIGHTS = (1e-2, 1e2)
-"""Bounds of the codebook's weights, in units of their median."""
-
-SORTED_AXES, SORTED_RADIUS = 16, 16
-"""Number of principal axes, and first filter radius, with which PLAS refines an order along the axes."""
-
-PAPER_TOP = 99
-"""Largest level of the paper's codebook: 100 levels in every channel."""
+SH_WEIGHTS = (1e-2, 1e2)  # bounds of the codebook's weights, in units of their median
+SORTED_AXES, SORTED_RADIUS = 16, 16  # principal axes, and first filter radius, with which PLAS refines their order
+PAPER_TOP = 99  # largest level of the paper's codebook: 100 levels in every channel
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,28 +49,18 @@ def fit_codebook(
     *,
     metric: ShMetric | None = None,
 ) -> Codebook:
-    """Build the codebook for the Gaussians ``chosen``.
-
-    Bands that are missing, or zero in all Gaussians, take almost no bytes: their tiles are constant.
-    """
+    """Build the codebook for the Gaussians ``chosen``. Bands that are missing, or zero in all Gaussians, take almost no
+    bytes: their tiles are constant."""
     settings, pool, is_list = planning.settings, planning.pool, planning.container.tables is not None
     dimensions = splats.shN.shape[1] * 3
     if dimensions == 0 or len(chosen) == 0:
         nothing = quantize(np.zeros((MIN_SIDE**2, 3 * COEFFICIENTS)), step=1)
         return Codebook(MIN_SIDE, nothing, np.zeros(max(len(chosen), 1), dtype=np.int32), half_steps(nothing))
     most = min(size, settings.sh_codebook_size)
-    clusters = kmeans.fit(
-        splats.shN.reshape(len(splats), dimensions),
-        chosen,
-        weights,
-        max(round(most), 1) if is_list else codebook_side(most) ** 2,
-        settings,
-        pool,
-        lattice=settings.sh_step if settings.shared_step_size else 0.0,
-        from_zero=is_list,
-        metric=metric,
-        report=planning.report("codebook"),
-    )
+    wanted = max(round(most), 1) if is_list else codebook_side(most) ** 2
+    lattice, report = settings.sh_step if settings.shared_step_size else 0.0, planning.report("codebook")
+    fit = partial(kmeans.fit, lattice=lattice, from_zero=is_list, metric=metric, report=report)
+    clusters = fit(splats.shN.reshape(len(splats), dimensions), chosen, weights, wanted, settings, pool)
     # The smallest square that holds the entries; unused places repeat some of them.
     side = next(s for s in range(MIN_SIDE, MAX_CODEBOOK_SIDE + 1, 8) if s * s >= len(clusters.centroids))
     report = planning.report("sort codebook")
@@ -120,10 +101,7 @@ def codebook_side(size: float) -> int:
 
 
 def _sort(
-    entries: Float32[np.ndarray, "cells D"],
-    settings: EncodeSettings,
-    pool: Workers,
-    report: Callable[[float], None],
+    entries: Float32[np.ndarray, "cells D"], settings: EncodeSettings, pool: Workers, report: Callable[[float], None]
 ) -> Int[np.ndarray, " cells"]:
     """Return the entry of each pixel of a tile, sorted so that neighbours are similar and the image compresses."""
     if (entries == entries[0]).all():
@@ -159,33 +137,18 @@ def sensitivity_weights(
 
 # Error of the SH codebook by its number of entries, and its optimal size.
 
-SH_SHRINK = 0.42
-"""Exponent s of the codebook's error ~ entries^-s, measured on real scenes with 1,000 to 10,000 entries."""
+SH_SHRINK = 0.42  # error ~ entries^-this, measured on real scenes with 1,000 to 10,000 entries
+ENTRY_BITS = 112  # bits per entry in the codebook's image, measured at 45 dimensions
+LABEL_SHARE = 0.5  # bits per label for each bit of the codebook's size: frequent entries take fewer
+QUICK = 1 << 13  # number of codebook entries that k-means finds in a few seconds
+FEW = 64  # number of codebook entries that any scene may have: they take about 1 kB, and SOG-XT has no fewer
+SAMPLE, SAMPLE_ENTRIES = 1 << 15, 1024  # Gaussians and entries from which the codebook's error is estimated
+MAX_DISPLAYED_ERROR = 3.0  # largest squared error of a displayed colour, summed over RGB from 0 to 1
 
-ENTRY_BITS = 112
-"""Bits per entry in the codebook's image, measured at 45 dimensions."""
-
-LABEL_SHARE = 0.5
-"""Bits per label for each bit of the codebook's size: less than 1, because frequent entries take fewer bits."""
-
-QUICK = 1 << 13
-"""Number of codebook entries that k-means finds in a few seconds."""
-
-FEW = 64
-"""Number of codebook entries that any scene may have: they take about 1 kB, and SOG-XT has no fewer."""
-
-SAMPLE, SAMPLE_ENTRIES = 1 << 15, 1024
-"""Number of Gaussians and of codebook entries from which the codebook's error is estimated."""
-
-MAX_DISPLAYED_ERROR = 3.0
-"""Largest squared error of a displayed colour, summed over RGB from 0 to 1."""
-
+# Factor on errors under a metric, of Gaussians that a capture has seen. The metric leaves out what base colours
+# compensate; with the factor, the codebook's size was best for held-out photographs.
 METRIC_GROWTH = 1.5
-"""Factor on errors under a metric, of Gaussians that a capture has seen. The metric leaves out what base colours
-compensate; with the factor, the codebook's size was best for held-out photographs."""
-
-SH_MEAN_SQUARE = 0.0796
-"""Mean square of a spherical harmonic over all directions, 1 / (4 pi)."""
+SH_MEAN_SQUARE = 0.0796  # mean square of a spherical harmonic over all directions, 1 / (4 pi)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,15 +160,12 @@ class CodebookErrorModel:
     unweighted: float = 0.0  # squared image error of a codebook of that size with equal weights
 
     def error(self, entries: float) -> float:
-        """Return the squared image error of a codebook with that number of entries."""
         return self.weighted * (self.entries / entries) ** SH_SHRINK
 
     def best_size(self, rd_lambda: float, count: int, ratio: float, entry_bits: float = ENTRY_BITS) -> int:
-        """Return the optimal number of entries, of ``entry_bits`` each, for ``count`` Gaussians.
-
-        Beyond :data:`QUICK` entries, which would take long to find, there are at least ``ratio`` Gaussians per entry.
-        Where no error is known, :data:`FEW` entries are right: k-means makes no more than the scene needs.
-        """
+        """Return the optimal number of entries, of ``entry_bits`` each, for ``count`` Gaussians. Beyond :data:`QUICK`
+        entries, which would take long to find, there are at least ``ratio`` Gaussians per entry. Where no error is
+        known, :data:`FEW` entries are right: k-means makes no more than the scene needs."""
         if self.weighted == 0:
             return FEW
         low, high = 0.0, np.log(max(count / ratio, min(count / 2, QUICK), FEW))
@@ -228,16 +188,8 @@ def codebook_error_model(
     vectors = splats.shN.reshape(len(splats), -1)
     entries = min(SAMPLE_ENTRIES, len(some) // 16)
     metric = ShMetric.of(sensitivity, splats.sh_degree)
-    clusters = kmeans.fit(
-        vectors,
-        some,
-        sensitivity_weights(sensitivity, some, splats),
-        entries,
-        settings,
-        pool,
-        lattice=0.0,
-        metric=metric,
-    )
+    weights = sensitivity_weights(sensitivity, some, splats)
+    clusters = kmeans.fit(vectors, some, weights, entries, settings, pool, lattice=0.0, metric=metric)
     lost, most = vectors[some] - clusters.centroids[clusters.labels], MAX_DISPLAYED_ERROR / SH_MEAN_SQUARE
     squared = np.minimum(np.square(lost, dtype=np.float64).sum(axis=1), most)
     seen = squared

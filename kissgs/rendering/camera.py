@@ -10,11 +10,8 @@ from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
 from kissgs.rendering.constants import DILATION
 
-MAX_SIDE = 1 << 16
-"""Largest side of an image, pixels; a square of this size already takes 50 GB."""
-
-MAX_FOCAL = 1e15
-"""Largest focal length, pixels."""
+MAX_SIDE = 1 << 16  # largest side of an image, pixels; a square of this size already takes 50 GB
+MAX_FOCAL = 1e15  # largest focal length, pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +123,8 @@ def look_at(
     width: int,
     height: int,
 ) -> Camera:
-    """Return a camera with ``target`` in the middle of its image; ``fov`` in radians, along the longer side.
-
-    ``up``, of any length, points up in the image; the roll is arbitrary if it is zero or along the line of sight.
-    """
+    """Return a camera with ``target`` in the middle of its image; ``fov`` in radians, along the longer side. ``up``, of
+    any length, points up in the image; the roll is arbitrary if it is zero or along the line of sight."""
     forward = target - position
     forward = forward / max(float(np.linalg.norm(forward)), 1e-30)
     right = np.cross(forward, up)

@@ -22,20 +22,11 @@ gsplat up to 1.5.3 has 0.999 for :data:`ALPHA_MAX`; later versions, like the ori
 factor of 0.005 for antialiased scenes, with which an opaque Gaussian of no size has an alpha of 1.3 / 255.
 """
 
-NEAR = 0.01
-"""Depth of the near plane, world units."""
-FAR = 1e10
-"""Depth of the far plane, world units."""
-DILATION = 0.3
-"""Usual variance added to both axes of a footprint, pixels², so that none is much narrower than a pixel."""
-FRUSTUM_MARGIN = 0.3
-"""Margin around the image within which the projection's derivative is not clamped, in units of half the image."""
-ALPHA_MIN = 1 / 255
-"""Smallest alpha that is drawn."""
-ALPHA_MAX = 0.99
-"""Largest alpha; larger ones are clamped."""
-TRANSMITTANCE_MIN = 1e-4
-"""Transmittance at which a pixel is complete: (1 - ALPHA_MAX)², two opaque Gaussians."""
-
-TILE = 16
-"""Side of the squares of pixels that are rendered together, pixels; the image does not depend on it."""
+NEAR = 0.01  # depth of the near plane, world units
+FAR = 1e10  # depth of the far plane, world units
+DILATION = 0.3  # usual variance added to both axes of a footprint, pixels², so that none is much narrower than a pixel
+FRUSTUM_MARGIN = 0.3  # in units of half the image; within it the projection's derivative is not clamped
+ALPHA_MIN = 1 / 255  # smallest alpha that is drawn
+ALPHA_MAX = 0.99  # largest alpha; larger ones are clamped
+TRANSMITTANCE_MIN = 1e-4  # transmittance at which a pixel is complete: (1 - ALPHA_MAX)², two opaque Gaussians
+TILE = 16  # side of the squares of pixels that are rendered together, pixels; the image does not depend on it

@@ -24,8 +24,7 @@ try:
 except ModuleNotFoundError as error:
     raise UnsupportedError("gradients need torch, which is not installed: pip install 'kissgs[train]'") from error
 
-Parameters = Mapping[str, Tensor]
-"""Stored parameters of a scene, by the names in :class:`kissgs.core.splats.Splats`."""
+Parameters = Mapping[str, Tensor]  # stored parameters of a scene, by the names in Splats
 
 
 def rasterize(
@@ -41,13 +40,11 @@ def rasterize(
     threads: int = 0,
     receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Render images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``, with gradients by all parameters.
-
-    On the CPU by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``), both with the image model of
+    """Render images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``, with gradients by all parameters. On the
+    CPU by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``), both with the image model of
     :mod:`kissgs.rendering.constants`. Cameras ``(C, 4, 4)`` and ``(C, 3, 3)``, and backgrounds ``(C, 3)``, have no
     gradient. ``receive`` is called in the backward pass on the CPU with the gradients of each image, in place of
-    autograd: most Gaussians have none, and arrays for all of them take longer to fill than to compute.
-    """
+    autograd: most Gaussians have none, and arrays for all of them take longer to fill than to compute."""
     tensors, device = [parameters[name] for name in ATTRIBUTES], parameters["means"].device
     if backgrounds is None:
         backgrounds = torch.zeros((len(viewmats), 3))
@@ -82,10 +79,8 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:  # noqa: ANN401
         parameters, others = inputs[: len(ATTRIBUTES)], inputs[len(ATTRIBUTES) :]
         cameras, backgrounds, antialiased, threads, receive = others
-        means, quats, scales, opacities, sh0, shN = (each.detach().contiguous().numpy() for each in parameters)
-        splats = Splats(
-            means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN, antialiased=antialiased
-        )
+        arrays = (each.detach().contiguous().numpy() for each in parameters)
+        splats = Splats(**dict(zip(ATTRIBUTES, arrays, strict=True)), antialiased=antialiased)
         with Workers(threads) as pool:
             frames = [draw(splats, camera, colour, pool) for camera, colour in zip(cameras, backgrounds, strict=True)]
         ctx.frames, ctx.threads, ctx.receive = frames, threads, receive
@@ -125,14 +120,11 @@ def photometric_loss(
     threads: int = 0,
 ) -> Float[torch.Tensor, ""]:
     """Return (1 - w) · mean |d| + w · (1 - SSIM) + m · mean d², for d = image - target and weights ``ssim_weight``, w,
-    and ``mse_weight``, m.
-
-    Where |d| is above 1, 2 |d| - 1 takes the place of d², so that a diverged pixel does not outweigh all others.
-    SSIM is that of :func:`kissgs.rendering.metrics.ssim`. With m = 0 it is the loss of Kerbl et al., "3D Gaussian
-    Splatting for Real-Time Radiance Field Rendering", ACM Transactions on Graphics 42 (2023), equation 7. On the CPU in
-    float32 the gradient is computed together with the value; elsewhere by autograd. Images are ``(H, W, 3)`` or
-    ``(C, H, W, 3)``, not clamped, except at ±1e9.
-    """
+    and ``mse_weight``, m. Where |d| is above 1, 2 |d| - 1 takes the place of d², so that a diverged pixel does not
+    outweigh all others. SSIM is that of :func:`kissgs.rendering.metrics.ssim`. With m = 0 it is the loss of Kerbl et
+    al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", ACM Transactions on Graphics 42 (2023),
+    equation 7. On the CPU in float32 the gradient is computed together with the value; elsewhere by autograd. Images
+    are ``(H, W, 3)`` or ``(C, H, W, 3)``, not clamped, except at ±1e9."""
     if image.shape != target.shape or image.ndim not in (3, 4) or image.shape[-1] != 3 or image.numel() == 0:
         raise InvalidViewsError(
             f"images to compare must have one shape, (height, width, 3) or (count, height, width, 3), not "
@@ -165,11 +157,7 @@ class _Photometric(torch.autograd.Function):
 
 
 def _photometric(
-    image: torch.Tensor,
-    target: torch.Tensor,
-    weights: tuple[float, float],
-    threads: int,
-    gradient: torch.Tensor | None,
+    image: torch.Tensor, target: torch.Tensor, weights: tuple[float, float], threads: int, gradient: torch.Tensor | None
 ) -> torch.Tensor:
     """Return the loss with ``weights`` of SSIM and of the squares; write its gradient into ``gradient`` if given."""
     count, (ssim_weight, mse_weight) = image.numel(), weights
@@ -186,10 +174,7 @@ def _views(images: torch.Tensor) -> np.ndarray:
 
 
 def plain_photometric_loss(
-    image: Float[torch.Tensor, "..."],
-    target: Float[torch.Tensor, "..."],
-    ssim_weight: float,
-    mse_weight: float = 0.0,
+    image: Float[torch.Tensor, "..."], target: Float[torch.Tensor, "..."], ssim_weight: float, mse_weight: float = 0.0
 ) -> Float[torch.Tensor, ""]:
     """Return the loss of :func:`photometric_loss` by plain torch operations, on any device and in any dtype."""
     x, y = (images.reshape(-1, *images.shape[-3:]).clamp(-1e9, 1e9) for images in (image, target))
@@ -207,10 +192,8 @@ def plain_photometric_loss(
 
 
 def _blur(maps: torch.Tensor) -> torch.Tensor:
-    """Blur each channel of ``(V, C, H, W)`` with the window of SSIM.
-
-    Contiguous depthwise convolutions, because torch computes those in full float32 on a GPU, others perhaps in TF32.
-    """
+    """Blur each channel of ``(V, C, H, W)`` with the window of SSIM. Contiguous depthwise convolutions, because torch
+    computes those in full float32 on a GPU, others perhaps in TF32."""
     channels = maps.shape[1]
     offsets = torch.arange(-5, 6, dtype=maps.dtype, device=maps.device)
     window = torch.softmax(-offsets.square() / 4.5, dim=0).expand(channels, 1, 11)

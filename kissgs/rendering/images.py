@@ -16,22 +16,13 @@ from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import BLACK, Colour, render
 
-LOSSLESS = 100
-"""Value of ``quality`` that means lossless WebP."""
-
-MAX_WEBP_SIDE = 16_383
-"""Largest side of a WebP image, pixels: the format has 14 bits for it."""
-
-MAX_PIXEL_BYTES = 4 << 30
-"""Largest size of the pixels of all images together, bytes: they are all in memory at once."""
+LOSSLESS = 100  # value of quality that means lossless WebP
+MAX_WEBP_SIDE = 16_383  # largest side of a WebP image, pixels: the format has 14 bits for it
+MAX_PIXEL_BYTES = 4 << 30  # largest size of the pixels of all images together, bytes: they are all in memory at once
 
 
 def render_all(
-    splats: Splats,
-    cameras: Sequence[Camera],
-    context: Context = DEFAULT_CONTEXT,
-    *,
-    background: Colour = BLACK,
+    splats: Splats, cameras: Sequence[Camera], context: Context = DEFAULT_CONTEXT, *, background: Colour = BLACK
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
     """Render an image for each camera, with 8 bits per channel; a repeated camera object gives the same array."""
     if 3 * sum(camera.width * camera.height for camera in cameras) > MAX_PIXEL_BYTES:
@@ -65,17 +56,14 @@ def reframed(camera: Camera, width: int, height: int) -> Camera:
 
 
 def png(pixels: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    """Return the image as a PNG file."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, "PNG")
     return stream.getvalue()
 
 
 def animated_webp(frames: Sequence[UInt8[np.ndarray, "H W 3"]], *, fps: float, quality: int) -> bytes:
-    """Return the frames as an animated WebP file that repeats for ever, or a single frame as a still one.
-
-    Durations are whole milliseconds such that the total duration is right. ``quality``: 0 to :data:`LOSSLESS`.
-    """
+    """Return the frames as an animated WebP file that repeats for ever, or a single frame as a still one. Durations are
+    whole milliseconds such that the total duration is right. ``quality``: 0 to :data:`LOSSLESS`."""
     height, width = frames[0].shape[:2]
     if max(width, height) > MAX_WEBP_SIDE:
         raise UnsupportedError(
@@ -96,11 +84,8 @@ def animated_webp(frames: Sequence[UInt8[np.ndarray, "H W 3"]], *, fps: float, q
 PAGE_COLOUR, TEXT_COLOUR, MARKED_COLOUR = (24, 24, 26), (225, 225, 225), (255, 190, 60)
 """Colours of the background, of labels and of marked labels, 8-bit RGB."""
 
-GAP = 4
-"""Space between images and around all of them, pixels."""
-
-MAX_PIXELS = 1 << 28
-"""Largest number of pixels of a contact sheet; many programs refuse to open more."""
+GAP = 4  # space between images and around all of them, pixels
+MAX_PIXELS = 1 << 28  # largest number of pixels of a contact sheet; many programs refuse to open more
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,10 +99,8 @@ class Label:
 def contact_sheet(
     images: Sequence[UInt8[np.ndarray, "_ _ 3"]], labels: Sequence[Label] = (), *, columns: int | None = None
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the images on a contact sheet, in rows from left to right, each in the middle of its cell.
-
-    Cells have the size of the largest image. By default there are so many ``columns`` that the sheet is about 3 to 2.
-    """
+    """Return the images on a contact sheet, in rows from left to right, each in the middle of its cell. Cells have the
+    size of the largest image. By default there are so many ``columns`` that the sheet is about 3 to 2."""
     width, height = max(p.shape[1] for p in images), max(p.shape[0] for p in images)
     font = ImageFont.load_default(size=max(11, min(width // 20, 28)))
     label_height = round(1.6 * sum(_metrics(font))) if labels else 0

@@ -17,20 +17,11 @@ from kissgs.core.resources import Workers
 # Images are floats in [0, 1] or uint8. Values outside [0, 1] are not clamped here; clamp renderings first. A NaN in
 # either image makes the result NaN, so that no average hides a failed rendering.
 
-WINDOW = 11
-"""Side of the Gaussian window of SSIM and MS-SSIM, pixels."""
-
-SCALE_WEIGHTS = 0.0448, 0.2856, 0.3001, 0.2363, 0.1333
-"""Exponents of MS-SSIM's five scales, from full resolution to a sixteenth of it, as published."""
-
-PATCH = 32
-"""Side of the patches over which :func:`ssim_with_patches` averages, pixels."""
-
-TILE_PIXELS = 160
-"""Width of a tile, pixels: the largest that the ring buffers of the kernel hold."""
-
-TILE_ROWS = 128
-"""Height of a tile, pixels; 20 rows around each tile are blurred again for it."""
+WINDOW = 11  # side of the Gaussian window of SSIM and MS-SSIM, pixels
+SCALE_WEIGHTS = 0.0448, 0.2856, 0.3001, 0.2363, 0.1333  # exponents of MS-SSIM's scales, as published
+PATCH = 32  # side of the patches over which ssim_with_patches averages, pixels
+TILE_PIXELS = 160  # width of a tile, pixels: the largest that the ring buffers of the kernel hold
+TILE_ROWS = 128  # height of a tile, pixels; 20 rows around each tile are blurred again for it
 
 
 def psnr(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
@@ -42,12 +33,10 @@ def psnr(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."])
 
 
 def ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
-    """Return the structural similarity, from -1 to 1; exactly 1 for equal images.
-
-    The mean over all pixels and channels, as in 3DGS: a Gaussian window of 11x11 pixels and standard deviation 1.5,
-    padding with zeros, C1 = 0.01², C2 = 0.03². Wang et al., "Image Quality Assessment: From Error Visibility to
-    Structural Similarity", IEEE Transactions on Image Processing 13 (2004).
-    """
+    """Return the structural similarity, from -1 to 1; exactly 1 for equal images. The mean over all pixels and
+    channels, as in 3DGS: a Gaussian window of 11x11 pixels and standard deviation 1.5, padding with zeros, C1 = 0.01²,
+    C2 = 0.03². Wang et al., "Image Quality Assessment: From Error Visibility to Structural Similarity", IEEE
+    Transactions on Image Processing 13 (2004)."""
     return ssim_with_patches(image, reference)[0]
 
 
@@ -62,10 +51,8 @@ def ssim_with_patches(
 
 
 def patch_edges(length: int) -> Int[np.ndarray, " n"]:
-    """Return where patches begin along a side of this many pixels, and its end: every :data:`PATCH` pixels.
-
-    A remainder of at least half a patch is one of its own; a smaller one belongs to the patch before it, if any.
-    """
+    """Return where patches begin along a side of this many pixels, and its end: every :data:`PATCH` pixels. A remainder
+    of at least half a patch is one of its own; a smaller one belongs to the patch before it, if any."""
     edges = PATCH * np.arange(max(1, (length + PATCH // 2) // PATCH) + 1)
     edges[-1] = length
     return edges
@@ -94,16 +81,11 @@ def ms_ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "...
         exponents /= exponents.sum()
     product = np.ones(3)
     for scale, exponent in enumerate(exponents):
-        similarity, structure = _mean_similarities(a, b)
+        sums = _similarity_sums(a, b, (1, 1), WINDOW // 2)[0, 0]  # over all windows inside the images
+        similarity, structure = sums / ((a.shape[0] - WINDOW + 1) * (a.shape[1] - WINDOW + 1))
         product *= np.maximum(similarity if scale == scales - 1 else structure, 0) ** exponent
         a, b = _halved(a), _halved(b)
     return float(product.mean())
-
-
-def _mean_similarities(a: Float32[np.ndarray, "H W 3"], b: Float32[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "2 3"]:
-    """Return the means of SSIM and of its second factor over all windows inside the images, for each channel."""
-    sums = _similarity_sums(a, b, (1, 1), WINDOW // 2)[0, 0]
-    return sums / ((a.shape[0] - WINDOW + 1) * (a.shape[1] - WINDOW + 1))
 
 
 def _similarity_sums(
@@ -153,10 +135,8 @@ def differences_and_ssim(
     gradient: Float32[np.ndarray, "V H W 3"] | None = None,
     weights: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Float64[np.ndarray, "3"]:
-    """Return sums over all pixels and channels, and compute the gradient of their weighted sum in the same pass.
-
-    With d = image - target, the sums are Σ |d|, Σ d² (for |d| above 1, 2 |d| - 1 in its place) and Σ SSIM.
-    """
+    """Return sums over all pixels and channels, and compute the gradient of their weighted sum in the same pass. With d
+    = image - target, the sums are Σ |d|, Σ d² (for |d| above 1, 2 |d| - 1 in its place) and Σ SSIM."""
     from kissgs.rendering import ssim_kernels
 
     count, height, width, _ = images.shape
@@ -186,12 +166,10 @@ def _tiles(height: int, width: int) -> list[np.ndarray]:
 
 
 class Flip:
-    """LDR-FLIP by the package ``flip-evaluator``: from 0 for equal images to 1. Construct it once and call it often.
-
-    It estimates the difference that an observer sees who flips between two images on a display with 67 pixels per
-    degree of visual angle. Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", Proceedings of the
-    ACM on Computer Graphics and Interactive Techniques 3 (2020).
-    """
+    """LDR-FLIP by the package ``flip-evaluator``: from 0 for equal images to 1. Construct it once and call it often. It
+    estimates the difference that an observer sees who flips between two images on a display with 67 pixels per degree
+    of visual angle. Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", Proceedings of the ACM on
+    Computer Graphics and Interactive Techniques 3 (2020)."""
 
     def __init__(self) -> None:
         """Load the package."""
@@ -212,12 +190,10 @@ class Flip:
 
 
 class Lpips:
-    """LPIPS with VGG-16: from 0 for equal images up to about 1. Construct it once and call it often.
-
-    This is the LPIPS of papers on Gaussian splatting: like the evaluation script of 3DGS, it passes images in [0, 1] to
-    the network, which was calibrated on [-1, 1]. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a
-    Perceptual Metric", CVPR 2018.
-    """
+    """LPIPS with VGG-16: from 0 for equal images up to about 1. Construct it once and call it often. This is the LPIPS
+    of papers on Gaussian splatting: like the evaluation script of 3DGS, it passes images in [0, 1] to the network,
+    which was calibrated on [-1, 1]. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual
+    Metric", CVPR 2018."""
 
     def __init__(self, device: str = "cpu") -> None:
         """Load the network, whose weights (528 MB) torchvision downloads on first use."""

@@ -22,11 +22,8 @@ if TYPE_CHECKING:
 
 # The rasteriser on CUDA: gsplat in its modes "classic" and "antialiased", with :mod:`kissgs.rendering.constants`.
 
-RenderedImage = tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]
-"""Colours and alphas of an image."""
-
-ImageRenderer = Callable[[Camera, Sequence[float]], RenderedImage]
-"""Function of a camera and a background (RGB) that renders an image of a scene."""
+RenderedImage = tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]  # colours and alphas of an image
+ImageRenderer = Callable[[Camera, Sequence[float]], RenderedImage]  # of a camera and a background, RGB
 
 GSPLAT_MISSING = "rendering on CUDA needs gsplat, which is not installed: pip install 'kissgs[cuda]'"
 
@@ -102,17 +99,10 @@ def image_renderer(splats: Splats) -> ImageRenderer:
     parameters = tensors_of(splats, "cuda")
 
     def render(camera: Camera, background: Sequence[float]) -> RenderedImage:
+        views = torch.from_numpy(camera.viewmat[None]), torch.from_numpy(camera.K[None]), camera.width, camera.height
+        model = torch.tensor([list(background)]), camera.dilation, splats.antialiased
         with torch.no_grad():
-            images, alphas = rasterize_on_cuda(
-                parameters,
-                viewmats=torch.from_numpy(camera.viewmat[None]),
-                Ks=torch.from_numpy(camera.K[None]),
-                width=camera.width,
-                height=camera.height,
-                backgrounds=torch.tensor([list(background)]),
-                dilation=camera.dilation,
-                antialiased=splats.antialiased,
-            )
+            images, alphas = rasterize_on_cuda(parameters, *views, *model)
         return images[0].cpu().numpy(), alphas[0].cpu().numpy()
 
     return render
@@ -166,17 +156,11 @@ def drawn_opacities(splats: Splats) -> Float64[np.ndarray, " N"]:
 
 
 def removal_scores(
-    splats: Splats,
-    cameras: Sequence[Camera],
-    context: Context = DEFAULT_CONTEXT,
-    *,
-    background: Colour = BLACK,
+    splats: Splats, cameras: Sequence[Camera], context: Context = DEFAULT_CONTEXT, *, background: Colour = BLACK
 ) -> Float64[np.ndarray, " N"]:
-    """Return, for each Gaussian, the squared image error that its removal alone would cause.
-
-    The score of GaussianPOP, section 3, exact except for Gaussians behind the end of a pixel's list. A sum over images,
-    pixels and RGB in [0, 1]; 0 for a Gaussian that no camera sees.
-    """
+    """Return, for each Gaussian, the squared image error that its removal alone would cause. The score of GaussianPOP,
+    section 3, exact except for Gaussians behind the end of a pixel's list. A sum over images, pixels and RGB in [0, 1];
+    0 for a Gaussian that no camera sees."""
     from kissgs.rendering.cpu.frame import draw
     from kissgs.rendering.cpu.frame import removal_scores as frame_scores
 

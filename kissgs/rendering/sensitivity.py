@@ -23,16 +23,13 @@ if TYPE_CHECKING:
     from kissgs.rendering.cpu.records import Frame
 
 
-LEAF = 512
-"""Largest number of Gaussians in a leaf of the tree, among which neighbours are searched."""
+LEAF = 512  # largest number of Gaussians in a leaf of the tree, among which neighbours are searched
 
 
 def local_scale(splats: Splats, *, threads: int = 0) -> Float32[np.ndarray, " N"]:
     """Return the distance from each Gaussian to about its 128th neighbour, at least its own size, world units.
-
     Distances are measured within the leaves of a k-d tree of equal counts, which adapts to parts of any size. For an
-    object of fewer Gaussians, the distance is extrapolated as if its surface continued.
-    """
+    object of fewer Gaussians, the distance is extrapolated as if its surface continued."""
     from kissgs.rendering.cpu.neighbours import leaf_scales, leaves_of
 
     means, found = np.array(splats.means, order="C"), np.empty(len(splats), np.float32)
@@ -47,12 +44,10 @@ def local_scale(splats: Splats, *, threads: int = 0) -> Float32[np.ndarray, " N"
 
 # Coverage: how well the best camera has seen each Gaussian, by visibility and resolution.
 
-RESOLVED = 3.0
-"""Length in the image of the distance to the 128th neighbour from which on a Gaussian counts as resolved, pixels."""
-
+RESOLVED = 3.0  # length in the image of the distance to the 128th neighbour, pixels, that is resolved
+# A Gaussian whose neighbours are more than ISOLATED times its size away counts as an object of its own, which is viewed
+# from up to MAX_APPROACH times nearer.
 ISOLATED, MAX_APPROACH = 16.0, 3.0
-"""A Gaussian whose neighbours are more than :data:`ISOLATED` times its size away counts as an object of its own, which
-is viewed from up to :data:`MAX_APPROACH` times nearer."""
 
 
 class Coverage:
@@ -61,8 +56,8 @@ class Coverage:
     def __init__(self, splats: Splats) -> None:
         self._splats = splats
         self._scale = local_scale(splats)
+        # From 0, seen by no camera or only from far away, to 1, seen from nearby.
         self.share: Float32[np.ndarray, " N"] = np.zeros(len(splats), np.float32)
-        """``(N,)`` coverage from 0, seen by no camera or only from far away, to 1, seen from nearby."""
 
     @property
     def close_up(self) -> Float32[np.ndarray, " N"]:
@@ -79,11 +74,8 @@ class Coverage:
         return found
 
     def add(self, frame: Frame, seen: Float32[np.ndarray, " N"], pool: Workers, finer: float = 1.0) -> None:
-        """Update the coverage by one rendered image.
-
-        ``seen``: sum over pixels of (alpha T)² by row of the frame's footprints; ``finer``: ratio of the resolution of
-        the image that this one is a thumbnail of to its own.
-        """
+        """Update the coverage by one rendered image. ``seen``: sum over pixels of (alpha T)² by row of the frame's
+        footprints; ``finer``: ratio of the resolution of the image that this one is a thumbnail of to its own."""
         from kissgs.rendering.cpu.sensitivity import raise_coverage
 
         length, parts = RESOLVED / finer, frame.parts.tolist()
@@ -92,9 +84,7 @@ class Coverage:
 
 # Measurement of the sensitivity of a scene, exactly to first order, with one backward pass per image.
 
-HIDDEN = 0.003
-"""Transmittance from which on what is behind counts as hidden: a change there has a hundred-thousandth of the squared
-error that it has in the open."""
+HIDDEN = 0.003  # transmittance behind which a change has a hundred-thousandth of the squared error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,26 +169,19 @@ def measure_sensitivity(
             if view_uncertainty and done + 1 == cameras.captured:
                 found.captured[:] = coverage.share
             del frame  # before the next one is made
-        each_part(
-            lambda a, b: moments_to_hessians(splats.scales, splats.opacities, a, b, found.shape_hessian),
-            even(len(splats), pool),
-            pool,
-        )
-    _finish(found)
+        shapes, parts = (splats.scales, splats.opacities), even(len(splats), pool)
+        each_part(lambda a, b: moments_to_hessians(*shapes, a, b, found.shape_hessian), parts, pool)
+    # Bound what overflows, and turn the sums of harmonics into means.
+    _bound(found.position_hessian, (0, 1, 2))
+    _bound(found.shape_hessian, OPACITY + SCALES + ROTATION)
+    np.nan_to_num(found.color_weight, copy=False, nan=LARGEST, posinf=LARGEST)
+    colors = found.color_weight[:, None]
+    for harmonics in (found.mean_harmonics, found.higher_harmonics):
+        np.nan_to_num(harmonics, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        np.divide(harmonics, colors, out=harmonics, where=colors > 0)
     return_free_memory()
     progress("sensitivity", 1.0)
     return found.with_prior(splats, coverage.close_up, coverage.share, view_uncertainty)
-
-
-def _finish(sums: Sensitivity) -> None:
-    """Bound what overflows, and turn the sums of harmonics into means."""
-    _bound(sums.position_hessian, (0, 1, 2))
-    _bound(sums.shape_hessian, OPACITY + SCALES + ROTATION)
-    np.nan_to_num(sums.color_weight, copy=False, nan=LARGEST, posinf=LARGEST)
-    for harmonics in (sums.mean_harmonics, sums.higher_harmonics):
-        np.nan_to_num(harmonics, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        colors = sums.color_weight[:, None]
-        np.divide(harmonics, colors, out=harmonics, where=colors > 0)
 
 
 def _bound(hessians: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> None:
@@ -220,19 +203,10 @@ def _bound(hessians: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> N
 # colour sensitivity. A few steps suffice: the first ones remove errors that neighbouring Gaussians share, which are the
 # visible ones.
 
-DAMPING = 0.02
-"""Weight of the attraction to the initial colours, in units of the median of the diagonal."""
-
-MAX_CHANGE = 0.5 / SH_C0
-"""Largest change of a coefficient: half of a colour's range. Faint Gaussians would fit the given cameras with larger
-changes that do not help other views."""
-
-MAX_CACHED_PIXELS = 1 << 27
-"""Largest number of pixels of the original's images that are kept in memory; above, they are rendered for each step."""
-
-PROBE_RMS = 0.1
-"""Root mean square of the colour changes that the matrix is applied to; small, because clamping at black is not
-linear."""
+DAMPING = 0.02  # weight of the attraction to the initial colours, in units of the median of the diagonal
+MAX_CHANGE = 0.5 / SH_C0  # of a coefficient, half of a colour's range: larger changes fit the given cameras only
+MAX_CACHED_PIXELS = 1 << 27  # of the original's images kept in memory; above, they are rendered for each step
+PROBE_RMS = 0.1  # of the colour changes that the matrix is applied to: clamping at black is not linear
 
 
 def refit_colors(
@@ -245,11 +219,9 @@ def refit_colors(
     *,
     steps: int,
 ) -> Float32[np.ndarray, "M 3"]:
-    """Return base colours of ``decoded`` with which its renderings are nearest to those of ``original``.
-
-    They are like ``sh0``, at most :data:`MAX_CHANGE` from the initial ones, to which ``prior`` attracts them. Each of
-    the ``steps`` of conjugate gradients takes one rendering and one gradient per camera.
-    """
+    """Return base colours of ``decoded`` with which its renderings are nearest to those of ``original``. They are like
+    ``sh0``, at most :data:`MAX_CHANGE` from the initial ones, to which ``prior`` attracts them. Each of the ``steps``
+    of conjugate gradients takes one rendering and one gradient per camera."""
     from kissgs.rendering.cpu.frame import add_color_gradients, draw
 
     if steps == 0 or not (color_weight > 0).any():

@@ -187,12 +187,10 @@ def ssim_tile(
     gradient: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Compute sums over one tile, and the gradient of l1 Σ|d| + l2 Σ h(d) / 2 + ssim Σ SSIM / 2.
-
-    d is image - target, whose channels are interleaved; h(d) is d² up to |d| = 1, and 2 |d| - 1 beyond. ``tile`` is
-    top, bottom, left and right, ends exclusive; columns count channels, at most 480. ``gradient`` is ``(0, 0)`` for the
-    sums only, to which Σ|d|, Σ h(d) and Σ SSIM are added.
-    """
+    """Compute sums over one tile, and the gradient of l1 Σ|d| + l2 Σ h(d) / 2 + ssim Σ SSIM / 2. d is image - target,
+    whose channels are interleaved; h(d) is d² up to |d| = 1, and 2 |d| - 1 beyond. ``tile`` is top, bottom, left and
+    right, ends exclusive; columns count channels, at most 480. ``gradient`` is ``(0, 0)`` for the sums only, to which
+    Σ|d|, Σ h(d) and Σ SSIM are added."""
     height, width = image.shape
     top, bottom, left, right = tile
     count = right - left
@@ -231,10 +229,8 @@ def ssim_tile(
 @compiled("void(float32[:, ::1], float32[:, ::1], int64[::1], float64[:, :, :, ::1])")
 def similarity_tile(image: np.ndarray, target: np.ndarray, tile: np.ndarray, sums: np.ndarray) -> None:
     """Add the sums of SSIM and of its factor structure over one tile, for each patch and channel, to ``(h, w, 2, 3)``.
-
     The tile is as for :func:`ssim_tile`. Patches of 32x32 pixels start at the top left of the image, and the last ones
-    take what remains of it; a single patch is the whole image.
-    """
+    take what remains of it; a single patch is the whole image."""
     height, width = image.shape
     top, bottom, left, right = tile
     first, last = max(left - 15, 0), min(right + 15, width)  # columns inside the image; the others stay zero

@@ -14,8 +14,7 @@ import numpy as np
 from kissgs.core.errors import OutputError
 from kissgs.io.files import atomic_file, reason_of, refuse_existing
 
-SAVE_INTERVAL = 30.0
-"""Shortest time between two saves, seconds."""
+SAVE_INTERVAL = 30.0  # shortest time between two saves, seconds
 
 
 class Checkpoint:
@@ -50,9 +49,8 @@ class Checkpoint:
     @property
     def due(self) -> bool:
         """Whether to save again: :data:`SAVE_INTERVAL` has passed, and saving takes at most 5 % of the time."""
-        return self._path is not None and time.monotonic() - self._saved_at >= max(
-            SAVE_INTERVAL, 20 * self._save_seconds
-        )
+        wait = max(SAVE_INTERVAL, 20 * self._save_seconds)
+        return self._path is not None and time.monotonic() - self._saved_at >= wait
 
     def save(self, state: Mapping[str, np.ndarray]) -> None:
         """Save a state in place of the former one, completely or not at all."""
@@ -68,10 +66,9 @@ class Checkpoint:
 
 def delete_checkpoints(*checkpoints: Path | None) -> None:
     """Delete checkpoints whose results are saved; files that cannot be deleted stay."""
-    for path in checkpoints:
-        if path is not None:
-            with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
+    for path in filter(None, checkpoints):
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def finetune_checkpoint_path(checkpoint: Path) -> Path:

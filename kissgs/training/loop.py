@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,11 +24,8 @@ try:
 except ModuleNotFoundError as error:
     raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
 
-SMOOTHING = 0.98
-"""Weight of the former value in the running means of loss and squared error."""
-
-LrSchedule = Callable[[float], Mapping[str, float]]
-"""Function from the fraction of steps done, 0 to 1, to the learning rates by parameter."""
+SMOOTHING = 0.98  # weight of the former value in the running means of loss and squared error
+LrSchedule = Callable[[float], Mapping[str, float]]  # learning rates by parameter, from the fraction of steps
 
 
 class TrainableScene(Protocol):
@@ -65,8 +62,6 @@ class Regularizer(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class TrainingPlan:
-    """Settings of a training."""
-
     stage: str  # in progress events
     pace: Pace
     rates: LrSchedule
@@ -86,34 +81,21 @@ def train(
     first: int = 0,
     after: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Fit a scene to target images, from step ``first`` on; ``after`` receives the number of steps done.
-
-    On the CPU, the result depends on the seed but not on the number of threads; on a GPU it is not reproducible. If
-    the receiver of progress raises, the scene is in the state after the last completed step.
-    """
+    """Fit a scene to target images, from step ``first`` on; ``after`` receives the number of steps done. On the CPU,
+    the result depends on the seed but not on the number of threads; on a GPU it is not reproducible. If the receiver of
+    progress raises, the scene is in the state after the last completed step."""
     order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
+    options: dict[str, Any] = {"ssim_weight": plan.ssim_weight, "mse_weight": plan.mse_weight}
+    options |= {"antialiased": scene.antialiased, "threads": context.threads, "receive": scene.receive}
     with torch_threads(context.threads), keep_free_memory():
         step, pace = first, plan.pace
         pace.update(step)
         while step < pace.steps:
             context.progress(plan.stage, step / pace.steps, running.text(len(scene)))
             parameters = scene.gaussians()
-            losses, errors = [], []
-            for n in islice(order, plan.batch):
-                loss, error = image_loss(
-                    parameters,
-                    targets,
-                    n,
-                    ssim_weight=plan.ssim_weight,
-                    mse_weight=plan.mse_weight,
-                    antialiased=scene.antialiased,
-                    threads=context.threads,
-                    receive=scene.receive,
-                )
-                losses.append(loss)
-                errors.append(error)
-            loss = torch.stack(losses).mean()
-            running.add(float(loss.detach()), sum(errors) / plan.batch)
+            found = [image_loss(parameters, targets, n, **options) for n in islice(order, plan.batch)]
+            loss = torch.stack([loss for loss, _ in found]).mean()
+            running.add(float(loss.detach()), sum(error for _, error in found) / plan.batch)
             for regularizer in plan.regularizers:
                 penalty = regularizer.penalty(step, parameters)
                 loss = loss if penalty is None else loss + penalty
@@ -138,24 +120,14 @@ def image_loss(
     threads: int,
     receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, float]:
-    """Render target ``n``; return the photometric loss, differentiable, and the mean squared error.
-
-    ``antialiased`` and ``receive`` are as in :func:`kissgs.rendering.differentiable.rasterize`.
-    """
-    camera = targets.cameras[n]
-    target = targets.image(n)
-    image, _ = rasterize(
-        parameters,
-        viewmats=torch.from_numpy(camera.viewmat)[None],  # float64: poses far from the origin need it
-        Ks=torch.from_numpy(camera.K)[None],
-        width=camera.width,
-        height=camera.height,
-        backgrounds=torch.from_numpy(targets.backgrounds[n])[None],
-        dilation=camera.dilation,
-        antialiased=antialiased,
-        threads=threads,
-        receive=receive,
-    )
+    """Render target ``n``; return the photometric loss, differentiable, and the mean squared error. ``antialiased`` and
+    ``receive`` are as in :func:`kissgs.rendering.differentiable.rasterize`."""
+    camera, target = targets.cameras[n], targets.image(n)
+    matrices = (camera.viewmat, camera.K, targets.backgrounds[n])
+    viewmat, K, background = (torch.from_numpy(matrix)[None] for matrix in matrices)  # float64, for poses far away
+    model: dict[str, Any] = {"dilation": camera.dilation, "antialiased": antialiased, "threads": threads}
+    view = viewmat, K, camera.width, camera.height
+    image, _ = rasterize(parameters, *view, backgrounds=background, receive=receive, **model)
     targets_there = torch.from_numpy(target)[None].to(image.device)
     loss = photometric_loss(image, targets_there, ssim_weight=ssim_weight, mse_weight=mse_weight, threads=threads)
     return loss, float(np.square(image[0].detach().cpu().numpy() - target).mean())
@@ -169,7 +141,6 @@ class RunningMeans:
     error: float = math.nan
 
     def add(self, loss: float, error: float) -> None:
-        """Add the values of a step."""
         first = math.isnan(self.loss)
         self.loss = loss if first else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
         self.error = error if first else SMOOTHING * self.error + (1 - SMOOTHING) * error

@@ -79,11 +79,9 @@ def adam(
     constants: np.ndarray,
 ) -> None:
     """Make a step with the rows ``first`` to ``last`` (exclusive) of a parameter of ``width`` numbers; all are flat.
-
     ``gradient`` is that of ``rows``, which ascend; ``everywhere``, if not empty, is added for all rows; ``factors`` of
     the learning rate may be empty for 1. ``constants``: learning rate / (1 - beta1^t); 1 / sqrt(1 - beta2^t); the
-    absolute value to which gradients are clamped; the smallest and the largest value that a step may reach.
-    """
+    absolute value to which gradients are clamped; the smallest and the largest value that a step may reach."""
     rate, correction, most, smallest, largest = constants[0], constants[1], constants[2], constants[3], constants[4]
     zero, finite = np.float32(0), np.float32(3.4028234e38)
     keep1, keep2, add1, add2 = np.float32(0.9), np.float32(0.999), np.float32(0.1), np.float32(0.001)
@@ -111,22 +109,14 @@ def adam(
             here[i] = min(max(here[i] - slopes[i], smallest), largest)
 
 
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
-"""Constants of Adam; the kernel has the same."""
-
-MAX_GRADIENT = 1e15
-"""Largest absolute value of a gradient: its square is still a finite float32."""
-
-MAX_RATE = 1e30
-"""Largest learning rate: the product with a step of Adam is still a finite float32."""
-
-PART = 1 << 19
-"""Approximate number of numbers that a thread updates at a time."""
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # constants of Adam; the kernel has the same
+MAX_GRADIENT = 1e15  # largest absolute value of a gradient: its square is still a finite float32
+MAX_RATE = 1e30  # largest learning rate: the product with a step of Adam is still a finite float32
+PART = 1 << 19  # approximate number of numbers that a thread updates at a time
 
 NONE = np.empty(0, np.float32)
 
-RowGradients = tuple[Int32[np.ndarray, " R"], Mapping[str, Float32[np.ndarray, "R ..."]]]
-"""Rows, ascending, and the gradients of these rows by the name of the parameter."""
+RowGradients = tuple[Int32[np.ndarray, " R"], Mapping[str, Float32[np.ndarray, "R ..."]]]  # rows ascend
 
 
 @dataclass(slots=True, eq=False)
@@ -149,7 +139,6 @@ class PrunableAdam:
         bounds: Mapping[str, tuple[float, float]] | None = None,
         factors: Mapping[str, Tensor] | None = None,
     ) -> None:
-        """Copy the parameters."""
         self._bounds, factors = bounds or {}, factors or {}
         self._leaves = {name: _leaf(value.detach().clone(), factors.get(name)) for name, value in values.items()}
 
@@ -159,11 +148,9 @@ class PrunableAdam:
         return {name: leaf.value for name, leaf in self._leaves.items()}
 
     def step(self, rates: Mapping[str, float], rows: RowGradients | None = None) -> None:
-        """Make an Adam step at these learning rates, and clear the gradients.
-
-        Parameters without any gradient stay. NaN and infinite gradients count as 0, others are clamped to
-        :data:`MAX_GRADIENT`. On the CPU, torch's number of threads is used; the result does not depend on it.
-        """
+        """Make an Adam step at these learning rates, and clear the gradients. Parameters without any gradient stay. NaN
+        and infinite gradients count as 0, others are clamped to :data:`MAX_GRADIENT`. On the CPU, torch's number of
+        threads is used; the result does not depend on it."""
         index, of_rows = (np.empty(0, np.int32), {}) if rows is None else rows
         parts: list[Callable[[], None]] = []
         for name, leaf in self._leaves.items():
@@ -234,23 +221,8 @@ def _parts(
     rows, of_rows = rows if len(of_rows) else rows[:0], of_rows.reshape(-1)
     width = len(values) // max(count, 1)
     step = max(1, PART // max(width, 1))
-    return [
-        partial(
-            adam,
-            values,
-            mean,
-            square,
-            rows,
-            of_rows,
-            slopes,
-            factors,
-            width,
-            first,
-            min(first + step, count),
-            constants,
-        )
-        for first in range(0, count, step)
-    ]
+    arrays = values, mean, square, rows, of_rows, slopes, factors, width
+    return [partial(adam, *arrays, first, min(first + step, count), constants) for first in range(0, count, step)]
 
 
 @torch.no_grad()
@@ -262,22 +234,10 @@ def _step_by_torch(leaf: _Leaf, rate: float, smallest: float, largest: float) ->
     gradient.nan_to_num_(0.0, 0.0, 0.0).clamp_(-MAX_GRADIENT, MAX_GRADIENT)
     most = 1.0 if leaf.factors is None or not len(leaf.factors) else float(leaf.factors.max())
     before = None if leaf.factors is None else leaf.value.detach().clone()
-    torch_adam(
-        [leaf.value],
-        [gradient],
-        [leaf.mean],
-        [leaf.square],
-        [],
-        [torch.tensor(leaf.steps - 1.0, device=leaf.value.device)],
-        fused=True,
-        amsgrad=False,
-        beta1=BETA1,
-        beta2=BETA2,
-        lr=rate * most,
-        weight_decay=0.0,
-        eps=EPSILON,
-        maximize=False,
-    )
+    steps = torch.tensor(leaf.steps - 1.0, device=leaf.value.device)
+    constants: dict[str, Any] = {"beta1": BETA1, "beta2": BETA2, "eps": EPSILON, "weight_decay": 0.0}
+    constants |= {"fused": True, "amsgrad": False, "maximize": False}
+    torch_adam([leaf.value], [gradient], [leaf.mean], [leaf.square], [], [steps], lr=rate * most, **constants)
     if before is not None and leaf.factors is not None:
         leaf.value.sub_(before).mul_(leaf.factors / most).add_(before)
     leaf.value.clamp_(smallest, largest)
@@ -291,8 +251,7 @@ BOUNDS = {
     "opacities": (OPACITY_LOGIT_MIN, OPACITY_LOGIT_MAX),
     "sh0": (-SH_LIMIT, SH_LIMIT),
     "shN": (-SH_LIMIT, SH_LIMIT),
-}
-"""Smallest and largest values that :func:`kissgs.core.splats.clean` leaves unchanged."""
+}  # smallest and largest values that kissgs.core.splats.clean leaves unchanged
 
 
 class GaussianModel:
@@ -301,7 +260,6 @@ class GaussianModel:
     def __init__(
         self, splats: Splats, device: Device = "cpu", extents: Float32[np.ndarray, " N"] | None = None
     ) -> None:
-        """Copy a scene."""
         extents = np.ones(len(splats), np.float32) if extents is None else extents
         self._adam = PrunableAdam(tensors_of(splats, device), BOUNDS, {"means": torch.from_numpy(extents)})
         self._rest = splats.select(slice(0))
@@ -318,27 +276,23 @@ class GaussianModel:
         """Receiver of gradients of images, for :meth:`step`, on the CPU; elsewhere autograd provides them."""
         return self.add_gradients if self._on_cpu else None
 
-    @property
-    def antialiased(self) -> bool:
-        """See :class:`kissgs.Splats`."""
-        return self._rest.antialiased
-
     def add_gradients(self, gradients: Gradients) -> None:
         """Add gradients of an image to those of the next :meth:`step`, on the CPU."""
         self._received.append(gradients)
 
+    @property
+    def antialiased(self) -> bool:
+        return self._rest.antialiased
+
     def gaussians(self) -> dict[str, Tensor]:
-        """Return the parameters themselves."""
         return self.parameters
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
 
     def step(self, rates: Mapping[str, float]) -> None:
-        """Make an Adam step at these learning rates, and clear the gradients.
-
-        Values are clamped to :data:`BOUNDS`; NaN and infinite gradients count as 0.
-        """
+        """Make an Adam step at these learning rates, and clear the gradients. Values are clamped to :data:`BOUNDS`; NaN
+        and infinite gradients count as 0."""
         if self._received:
             found = Gradients.sum(self._received)
             of_rows = {name: getattr(found, name) for name in ATTRIBUTES}
@@ -348,7 +302,6 @@ class GaussianModel:
             self._adam.step(rates)
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
-        """Keep only the Gaussians at ``index``, with their Adam moments."""
         self._adam.keep(index)
 
     def splats(self) -> Splats:

@@ -18,26 +18,13 @@ from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import ImageRenderer, image_renderer, render
 from kissgs.settings import TrainingViewSettings
 
-SCORING_STRIDE = 4
-"""One in this many virtual training cameras scores Gaussians."""
-
-CLOSE_UPS, CLOSE_UP_SHRINK = 4, 4
-"""Number of close-ups per virtual scoring camera, and the factor by which their sides are shorter."""
-
-BACKGROUNDS = (0.0, 0.5, 1.0)
-"""Grey levels of the backgrounds, in turn, of virtual cameras that score or stand beside a capture."""
-
-MIN_SYNTHETIC_VIEWS = 64
-"""Smallest number of synthetic views beside those of a capture; fewer are overfitted."""
-
-SCORING_SHARE = 0.25
-"""Number of these that score Gaussians, as a share of the number of the capture's training views."""
-
-MAX_SIDE_RATIO = 1.5
-"""Largest longer side of the training images of a capture, in units of the setting ``view_size``."""
-
-MAX_EVAL_VIEWS = 16
-"""Largest number of evaluation views."""
+SCORING_STRIDE = 4  # one in this many virtual training cameras scores Gaussians
+CLOSE_UPS, CLOSE_UP_SHRINK = 4, 4  # per virtual scoring camera, and by how much their sides are shorter
+BACKGROUNDS = (0.0, 0.5, 1.0)  # grey levels, in turn, of virtual cameras that score or stand beside a capture
+MIN_SYNTHETIC_VIEWS = 64  # smallest number of synthetic views beside those of a capture; fewer are overfitted
+SCORING_SHARE = 0.25  # number of these that score Gaussians, as a share of the number of the capture's training views
+MAX_SIDE_RATIO = 1.5  # largest longer side of the training images of a capture, in units of the setting view_size
+MAX_EVAL_VIEWS = 16  # largest number of evaluation views
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,14 +32,10 @@ class SupervisionViews:
     """Views by their role."""
 
     train: tuple[View, ...]  # samples of larger photographs; none if nothing is trained
+    # A capture's training views and some synthetic ones, or some virtual cameras and close-ups. Virtual ones have the
+    # usual dilation, so that Gaussians between the sampled pixels of photographs count too.
     score: tuple[View, ...]
-    """Views that score Gaussians: the training views of a capture and some synthetic ones, or some virtual cameras and
-    close-ups, each with a background of its own. Virtual ones have the usual dilation, so that Gaussians between the
-    sampled pixels of photographs count too."""
-
-    test: tuple[View, ...]
-    """Held-out views for evaluation, or some training views if there are none, whole; all have photographs or none."""
-
+    test: tuple[View, ...]  # held-out views, or some training views, whole; all have photographs or none
     background: Float32[np.ndarray, "3"]
     source: str  # of the training views, in words
     captured: bool = False  # whether the training views are those of a capture
@@ -66,7 +49,6 @@ class SupervisionViews:
 
     @property
     def eval_views(self) -> Views:
-        """Evaluation views, for :func:`kissgs.evaluate`."""
         return Views((), self.test, self.background, self.source)
 
 
@@ -78,11 +60,9 @@ def supervision_views(
     *,
     scoring_stride: int = SCORING_STRIDE,
 ) -> SupervisionViews:
-    """Return a capture's training views with virtual ones of the whole scene, or virtual views alone.
-
-    Every ``scoring_stride``-th virtual view scores. 1: no view trains, so that :data:`SCORING_STRIDE` times fewer are
-    drawn; 0: none scores.
-    """
+    """Return a capture's training views with virtual ones of the whole scene, or virtual views alone. Every
+    ``scoring_stride``-th virtual view scores. 1: no view trains, so that :data:`SCORING_STRIDE` times fewer are drawn;
+    0: none scores."""
     if views is None or not views.train:
         virtual = _virtual_views(splats, settings, scoring_stride, context)
         if views is None or not views.test:
@@ -90,7 +70,7 @@ def supervision_views(
         return replace(virtual, test=_evaluation_views(views), background=views.background)
     train = tuple(_thinned(view, number, settings.view_size) for number, view in enumerate(views.train))
     synthetic, per_epoch = _synthetic_views(splats, views.train, settings, context)
-    side = _virtual_side(settings)
+    side = settings.view_size * 3 // 5  # of virtual cameras
     scoring = math.ceil(SCORING_SHARE * len(train)) if scoring_stride else 0
     source = f"{len(synthetic)} virtual cameras" if synthetic else ""
     if synthetic and scoring:
@@ -111,10 +91,8 @@ def supervision_views(
 def _synthetic_views(
     splats: Splats, train: Sequence[View], settings: TrainingViewSettings, context: Context
 ) -> tuple[tuple[View, ...], int]:
-    """Return virtual views of all that a capture may not show, in random order, and their number in each epoch.
-
-    A quarter of them together see all regions. Images are square and have the area of the photographs.
-    """
+    """Return virtual views of all that a capture may not show, in random order, and their number in each epoch. A
+    quarter of them together see all regions. Images are square and have the area of the photographs."""
     share, camera = settings.synthetic_view_share, train[0].camera
     if share == 0:
         return (), 0
@@ -125,20 +103,12 @@ def _synthetic_views(
     cameras, threads = [view.camera for view in regions.all], context.threads
     cameras += scattered_cameras(splats, side=side, count=count - len(cameras), seed=settings.seed, threads=threads)
     order = np.random.default_rng(settings.seed).permutation(len(cameras))
-    views = [
-        View(f"synthetic {n}", cameras[index], background=_grey(BACKGROUNDS[n % len(BACKGROUNDS)]))
-        for n, index in enumerate(order)
-    ]
+    views = [View(f"synthetic {n}", cameras[index], background=_background(n)) for n, index in enumerate(order)]
     return tuple(views), min(per_epoch, len(views))
 
 
-def _virtual_side(settings: TrainingViewSettings) -> int:
-    """Return the largest side of the images of virtual cameras, pixels."""
-    return settings.view_size * 3 // 5
-
-
-def _grey(level: float) -> Float32[np.ndarray, "3"]:
-    return np.full(3, level, np.float32)
+def _background(n: int) -> Float32[np.ndarray, "3"]:
+    return np.full(3, BACKGROUNDS[n % len(BACKGROUNDS)], np.float32)
 
 
 def evaluation_only(views: Views | None) -> SupervisionViews:
@@ -164,7 +134,7 @@ def _evaluation_views(views: Views) -> tuple[View, ...]:
 
 def _virtual_views(splats: Splats, settings: TrainingViewSettings, stride: int, context: Context) -> SupervisionViews:
     """Return virtual views only; their targets are renderings of the scene."""
-    side = _virtual_side(settings)
+    side = settings.view_size * 3 // 5
     count = max(1, settings.views * (stride or SCORING_STRIDE) // SCORING_STRIDE)
     drawn = random_poses(splats, context, side=side, count=count, seed=settings.seed)
     scoring = _scoring_views(splats, drawn.train[::stride], side, settings.seed) if stride else ()
@@ -181,25 +151,17 @@ def _virtual_views(splats: Splats, settings: TrainingViewSettings, stride: int, 
 
 def _scoring_views(splats: Splats, views: Sequence[View], side: int, seed: int) -> tuple[View, ...]:
     """Return ``views`` and close-ups with black, grey and white backgrounds in turn: on black, dark parts do not show.
-
-    ``side`` is that of the views, pixels.
-    """
+    ``side`` is that of the views, pixels."""
     cameras = close_ups(splats, side=max(1, side // CLOSE_UP_SHRINK), count=CLOSE_UPS * len(views), seed=seed)
     added = [View(f"close-up {n}", camera) for n, camera in enumerate(cameras)]
-    return tuple(
-        replace(view, background=_grey(BACKGROUNDS[n % len(BACKGROUNDS)]))
-        for group in (views, added)
-        for n, view in enumerate(group)
-    )
+    return tuple(replace(view, background=_background(n)) for group in (views, added) for n, view in enumerate(group))
 
 
 def _thinned(view: View, number: int, size: int) -> View:
-    """Return every n-th pixel and row of a view, so that the longer side has at most 1.5 times ``size`` pixels.
-
-    Views of different numbers begin at different pixels. A scene that is trained on reduced photographs renders worse
-    at their own size, because footprints are dilated to a pixel (docs/method/research-log.md, "Size of the training
-    images").
-    """
+    """Return every n-th pixel and row of a view, so that the longer side has at most 1.5 times ``size`` pixels. Views
+    of different numbers begin at different pixels. A scene that is trained on reduced photographs renders worse at
+    their own size, because footprints are dilated to a pixel (docs/method/research-log.md, "Size of the training
+    images")."""
     width, height = view.camera.width, view.camera.height
     stride = math.ceil(max(width, height) / (MAX_SIDE_RATIO * size))
     if stride == 1:
@@ -214,8 +176,7 @@ def _evenly_selected(views: Sequence[View], most: int = MAX_EVAL_VIEWS) -> tuple
 
 # Training targets: cameras with photographs, or with renderings of the original scene.
 
-NEAREST_CAMERAS, EXTENT_RATIO = 4, 4.0
-"""The local extent of the cameras is estimated as 4 times the distance to the 4th nearest camera."""
+NEAREST_CAMERAS, EXTENT_RATIO = 4, 4.0  # local extent: 4 times the distance to the 4th nearest camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,11 +199,9 @@ class TrainingTargets:
         return image.astype(np.float32) / np.float32(255 if image.dtype == np.uint8 else 1)
 
     def order(self, seed: Sequence[int], first: int = 0) -> Iterator[int]:
-        """Yield the index of the target for step ``first`` and each later one.
-
-        Each epoch has all targets but the synthetic ones, and the next few of these, in random order.
-        The order depends on the seed and the step only, so that training can be resumed at any step.
-        """
+        """Yield the index of the target for step ``first`` and each later one. Each epoch has all targets but the
+        synthetic ones, and the next few of these, in random order. The order depends on the seed and the step only, so
+        that training can be resumed at any step."""
         always, some = len(self) - self.synthetic, self.synthetic_per_epoch
         turns = np.random.default_rng(seed).permutation(self.synthetic)
         count = always + some
@@ -255,21 +214,17 @@ class TrainingTargets:
 
     @property
     def extent(self) -> float:
-        """Extent of the cameras, world units: 1.1 times the largest distance to their mean position, as in 3DGS.
-
-        0 if all cameras are at one position. Synthetic ones do not count.
-        """
+        """Extent of the cameras, world units: 1.1 times the largest distance to their mean position, as in 3DGS. 0 if
+        all cameras are at one position. Synthetic ones do not count."""
         cameras = self.cameras[: len(self) - self.synthetic]
         positions = np.array([camera.position for camera in cameras])
         return 1.1 * float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
 
     def local_extents(self, means: Float32[np.ndarray, "N 3"], largest: float) -> Float32[np.ndarray, " N"]:
         """Return the extent of the cameras around each of these points, world units, above 0 and at most ``largest``.
-
         If a scene has several objects with cameras around each, the extent of all cameras does not represent the size
         of one object. For a scene of one object, most points get ``largest``. Synthetic cameras count: an object that
-        was not photographed has no others.
-        """
+        was not photographed has no others."""
         positions = np.array([camera.position for camera in self.cameras])
         nearest = np.full((len(means), min(NEAREST_CAMERAS, len(positions))), np.inf)
         for position in positions:
@@ -283,9 +238,7 @@ class TrainingTargets:
 
 
 def training_targets(
-    reference: Splats,
-    supervision: SupervisionViews,
-    context: Context = DEFAULT_CONTEXT,
+    reference: Splats, supervision: SupervisionViews, context: Context = DEFAULT_CONTEXT
 ) -> TrainingTargets:
     """Load the photographs of the training views, and render ``reference`` for those that have none."""
     views, background = supervision.train, supervision.background

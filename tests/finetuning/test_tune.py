@@ -88,7 +88,7 @@ def test_training_has_the_loss_of_the_settings(preset, weights, stage, monkeypat
         files = written(Settings.from_preset("fast").encode)
         work(plan, plan, scene, files)
     else:
-        training = SceneTraining(Popspa(scene, settings, work.supervision, targets=work.targets))
+        training = SceneTraining(Popspa(scene, settings, work.supervision, targets=work.targets), np.arange(len(scene)))
         training.begin()
         training.train(Phase("refine", 1, 40), 0, Context(1))
     assert [(plan.ssim_weight, plan.mse_weight) for plan in plans] == [weights]

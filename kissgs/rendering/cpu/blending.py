@@ -19,8 +19,7 @@ from numba import float32, float64, int32, int64, njit, void
 from kissgs.core.numba_kernels import compiled
 from kissgs.rendering.cpu.records import FRAME, SLOTS, Blended, Frame, Slots, TileLists
 
-Place = tuple[np.float32, np.float32, np.float32, np.float32, np.float32]
-"""Centre of a footprint relative to a tile, and its l0, l1, l2."""
+Place = tuple[np.float32, np.float32, np.float32, np.float32, np.float32]  # relative to a tile: centre, l0, l1, l2
 
 # Sums may be reordered for vectorisation, at compile time, so that results stay reproducible.
 _FAST = {"contract", "reassoc", "nsz"}
@@ -57,10 +56,8 @@ def _pixel_centres(s: np.ndarray) -> None:
 
 @njit(nogil=True, error_model="numpy")
 def _copy_records(records: np.ndarray, members: np.ndarray, first: int, last: int, copies: np.ndarray) -> None:
-    """Copy the first 9 values of the records of members ``first`` to ``last`` (exclusive) into ``copies``.
-
-    Records lie anywhere in memory. Copies of many at once do not wait for each other.
-    """
+    """Copy the first 9 values of the records of members ``first`` to ``last`` (exclusive) into ``copies``. Records lie
+    anywhere in memory. Copies of many at once do not wait for each other."""
     for i in range(first, last):
         for c in range(9):
             copies[i - first, c] = records[members[i], c]
@@ -94,17 +91,10 @@ def _rows(span: np.uint32, half: int) -> tuple[np.uint64, np.uint64]:
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 def _alpha(
-    x: np.float32,
-    y: np.float32,
-    drawn: bool,
-    place: Place,
-    opacity: np.float32,
-    limits: tuple[np.float32, np.float32],
+    x: np.float32, y: np.float32, drawn: bool, place: Place, opacity: np.float32, limits: tuple[np.float32, np.float32]
 ) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Return u, v, alpha before it is clamped, and alpha, 0 where it is not ``drawn``, at a pixel centre.
-
-    It takes no array: an array that is passed to an inlined function prevents vectorisation.
-    """
+    """Return u, v, alpha before it is clamped, and alpha, 0 where it is not ``drawn``, at a pixel centre. It takes no
+    array: an array that is passed to an inlined function prevents vectorisation."""
     mx, my, l0, l1, l2 = place
     least, most = limits
     dx, dy = x - mx, y - my
@@ -295,24 +285,13 @@ def _backward(
     sums[6], sums[7], sums[8] = vr, vg, vb
 
 
-@compiled(
-    void(FRAME, SLOTS, int64, int64, float32[:, :, ::1], float32[:, ::1], float32[:, ::1]),
-    fastmath=_FAST,
-)
+@compiled(void(FRAME, SLOTS, int64, int64, float32[:, :, ::1], float32[:, ::1], float32[:, ::1]), fastmath=_FAST)
 def blend_backward(
-    frame: Frame,
-    slots: Slots,
-    first: int,
-    last: int,
-    v_image: np.ndarray,
-    v_alpha: np.ndarray,
-    v_slots: np.ndarray,
+    frame: Frame, slots: Slots, first: int, last: int, v_image: np.ndarray, v_alpha: np.ndarray, v_slots: np.ndarray
 ) -> None:
     """Compute the gradients of tiles ``first`` to ``last`` (exclusive), given those by the image and by its alpha.
-
     ``v_slots``, ``(slots, 9)``, 0 before, receives the sums over the tile's pixels of the gradient by the exponent
-    times 1, u, v, u², uv, v², and of the gradient by the colour's R, G, B.
-    """
+    times 1, u, v, u², uv, v², and of the gradient by the colour's R, G, B."""
     records, lists, blended = frame.footprints.records, frame.lists, frame.blended
     limits = blended.limits[0], blended.limits[1]
     # Per pixel: x, y, stop, T; gradient by R, G, B; product of the colour behind and its gradient, less that by alpha.
@@ -390,16 +369,13 @@ def blend_colors_backward(
 # Moments: sums over the pixels of a footprint, from which the sensitivity follows
 # (:mod:`kissgs.rendering.cpu.sensitivity`).
 
-MOMENTS = 10
-"""Number of moments of each footprint in each tile."""
+MOMENTS = 10  # number of moments of each footprint in each tile
 
 
 @njit(nogil=True, error_model="numpy")
 def _begin_moments(records: np.ndarray, lists: TileLists, tile: int, frame: Blended, s: np.ndarray) -> None:
     """Write T, the colour behind all Gaussians, and the transmittance to the background behind, of a tile's pixels.
-
-    What is behind the end of a pixel's list has about the colour of the next Gaussian, and hides the background.
-    """
+    What is behind the end of a pixel's list has about the colour of the next Gaussian, and hides the background."""
     x0, y0 = (tile % lists.columns) * 16, (tile // lists.columns) * 16
     height, width = frame.transmittance.shape
     background, begin, max_color = frame.background, lists.starts[tile], np.float32(2)
@@ -469,12 +445,10 @@ def _moments(
 
 @compiled(void(FRAME, SLOTS, int64, int64, float64, float32[:, ::1]), fastmath=_FAST)
 def moments(frame: Frame, slots: Slots, first: int, last: int, spread: float, sums: np.ndarray) -> None:
-    """Compute moments of the members of tiles ``first`` to ``last`` (exclusive), ``(slots, 10)``.
-
-    These are sums over the tile's pixels of |w|² times 1, u², uv, v², u⁴, u³v, u²v², uv³, v⁴; and of (alpha T)².
-    ``spread`` is the standard deviation of each channel of the background. Pixels at which alpha is clamped to
-    ALPHA_MAX count in the first sum only, which is therefore the error of removing the Gaussian.
-    """
+    """Compute moments of the members of tiles ``first`` to ``last`` (exclusive), ``(slots, 10)``. These are sums over
+    the tile's pixels of |w|² times 1, u², uv, v², u⁴, u³v, u²v², uv³, v⁴; and of (alpha T)². ``spread`` is the standard
+    deviation of each channel of the background. Pixels at which alpha is clamped to ALPHA_MAX count in the first sum
+    only, which is therefore the error of removing the Gaussian."""
     records, lists, blended = frame.footprints.records, frame.lists, frame.blended
     limits, variance = (blended.limits[0], blended.limits[1]), np.float32(3 * spread * spread)
     # Per pixel: x, y, stop, T; R, G, B behind the Gaussian, and transmittance to the background behind it.

@@ -18,18 +18,9 @@ from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending, sensitivity
 from kissgs.rendering.cpu.projection import add_colors, project_backward, shade_backward
 from kissgs.rendering.cpu.records import Blended, Frame, Gaussians, Projection, Slots
-from kissgs.rendering.cpu.tiles import (
-    Part,
-    each_part,
-    even,
-    even_tiles,
-    find_footprints,
-    number_slots,
-    sort_into_tiles,
-)
+from kissgs.rendering.cpu.tiles import Part, each_part, even, even_tiles, find_footprints, number_slots, sort_into_tiles
 
-BAND = 1 << 19
-"""Number of members of tiles whose moments are in memory at once."""
+BAND = 1 << 19  # number of members of tiles whose moments are in memory at once
 
 
 def draw(
@@ -40,32 +31,24 @@ def draw(
     end: float = constants.TRANSMITTANCE_MIN,
 ) -> Frame:
     """Render an image of a finite scene (:func:`kissgs.clean`) by the image model of :mod:`kissgs.rendering.constants`.
-
-    Beyond the transmittance ``end``, the background is shown instead of what is behind.
-    """
+    Beyond the transmittance ``end``, the background is shown instead of what is behind."""
     colour = np.array(background, np.float32, order="C")
     if colour.shape != (3,) or not np.isfinite(colour).all():
         raise InvalidViewsError("a background must be three finite numbers: red, green and blue, from 0 to 1")
     try:
-        return _draw(for_kernels(splats), camera, colour, pool, end)
+        gaussians, projection = Gaussians.of(for_kernels(splats)), Projection.of(splats, camera)
+        footprints, parts = find_footprints(gaussians, projection, pool)
+        lists = sort_into_tiles(footprints, parts, projection, pool)
+        image = np.empty((camera.height, camera.width, 3), np.float32)
+        transmittance = np.empty((camera.height, camera.width), np.float32)
+        stops = np.empty((len(lists.starts) - 1, constants.TILE**2), np.int32)
+        limits = np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, end], np.float32)
+        blended = Blended(image, transmittance, stops, colour, limits)
+        frame = Frame(gaussians, projection, footprints, np.array(parts), lists, blended)
+        each_part(lambda first, last: blending.blend(frame, first, last), even_tiles(lists, pool), pool)
     except MemoryError as error:
         size = f"{camera.width}x{camera.height}"
         raise UnsupportedError(f"there is not enough memory for an image of {size}; render a smaller one") from error
-
-
-def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], pool: Workers, end: float) -> Frame:
-    gaussians, projection = Gaussians.of(splats), Projection.of(splats, camera)
-    footprints, parts = find_footprints(gaussians, projection, pool)
-    lists = sort_into_tiles(footprints, parts, projection, pool)
-    blended = Blended(
-        np.empty((camera.height, camera.width, 3), np.float32),
-        np.empty((camera.height, camera.width), np.float32),
-        np.empty((len(lists.starts) - 1, constants.TILE**2), np.int32),
-        background,
-        np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, end], np.float32),
-    )
-    frame = Frame(gaussians, projection, footprints, np.array(parts), lists, blended)
-    each_part(lambda first, last: blending.blend(frame, first, last), even_tiles(lists, pool), pool)
     return frame
 
 
@@ -85,10 +68,8 @@ def _each_footprint(kernel: Callable[..., None], frame: Frame, slots: Slots, poo
 
 def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     """Return the squared change of the image by each Gaussian's removal; see :func:`rasterizer.removal_scores`."""
-    slots, errors = (
-        number_slots(frame.lists, len(frame.gaussians.means)),
-        np.zeros(len(frame.lists.members), np.float32),
-    )
+    slots = number_slots(frame.lists, len(frame.gaussians.means))
+    errors = np.zeros(len(frame.lists.members), np.float32)
     _each_tile(blending.removal_errors, frame, slots, pool, errors)
     return sums_of_slots(frame, slots, errors)
 
@@ -104,21 +85,14 @@ def add_sensitivities(
     frame: Frame, weight: float, spread: float, into: Sensitivity, pool: Workers
 ) -> Float32[np.ndarray, " N"]:
     """Add the sensitivity in this image to ``into``, and return the sum of (alpha T)² over its pixels by footprint.
-
     ``weight`` is that of a single value's squared error, ``spread`` the standard deviation of the background.
     ``shape_hessian`` receives moments, which :func:`sensitivity.moments_to_hessians` converts in the end; harmonics are
-    weighted by (alpha T)², and to be divided by ``color_weight``.
-    """
+    weighted by (alpha T)², and to be divided by ``color_weight``."""
     seen = np.empty(len(frame.footprints.records), np.float32)
     for first, last in frame.parts:
         seen[first:last] = 0
     sums = sensitivity.Sums(
-        into.position_hessian,
-        into.shape_hessian,
-        into.color_weight,
-        into.mean_harmonics,
-        into.higher_harmonics,
-        seen,
+        into.position_hessian, into.shape_hessian, into.color_weight, into.mean_harmonics, into.higher_harmonics, seen
     )
     starts = frame.lists.starts
     edges = np.searchsorted(starts, np.arange(0, starts[-1], BAND))
@@ -142,8 +116,7 @@ def for_kernels(splats: Splats) -> Splats:
 class Gradients:
     """Gradients of a loss by the stored parameters of the R Gaussians that have any; those of all others are 0."""
 
-    gaussians: Int32[np.ndarray, " R"]
-    """Indices of these Gaussians, ascending."""
+    gaussians: Int32[np.ndarray, " R"]  # indices of these Gaussians, ascending
     means: Float32[np.ndarray, "R 3"]
     quats: Float32[np.ndarray, "R 4"]
     scales: Float32[np.ndarray, "R 3"]
@@ -173,10 +146,8 @@ class Gradients:
 def differentiate(
     frame: Frame, v_image: Float32[np.ndarray, "H W 3"], v_alpha: Float32[np.ndarray, "H W"], pool: Workers
 ) -> Gradients:
-    """Return the gradients of a loss by the stored parameters, given those by the image and by its alpha.
-
-    Only Gaussians that contribute to the image have any: of many Gaussians, most lie outside it, or behind others.
-    """
+    """Return the gradients of a loss by the stored parameters, given those by the image and by its alpha. Only
+    Gaussians that contribute to the image have any: of many Gaussians, most lie outside it, or behind others."""
     slots = number_slots(frame.lists, len(frame.footprints.records))
     v_slots, changed = np.zeros((len(slots.of), 9), np.float32), np.empty_like(slots.rows)
     _each_tile(blending.blend_backward, frame, slots, pool, v_image, v_alpha, v_slots)

@@ -10,8 +10,7 @@ from kissgs.core.numba_kernels import compiled
 from kissgs.core.resources import Workers
 from kissgs.rendering.cpu.tiles import each_part, even
 
-SEARCH_LEAF = 16
-"""Largest number of points in a leaf in which nearest neighbours are searched."""
+SEARCH_LEAF = 16  # largest number of points in a leaf in which nearest neighbours are searched
 
 
 @njit(nogil=True, error_model="numpy")
@@ -23,9 +22,7 @@ def _before(values: np.ndarray, a: int, b: int) -> bool:
 @njit(nogil=True, error_model="numpy")
 def _partition(values: np.ndarray, order: np.ndarray, first: int, last: int, middle: int) -> None:
     """Permute ``order[first:last]`` so that the points before position ``middle`` are those of the smallest values.
-
-    Hoare's selection; the set of points before ``middle`` does not depend on their order on entry.
-    """
+    Hoare's selection; the set of points before ``middle`` does not depend on their order on entry."""
     low, high = first, last - 1
     while low < high:
         centre = (low + high) // 2
@@ -86,10 +83,8 @@ def _split(columns: np.ndarray, leaf: int, order: np.ndarray, edges: np.ndarray)
 
 @njit(nogil=True, error_model="numpy")
 def _at_rank(bits: np.ndarray, rank: int, low: int, high: int) -> int:
-    """Return the bits of the float at this rank, to 11 bits of the mantissa, by bisection of counts.
-
-    Bits of positive floats sort as the floats do; ``low`` are those of the smallest, ``high`` at or above the result.
-    """
+    """Return the bits of the float at this rank, to 11 bits of the mantissa, by bisection of counts. Bits of positive
+    floats sort as the floats do; ``low`` are those of the smallest, ``high`` at or above the result."""
     while high - low > 4096:
         middle = low + (high - low) // 2
         bound, count = np.int32(middle), np.int32(0)
@@ -128,12 +123,10 @@ def _squared_scale(squared: np.ndarray, rank: int) -> float:
 def leaf_scales(
     means: np.ndarray, order: np.ndarray, edges: np.ndarray, first: int, last: int, scales: np.ndarray
 ) -> None:
-    """Compute the local scales of the points in leaves ``first`` to ``last`` (exclusive).
-
-    The scale is the distance within which one in four of every fourth point of the leaf lies. If the nearest half,
-    quarter or eighth of these is nearer than a fifth of what a surface of uniform density would have, the object has no
-    more points, and their distance is used.
-    """
+    """Compute the local scales of the points in leaves ``first`` to ``last`` (exclusive). The scale is the distance
+    within which one in four of every fourth point of the leaf lies. If the nearest half, quarter or eighth of these is
+    nearer than a fifth of what a surface of uniform density would have, the object has no more points, and their
+    distance is used."""
     for leaf in range(first, last):
         members = np.sort(order[edges[leaf] : edges[leaf + 1]])
         count = members.shape[0]
@@ -154,11 +147,9 @@ def leaf_scales(
 
 @compiled("void(float64[:, ::1], int32[::1], int64[::1], float64[:, :, ::1])")
 def _fill_boxes(means: np.ndarray, order: np.ndarray, edges: np.ndarray, boxes: np.ndarray) -> None:
-    """Compute the bounding boxes ``(2 * S, 2, 3)`` of a binary tree over the leaves, S being a power of two.
-
-    They are the lowest and highest coordinates of node n, whose children are 2 n and 2 n + 1; node S + i is leaf i.
-    Nodes without points have inverted boxes.
-    """
+    """Compute the bounding boxes ``(2 * S, 2, 3)`` of a binary tree over the leaves, S being a power of two. They are
+    the lowest and highest coordinates of node n, whose children are 2 n and 2 n + 1; node S + i is leaf i. Nodes
+    without points have inverted boxes."""
     side = boxes.shape[0] // 2
     boxes[:, 0] = np.inf
     boxes[:, 1] = -np.inf
@@ -260,11 +251,8 @@ def unique_pairs(found: np.ndarray, pairs: np.ndarray) -> int:
 
 
 def leaves_of(points: Shaped[np.ndarray, "N 3"], leaf: int) -> tuple[Int32[np.ndarray, " N"], Int64[np.ndarray, " e"]]:
-    """Split points into the leaves of a k-d tree of equal counts: at the median of a part's longest side.
-
-    Returns:
-        Numbers of the points, leaf after leaf, and the edges of the leaves of at most ``leaf`` points in it.
-    """
+    """Split points into the leaves of a k-d tree of equal counts: at the median of a part's longest side. Returned are
+    the numbers of the points, leaf after leaf, and the edges of the leaves of at most ``leaf`` points in it."""
     order, edges = np.arange(len(points), dtype=np.int32), np.empty(4 * len(points) // leaf + 2, np.int64)
     found = _split(np.array(points.T, np.float32, order="C"), leaf, order, edges)
     return order, edges[: found + 1]
@@ -274,9 +262,7 @@ def nearest_neighbours(
     points: Float64[np.ndarray, "N 3"], count: int, rank: int, pool: Workers
 ) -> tuple[Int32[np.ndarray, "N K"], Float64[np.ndarray, " N"]]:
     """Return the ``count`` nearest other points of each, nearest first, and the squared distance to that of ``rank``.
-
-    Of equally near ones, any; there must be more than ``count`` points, and ranks are from 0.
-    """
+    Of equally near ones, any; there must be more than ``count`` points, and ranks are from 0."""
     order, edges = leaves_of(points, SEARCH_LEAF)
     leaves = len(edges) - 1
     boxes = np.empty((2 << (leaves - 1).bit_length(), 2, 3))

@@ -25,9 +25,7 @@ from kissgs.rendering.cpu.records import (
 @njit(nogil=True, error_model="numpy")
 def _harmonics(x: float, y: float, z: float, count: int, basis: np.ndarray) -> None:
     """Write the real spherical harmonics 1 to ``count``, without the constant one, at a unit vector into ``basis``.
-
-    Unrolled, unlike :func:`kissgs.core.harmonics_kernel.write_harmonics`, because every footprint needs it.
-    """
+    Unrolled, unlike :func:`kissgs.core.harmonics_kernel.write_harmonics`, because every footprint needs it."""
     if count >= 3:
         basis[0] = -0.4886025119029199 * y
         basis[1] = 0.4886025119029199 * z
@@ -189,10 +187,7 @@ def _applied(m: Matrix, a: Vector) -> Vector:
 
 @_helper
 def _pose(viewmat: np.ndarray) -> tuple[Matrix, Vector]:
-    return (
-        (_load(viewmat, 0), _load(viewmat, 1), _load(viewmat, 2)),
-        (viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]),
-    )
+    return ((_load(viewmat, 0), _load(viewmat, 1), _load(viewmat, 2)), (viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]))
 
 
 @_helper
@@ -268,10 +263,8 @@ def _compensation(w: Vector, v: Vector, dilation: float) -> float:
 @_helper
 def _strain(axis: Vector, u: Vector, v: Vector, i: int, j: int) -> float:
     """Return entry i, j of the derivative of the logarithm of :func:`_compensation` by a strain E of W, to W (1 + E).
-
     It is Wᵀ ((W Wᵀ)⁻¹ - (W Wᵀ + dilation)⁻¹) W: the projection onto the rows of W, whose cross product has the
-    direction ``axis``, minus twice that of the rows u, v of L W.
-    """
+    direction ``axis``, minus twice that of the rows u, v of L W."""
     return (1.0 if i == j else 0.0) - axis[i] * axis[j] - 2 * (u[i] * u[j] + v[i] * v[j])
 
 
@@ -284,10 +277,8 @@ def _unit(a: Vector) -> Vector:
 
 @_helper
 def _whitened(w: Vector, v: Vector, dilation: float) -> tuple[Vector, Vector]:
-    """Return the rows of L W, whose entries are at most 1/√2: l0 w + l1 v, and l2 v.
-
-    The terms of l0 w + l1 v are as large as a needle is long and cancel; w (v v) - v (w v) = v × (w × v) avoids that.
-    """
+    """Return the rows of L W, whose entries are at most 1/√2: l0 w + l1 v, and l2 v. The terms of l0 w + l1 v are as
+    large as a needle is long and cancel; w (v v) - v (w v) = v × (w × v) avoids that."""
     l0, _, l2 = _cholesky(w, v, dilation)
     scale = l0 / (_dot(v, v) + dilation)
     return _mix(scale * dilation, w, scale, _cross(v, _cross(w, v))), _scaled(v, (l2, l2, l2))
@@ -296,10 +287,8 @@ def _whitened(w: Vector, v: Vector, dilation: float) -> tuple[Vector, Vector]:
 @_helper
 def _is_far_outside(centre: float, side: int, deviation: float, clamped: float, most: float, dilation: float) -> bool:
     """Return whether a Gaussian is so far outside the image along an axis that it cannot reach it at any opacity.
-
     ``side`` is that of the image, ``deviation`` the largest standard deviation in pixels, ``clamped`` x/z or y/z, and
-    ``most`` the largest 2 tau.
-    """
+    ``most`` the largest 2 tau."""
     beyond = max(-centre, centre - side)
     return beyond > 0 and beyond * beyond > most * (deviation * deviation * (1 + clamped * clamped) + dilation)
 
@@ -365,10 +354,8 @@ def _overlaps(centre: float, half: float, side: int) -> bool:
 
 @compiled(int64(GAUSSIANS, PROJECTION, int64, int64, FOOTPRINTS))
 def project(gaussians: Gaussians, projection: Projection, first: int, last: int, found: Footprints) -> int:
-    """Find the footprints of the Gaussians ``first`` to ``last`` (exclusive) that touch the image.
-
-    They are written from row ``first`` on, without colours; their number is returned.
-    """
+    """Find the footprints of the Gaussians ``first`` to ``last`` (exclusive) that touch the image. They are written
+    from row ``first`` on, without colours; their number is returned."""
     K, width, height, dilation = projection.K, projection.width, projection.height, projection.dilation
     alpha_min, records = projection.alpha_min, found.records
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -417,10 +404,8 @@ def project(gaussians: Gaussians, projection: Projection, first: int, last: int,
 def _by_axes(
     sums: np.ndarray, w: Vector, v: Vector, dilation: float, antialiased: bool, v_scales: np.ndarray, i: int
 ) -> tuple[Vector, Vector]:
-    """Return the gradients by the rows of W; write those by the log-scales of row ``i``.
-
-    By W: -4 Lᵀ S L W, S = (Σ uu, Σ uv; Σ uv, Σ vv); the derivative of a scale by its logarithm is the scale.
-    """
+    """Return the gradients by the rows of W; write those by the log-scales of row ``i``. By W: -4 Lᵀ S L W, S = (Σ uu,
+    Σ uv; Σ uv, Σ vv); the derivative of a scale by its logarithm is the scale."""
     l0, l1, l2 = _cholesky(w, v, dilation)
     u_rows, v_rows = _whitened(w, v, dilation)
     spread_u, spread_v = _mix(sums[3], u_rows, sums[4], v_rows), _mix(sums[4], u_rows, sums[5], v_rows)
@@ -451,9 +436,7 @@ def _by_position(
     by_rows: tuple[Vector, Vector],
 ) -> Vector:
     """Return the gradient by the mean: through the centre, through J, and through the x/z and y/z of J if not clamped.
-
-    ``position``: x/z, y/z and z; ``by_rows``: gradients by the rows of J Rc.
-    """
+    ``position``: x/z, y/z and z; ``by_rows``: gradients by the rows of J Rc."""
     (left, right, top, bottom), (x, y, z), (jx, jxz, jy, jyz) = frustum, position, J
     by_p, by_q = by_rows
     by_jx, by_jxz = _dot(by_p, rotation[0]), _dot(by_p, rotation[2])
@@ -476,11 +459,9 @@ def project_backward(
     gradients: Gaussians,
     v_colors: np.ndarray,
 ) -> None:
-    """Compute the gradients of the footprints ``changed[first:last]`` from those of ``blending.blend_backward``.
-
-    Writes their Gaussians, ``indices``; the gradients by these, all but those by SH; and, ``(R, 3)``, those by the
-    colours before they are clamped.
-    """
+    """Compute the gradients of the footprints ``changed[first:last]`` from those of ``blending.blend_backward``. Writes
+    their Gaussians, ``indices``; the gradients by these, all but those by SH; and, ``(R, 3)``, those by the colours
+    before they are clamped."""
     gaussians, projection, footprints = frame.gaussians, frame.projection, frame.footprints
     pose, frustum = _pose(projection.viewmat), _frustum(projection)
     sums = np.empty(9, np.float64)
@@ -513,9 +494,7 @@ def project_backward(
 @compiled(void(FRAME, SLOTS, int64, int64, float32[:, ::1], float32[:, ::1]))
 def add_colors(frame: Frame, slots: Slots, first: int, last: int, v_slots: np.ndarray, v_colors: np.ndarray) -> None:
     """Add the gradients by ``sh0``, given those of ``blending.blend_colors_backward``, of ``slots.rows[first:last]``.
-
-    Colours that are clamped to 0 have no gradient.
-    """
+    Colours that are clamped to 0 have no gradient."""
     for i in range(first, last):
         row = slots.rows[i]
         for c in range(3):

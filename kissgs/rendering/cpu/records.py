@@ -46,29 +46,17 @@ class Projection(NamedTuple):
 
     @classmethod
     def of(cls, splats: Splats, camera: Camera) -> Projection:
-        """Return the projection of a scene into the image of a camera."""
-        return cls(
-            camera.viewmat,
-            camera.K,
-            np.ascontiguousarray(camera.position),
-            int(camera.width),
-            int(camera.height),
-            constants.NEAR,
-            constants.FAR,
-            float(camera.dilation),
-            constants.FRUSTUM_MARGIN,
-            constants.ALPHA_MIN,
-            bool(splats.antialiased),
-        )
+        pose = camera.viewmat, camera.K, np.ascontiguousarray(camera.position), int(camera.width), int(camera.height)
+        depths, dilation = (constants.NEAR, constants.FAR), float(camera.dilation)
+        antialiased = bool(splats.antialiased)
+        return cls(*pose, *depths, dilation, constants.FRUSTUM_MARGIN, constants.ALPHA_MIN, antialiased)
 
 
 class Footprints(NamedTuple):
     """The M Gaussians that touch an image, in the order of the scene, in some rows of arrays for all N."""
 
-    visible: Int32[np.ndarray, " N"]
-    """The Gaussian of each row."""
-    depths: Float32[np.ndarray, " N"]
-    """z in the camera."""
+    visible: Int32[np.ndarray, " N"]  # the Gaussian of each row
+    depths: Float32[np.ndarray, " N"]  # z in the camera
     records: Float32[np.ndarray, "N 11"]
     """Centre x, y; l0, l1, l2 of :mod:`kissgs.rendering.cpu.blending`; opacity, compensated in an antialiased scene; R,
     G, B; the largest exponent whose alpha reaches ALPHA_MIN; half height in pixels."""
@@ -77,12 +65,9 @@ class Footprints(NamedTuple):
 class TileLists(NamedTuple):
     """Lists of the footprints that touch each tile."""
 
-    columns: int
-    """Number of tiles in a row of tiles."""
-    starts: Int64[np.ndarray, " tiles_1"]
-    """Index of the first member of each tile."""
-    members: Int32[np.ndarray, " P"]
-    """Rows of the footprints, tile after tile, front to back."""
+    columns: int  # number of tiles in a row of tiles
+    starts: Int64[np.ndarray, " tiles_1"]  # index of the first member of each tile
+    members: Int32[np.ndarray, " P"]  # rows of the footprints, tile after tile, front to back
     spans: UInt32[np.ndarray, " P"]
     """Rows of pixels that each member touches in the tile, as ``32 * first + last``, last exclusive: those in its left
     half in the lower 16 bits, those in its right half in the upper ones."""
@@ -91,15 +76,11 @@ class TileLists(NamedTuple):
 class Blended(NamedTuple):
     """An image, and what it was blended with."""
 
-    image: Float32[np.ndarray, "H W 3"]
-    """RGB, 0 and up, not clamped to 1."""
-    transmittance: Float32[np.ndarray, "H W"]
-    """Share of the background that is visible, 1 - alpha."""
-    stops: Int32[np.ndarray, "tiles 256"]
-    """Index of the first member of the tile that is not drawn at the pixel; left half first, row after row."""
+    image: Float32[np.ndarray, "H W 3"]  # RGB, 0 and up, not clamped to 1
+    transmittance: Float32[np.ndarray, "H W"]  # share of the background that is visible, 1 - alpha
+    stops: Int32[np.ndarray, "tiles 256"]  # index of the first member that is not drawn at the pixel; left half first
     background: Float32[np.ndarray, "3"]
-    limits: Float32[np.ndarray, "3"]
-    """ALPHA_MIN, ALPHA_MAX, and the transmittance at which the list of a pixel ends."""
+    limits: Float32[np.ndarray, "3"]  # ALPHA_MIN, ALPHA_MAX, and the transmittance at which the list of a pixel ends
 
 
 class Frame(NamedTuple):
@@ -108,8 +89,7 @@ class Frame(NamedTuple):
     gaussians: Gaussians
     projection: Projection
     footprints: Footprints
-    parts: Int64[np.ndarray, "parts 2"]
-    """First and last (exclusive) row of each range that holds footprints; other rows are not set."""
+    parts: Int64[np.ndarray, "parts 2"]  # first and last (exclusive) row of ranges with footprints; others are not set
     lists: TileLists
     blended: Blended
 
@@ -129,23 +109,16 @@ class Frame(NamedTuple):
 
 
 class Slots(NamedTuple):
-    """Numbers of the members of some tiles, footprint by footprint, so that sums over tiles have a fixed order.
+    """Numbers of the members of some tiles, footprint by footprint, so that sums over tiles have a fixed order. A tile
+    writes to its own slots, and the slots of a footprint are added in order."""
 
-    A tile writes to its own slots, and the slots of a footprint are added in order.
-    """
-
-    begin: int
-    """Index of the first member of these tiles."""
-    of: Int32[np.ndarray, " S"]
-    """Slot of each member."""
-    rows: Int32[np.ndarray, " T"]
-    """Rows of the footprints that are members, ascending."""
-    first: Int32[np.ndarray, " N_1"]
-    """First slot of each row; a row's slots end where the next one's begin."""
+    begin: int  # index of the first member of these tiles
+    of: Int32[np.ndarray, " S"]  # slot of each member
+    rows: Int32[np.ndarray, " T"]  # rows of the footprints that are members, ascending
+    first: Int32[np.ndarray, " N_1"]  # first slot of each row; a row's slots end where the next one's begin
 
 
-named_tuple: Any = types.NamedTuple
-"""Type of a named tuple; numba has no annotations."""
+named_tuple: Any = types.NamedTuple  # type of a named tuple; numba has no annotations
 
 GAUSSIANS = named_tuple((*[float32[:, ::1]] * 3, float32[::1], float32[:, ::1], float32[:, :, ::1]), Gaussians)
 PROJECTION = named_tuple(

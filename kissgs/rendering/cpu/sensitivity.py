@@ -46,11 +46,9 @@ def raise_coverage(
     share: np.ndarray,
 ) -> None:
     """Raise the coverage, ``share``, of the Gaussians of footprints ``first`` to ``last`` (exclusive) by one image.
-
     ``seen`` is the sum of (alpha T)² over the pixels of each footprint; ``resolved_length`` the length in the image of
     the local scale from which a Gaussian counts as resolved, pixels. It counts as seen from 0.003 of its squared alpha
-    on; with less than a twentieth of its opacity unobstructed, it is hidden.
-    """
+    on; with less than a twentieth of its opacity unobstructed, it is hidden."""
     gaussians, projection = frame.gaussians, frame.projection
     means, scales, K, eye = gaussians.means, gaussians.scales, projection.K, projection.eye
     dilated_area = projection.dilation / 0.3  # of a squared point, pixels
@@ -91,10 +89,8 @@ def _square(u: Vector, v: Vector, axis: int) -> Vector:
 
 @_helper
 def _thickened(s: Vector) -> Vector:
-    """Return the factors by which a Gaussian's axes are enlarged to at least 1/10,000 of the longest.
-
-    Moments of a needle's thin axes would underflow, while their derivatives by rotations are large.
-    """
+    """Return the factors by which a Gaussian's axes are enlarged to at least 1/10,000 of the longest. Moments of a
+    needle's thin axes would underflow, while their derivatives by rotations are large."""
     least = 1e-4 * max(s[0], s[1], s[2])
     return max(least / s[0], 1.0), max(least / s[1], 1.0), max(least / s[2], 1.0)
 
@@ -106,14 +102,10 @@ class Sums(NamedTuple):
     shape_moments: Float32[np.ndarray, "N 10"]
     """Sums over pixels of |w|² times 1; times g0², g1², g2²; times their squares; and times (g1 g2)², (g2 g0)²,
     (g0 g1)²; with constant terms in antialiased scenes."""
-    color_weight: Float32[np.ndarray, " N"]
-    """Sum of (alpha T)²."""
-    harmonics: Float32[np.ndarray, "N K"]
-    """Sum of (alpha T)² times the spherical harmonics without the constant one."""
-    higher_harmonics: Float32[np.ndarray, "N H"]
-    """Sum of (alpha T)² times those of higher degrees."""
-    seen: Float32[np.ndarray, " N"]
-    """Sum of (alpha T)² of this image alone, without its weight, by row."""
+    color_weight: Float32[np.ndarray, " N"]  # sum of (alpha T)²
+    harmonics: Float32[np.ndarray, "N K"]  # sum of (alpha T)² times the spherical harmonics without the constant one
+    higher_harmonics: Float32[np.ndarray, "N H"]  # sum of (alpha T)² times those of higher degrees
+    seen: Float32[np.ndarray, " N"]  # sum of (alpha T)² of this image alone, without its weight, by row
 
 
 SUMS = named_tuple(
@@ -125,14 +117,12 @@ SUMS = named_tuple(
 def _add_shape(
     m: np.ndarray, w: Vector, v: Vector, s: Vector, dilation: float, antialiased: bool, out: np.ndarray, n: int
 ) -> None:
-    """Add the moments of one footprint as moments of g to the row ``n`` of ``shape_moments``.
-
-    A footprint's coordinates (u, v) times L W are coordinates g in the Gaussian's own frame, in units of its axes, here
-    :func:`_thickened`. The derivative of ln alpha by a strain of the Gaussian is quadratic in g whatever the camera, so
-    images are added as moments of g, and the Hessian by log-scales and rotation follows once
-    (:func:`moments_to_hessians`). In antialiased scenes that derivative has a constant term as well (:func:`_strain`):
-    g g becomes g g + strain / 4. Pixels at which alpha is clamped have it too, where it is at most 2 %.
-    """
+    """Add the moments of one footprint as moments of g to the row ``n`` of ``shape_moments``. A footprint's coordinates
+    (u, v) times L W are coordinates g in the Gaussian's own frame, in units of its axes, here :func:`_thickened`. The
+    derivative of ln alpha by a strain of the Gaussian is quadratic in g whatever the camera, so images are added as
+    moments of g, and the Hessian by log-scales and rotation follows once (:func:`moments_to_hessians`). In antialiased
+    scenes that derivative has a constant term as well (:func:`_strain`): g g becomes g g + strain / 4. Pixels at which
+    alpha is clamped have it too, where it is at most 2 %."""
     m0, m20, m11, m02, m40, m31, m22, m13, m04 = m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]
     plain_u, plain_v = _whitened(w, v, dilation)
     thickened = _thickened(s)

@@ -29,10 +29,8 @@ from kissgs.rendering.cpu.records import (
 
 @njit(nogil=True, error_model="numpy")
 def _sort_list(keys: np.ndarray, rows: np.ndarray, spans: np.ndarray, scratch: np.ndarray, counts: np.ndarray) -> None:
-    """Sort ``rows`` and ``spans`` of one tile's members by their keys, stably.
-
-    ``scratch`` has four rows, as long as the keys or longer, ``counts`` 2048 entries.
-    """
+    """Sort ``rows`` and ``spans`` of one tile's members by their keys, stably. ``scratch`` has four rows, as long as
+    the keys or longer, ``counts`` 2048 entries."""
     count = keys.shape[0]
     order, other = scratch[0], scratch[1]
     for i in range(count):
@@ -126,11 +124,9 @@ def _disc(records: np.ndarray, n: int) -> tuple[float, float, float, float, floa
 
 @njit(nogil=True, error_model="numpy")
 def _halves(records: np.ndarray, n: int, row: int, halves: int) -> tuple[int, int]:
-    """Return the first and last (exclusive) half of a tile that footprint ``n`` touches in a row of tiles.
-
-    The footprint is the disc u² + v² <= tau. In a row of tiles, v is in an interval; x = (u - k v) / l0 is largest at
-    v = -k √tau / √(1 + k²) or at the interval's nearer end.
-    """
+    """Return the first and last (exclusive) half of a tile that footprint ``n`` touches in a row of tiles. The
+    footprint is the disc u² + v² <= tau. In a row of tiles, v is in an interval; x = (u - k v) / l0 is largest at v =
+    -k √tau / √(1 + k²) or at the interval's nearer end."""
     centre_x, centre_y, l0, l1, l2, tau = _disc(records, n)
     radius = np.sqrt(tau)
     low = max((16 * row + 0.5 - centre_y) * l2, -radius)
@@ -163,9 +159,7 @@ def _box(records: np.ndarray, n: int, halves: int, rows: int) -> tuple[int, int,
 @njit(nogil=True, error_model="numpy")
 def _span(records: np.ndarray, n: int, half: int, row: int) -> int:
     """Return the rows of pixels that a footprint touches in half of a tile, as ``32 * first + last``, last exclusive.
-
-    Within the half's columns, the footprint is highest at its own highest point or at the nearer side of the half.
-    """
+    Within the half's columns, the footprint is highest at its own highest point or at the nearer side of the half."""
     centre_x, centre_y, l0, l1, l2, tau = _disc(records, n)
     x, y = 8 * half - centre_x, 16 * row - centre_y
     reach = np.sqrt(tau) / l2
@@ -206,10 +200,8 @@ def count_tiles(records: np.ndarray, first: int, last: int, per_tile: np.ndarray
 def fill_tiles(
     footprints: Footprints, first: int, last: int, lists: TileLists, ends: np.ndarray, keys: np.ndarray
 ) -> None:
-    """Append footprints ``first`` to ``last`` (exclusive) to the lists of the tiles that they touch.
-
-    The list of each tile continues at ``ends``. ``keys``: bits of each member's depth, which sort as depths do.
-    """
+    """Append footprints ``first`` to ``last`` (exclusive) to the lists of the tiles that they touch. The list of each
+    tile continues at ``ends``. ``keys``: bits of each member's depth, which sort as depths do."""
     records, depths = footprints.records, footprints.depths.view(np.uint32)
     rows, columns = ends.shape
     for n in range(first, last):
@@ -231,17 +223,10 @@ def fill_tiles(
 
 R = TypeVar("R")
 
-Part = tuple[int, int]
-"""First and last (exclusive) of some items."""
-
-MAX_PAIRS = 2**31 - 1
-"""Largest number of pairs of a footprint and a tile that it touches: the lists are int32."""
-
-MAX_MEMBERS = 2**24 - 1
-"""Largest number of footprints in one tile: kernels store their indices as float32."""
-
-PARTS_PER_THREAD = 4
-"""Number of parts per thread; parts differ in cost, and smaller ones balance the load."""
+Part = tuple[int, int]  # first and last (exclusive) of some items
+MAX_PAIRS = 2**31 - 1  # largest number of pairs of a footprint and a tile that it touches: the lists are int32
+MAX_MEMBERS = 2**24 - 1  # largest number of footprints in one tile: kernels store their indices as float32
+PARTS_PER_THREAD = 4  # number of parts per thread; parts differ in cost, and smaller ones balance the load
 
 
 def find_footprints(gaussians: Gaussians, projection: Projection, pool: Workers) -> tuple[Footprints, list[Part]]:
@@ -279,10 +264,7 @@ def number_slots(lists: TileLists, rows: int, tiles: Part | None = None) -> Slot
     first, last = tiles or (0, len(lists.starts) - 1)
     begin, end = int(lists.starts[first]), int(lists.starts[last])
     slots = Slots(
-        begin,
-        np.empty(end - begin, np.int32),
-        np.empty(min(end - begin, rows), np.int32),
-        np.empty(rows + 1, np.int32),
+        begin, np.empty(end - begin, np.int32), np.empty(min(end - begin, rows), np.int32), np.empty(rows + 1, np.int32)
     )
     found = fill_slots(lists.members[begin:end], slots)
     return slots._replace(rows=slots.rows[:found])
