@@ -1,7 +1,5 @@
 """The scene formats, one line each, and what the name of an output stands for. A format's module is imported when used.
-
-To add a format, add its module, which ends in ``FORMAT = Codec(…)``, and its line in :data:`FORMATS`.
-"""
+To add a format, add its module, which ends in ``FORMAT = Codec(…)``, and its line in :data:`FORMATS`."""
 
 from __future__ import annotations
 
@@ -104,10 +102,8 @@ def ending_of(container: ContainerName) -> str:
 
 
 def names_folder(destination: str | PathLike[str]) -> bool:
-    """Whether a name is that of a folder: one that exists, or ends in a slash or in ``.container``.
-
-    A Path keeps no slash: one without an ending is a folder.
-    """
+    """Whether a name is that of a folder: one that exists, or ends in a slash or in ``.container``. A Path keeps no
+    slash: one without an ending is a folder."""
     name = os.fspath(destination)
     ending = Path(f"_{Path(name).name.rstrip('.')}").suffix  # also of ".zip" and "a.zip."
     return (
@@ -150,10 +146,8 @@ def named_container(requested: str | None, destination: str | PathLike[str] | No
 
 
 def named_manifest(destination: Path) -> Path | None:
-    """Return the manifest of the streamed scene that a destination names; None if it names something else.
-
-    It is the destination itself, or ``levels.json`` in a folder that ends in ``.sogxt``.
-    """
+    """Return the manifest of the streamed scene that a destination names; None if it names something else. It is the
+    destination itself, or ``levels.json`` in a folder that ends in ``.sogxt``."""
     if destination.name in MANIFESTS:
         return destination
     return destination / LEVELS_NAME if destination.suffix.lower() == LEVELS_ENDING else None

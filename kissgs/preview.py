@@ -22,7 +22,8 @@ from typing import Any
 from urllib.parse import quote, unquote, urlsplit
 
 from kissgs._version import __version__
-from kissgs.core.context import Progress, silent
+from kissgs.cameras.virtual.first_view import first_view_of
+from kissgs.core.context import Context, Progress, silent
 from kissgs.core.errors import InvalidSceneError, KissgsError, UnsupportedError
 from kissgs.core.positions import WORLD
 from kissgs.formats import CONTAINERS, FORMATS, ending_of
@@ -180,7 +181,10 @@ def page_scene(
     found = _as_container(source, reading)
     if found is None:
         file = io.BytesIO()
-        write_ply(file, replace(splats, origin=WORLD), progress=progress)  # viewers draw a scene better near the origin
+        view = first_view_of(splats, Context(threads, progress=progress))
+        comment = "" if view is None else f"comment kissgs view {json.dumps(view)}"
+        near = replace(splats, origin=WORLD)  # viewers draw a scene better near the origin
+        write_ply(file, near, progress=progress, comment=comment)
         found = PageScene(f"{_stem(source)}.ply", file.getvalue(), converted=recognise(source) != "ply")
     return replace(found, notes=(*splats.notes, *cleaned.notes))
 
@@ -197,10 +201,8 @@ def page_container(
 
 
 def _as_container(source: Path | bytes, reading: ReadOptions) -> PageScene | None:
-    """Return the zip of a container, None for other formats. The files of a folder are packed.
-
-    A container is not shown as it is if its mark of antialiasing does not count.
-    """
+    """Return the zip of a container, None for other formats. The files of a folder are packed. A container is not shown
+    as it is if its mark of antialiasing does not count."""
     found = recognise(source)
     kind = next((kind for kind in CONTAINERS if kind == found), None)
     if kind is None or reading.antialiased is not None:
@@ -341,11 +343,9 @@ _SERVED_POLICY = (
 
 
 class PageServer(ThreadingHTTPServer):
-    """Server of the page at ``/``, of its files and of the scene, and of nothing else.
-
-    Only requests whose ``Host`` is this machine by number or as ``localhost`` are answered, so that a web site whose
-    name resolves to 127.0.0.1 cannot read the scene. Port 0 is a free one.
-    """
+    """Server of the page at ``/``, of its files and of the scene, and of nothing else. Only requests whose ``Host`` is
+    this machine by number or as ``localhost`` are answered, so that a web site whose name resolves to 127.0.0.1 cannot
+    read the scene. Port 0 is a free one."""
 
     daemon_threads = True
     block_on_close = False

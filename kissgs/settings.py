@@ -382,15 +382,17 @@ class Preset(StrEnum):
     PAPER = "paper"
 
 
+_PAPER_LOSS = {"ssim_weight": 0.2, "mse_weight": 0.0, "synthetic_view_share": 0.0}
+
 PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
     Preset.FAST: {
         "compact": {"sparsify_steps": 0, "refine_steps": 0},
         "encode": {
             "rate_distortion": False,
             "order": "hilbert",
+            "codebook_order": "axes",
             "sh_kmeans_iterations": 1,
             "sh_neighbors": 32,
-            "codebook_order": "axes",
             "codebook_max_effort": False,
             "high_effort_pixels": 0,
             "webp_quality": 50,
@@ -417,18 +419,16 @@ PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
             "min_keep_per_scoring": 0.0,
             "sparsify_steps": 5000,
             "prune_rounds": 1,
-            "admm_rho": 5e-4,
             "refine_steps": 5000,
+            "admm_rho": 5e-4,
             "erank_weight": 0.01,
             "min_scale_weight": 1.0,
-            "synthetic_view_share": 0.0,
-            "ssim_weight": 0.2,
-            "mse_weight": 0.0,
+            **_PAPER_LOSS,
             "means_lr_scale": 0.01,
+            "final_means_lr_scale": 0.00215,
             "lr_scale": 1.0,
             "final_lr_scale": 1.0,
             "synthetic_lr_scale": 1.0,
-            "final_means_lr_scale": 0.00215,
         },
         "encode": {
             "rate_distortion": False,
@@ -447,15 +447,7 @@ PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
             "codebook_max_effort": False,
             "high_effort_pixels": 0,
         },
-        "finetune": {
-            "steps": 4000,
-            "batch": 8,
-            "ssim_weight": 0.2,
-            "mse_weight": 0.0,
-            "rate_weight": 0.0,
-            "tv_weight": 1.0,
-            "synthetic_view_share": 0.0,
-        },
+        "finetune": {"steps": 4000, "batch": 8, **_PAPER_LOSS, "rate_weight": 0.0, "tv_weight": 1.0},
     },
 }
 """Differences from the defaults, by preset and group."""

@@ -1,7 +1,5 @@
-"""Procedural sample scene with the appearance and statistics of a trained 3DGS reconstruction.
-
-Axes as in COLMAP, y pointing down: the ground is y = 0, the camera looks along +z.
-"""
+"""Procedural sample scene with the appearance and statistics of a trained 3DGS reconstruction. Axes as in COLMAP, y
+pointing down: the ground is y = 0, the camera looks along +z."""
 
 from __future__ import annotations
 
@@ -260,11 +258,9 @@ def _cover(
 
 
 def _scatter(surface: Surface, n: int, rng: np.random.Generator) -> tuple[Rows, Rows, Column]:
-    """Return ``n`` points of the surface, their normals, and the expected distance between neighbours.
-
-    A grid of n to 4n cells covers the surface. Along a Z-order curve through it, each n-th part of the integral of the
-    density gets one Gaussian. Independent draws would leave holes, which a trained scene does not have.
-    """
+    """Return ``n`` points of the surface, their normals, and the expected distance between neighbours. A grid of n to
+    4n cells covers the surface. Along a Z-order curve through it, each n-th part of the integral of the density gets
+    one Gaussian. Independent draws would leave holes, which a trained scene does not have."""
     corners, side = _z_order(n)
     points, _, area = surface.shape((corners + 0.5) / np.float32(side))
     distance2 = (points**2).sum(axis=1)

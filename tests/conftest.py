@@ -7,8 +7,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import helpers.examples  # registers the profiles of Hypothesis
-import helpers.shape_checks  # noqa: F401  # the hook names it
+import helpers.shape_checks  # the hook names it
 import pytest
+from helpers.compile_once import compile_once
 from helpers.servers import ray_cluster  # noqa: F401
 from jaxtyping import install_import_hook
 
@@ -52,22 +53,28 @@ install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "h
 
 
 WITH_FEWER_CAMERAS = ("io", "sog", "sogxt", "extremes", "finetuning")
-SMALLER_UNLESS_EXHAUSTIVE = ("compaction", "evaluation", "pipeline", "planning", "streaming")
-AS_USERS_HAVE_IT = (
+SMALLER_UNLESS_EXHAUSTIVE = ("cli", "compaction", "evaluation", "pipeline", "planning", "streaming")
+AS_USERS_HAVE_IT = {
+    "test_bench",  # measures in another process
     "test_promises",
     "test_nothing_is_lost",
     "test_cameras",
     "test_overlooked",
     "test_html",
     "test_capture_fit",
-)
+    "test_ctrl_c_leaves_a_checkpoint_to_resume_from",  # the first part of the work is in another process
+}
 
 
 @pytest.fixture(autouse=True)
 def fewer_and_smaller_images(request, monkeypatch):
     """Choose virtual cameras from fewer, and evaluate smaller images: they take most of the time for a small scene."""
+    helpers.shape_checks.checked.clear()
     folder = request.path.parent.name
-    thorough = request.node.get_closest_marker("exhaustive") or request.path.stem in AS_USERS_HAVE_IT
+    thorough = (
+        request.node.get_closest_marker("exhaustive")
+        or {request.path.stem, request.function.__name__} & AS_USERS_HAVE_IT
+    )
     if folder in WITH_FEWER_CAMERAS or (folder in SMALLER_UNLESS_EXHAUSTIVE and not thorough):
         from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
 
@@ -91,6 +98,12 @@ def pytest_xdist_auto_num_workers():
     from kissgs.core.resources import processors  # after the hook
 
     return processors() + 1
+
+
+def pytest_configure(config):
+    """Let one of several processes compile each kernel."""
+    if hasattr(config, "workerinput"):
+        compile_once(Path(config.option.basetemp).parent)
 
 
 def pytest_addoption(parser):

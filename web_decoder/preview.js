@@ -65,8 +65,9 @@ async function openContainer(source, load) {
     if (load.signal.aborted) return;
     for (const attribute of scene.contents[file]) arrived.add(attribute);
     if (shown?.scene !== scene) {
-      shown = { scene, source, seconds: null };
       setTitle(source.name);
+      showPanel(); // before the first image, whose size it changes
+      shown = { scene, source, seconds: null };
       view.conceal(); // else the former scene would stay under this name if the positions never arrive
     }
     refine(scene, stageOf(arrived, scene.degree));
@@ -91,6 +92,7 @@ async function openContainer(source, load) {
     shown = { scene, source, seconds: (performance.now() - begun) / 1000 };
     refine(scene, STAGES.whole);
     await view.settled;
+    if (scene.count) await view.drawn(); // statistics and planes take seconds, in which nothing is drawn
     announce(`${source.name}: ${count(scene.count)} Gaussians.`);
   } catch (error) {
     if (shown?.source === source && !load.signal.aborted) refine(shown.scene, lastStageOf(arrived));

@@ -261,9 +261,7 @@ def undistort(
     photo: UInt8[np.ndarray, "H W 3"], window: Window, stride: int = 1, first: tuple[int, int] = (0, 0)
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return every ``stride``-th pixel of every ``stride``-th row of the image that a pinhole would take of ``window``.
-
-    Each pixel's ray is projected through the lens, and the photograph is sampled there, bicubically (Catmull-Rom).
-    """
+    Each pixel's ray is projected through the lens, and the photograph is sampled there, bicubically (Catmull-Rom)."""
     lens = window.lens
     planes = np.ascontiguousarray(photo.transpose(2, 0, 1))  # NumPy gathers single bytes faster than triples
     x = (window.left + np.arange(first[0], window.width, stride) + 0.5 - lens.cx) / lens.fx

@@ -63,11 +63,8 @@ class Orbit:
         return look_at(position, position - direction, self.up, fov=FIELD_OF_VIEW, width=width, height=height)
 
     def loop_cameras(self, frames: int, width: int, height: int) -> list[Camera]:
-        """Return the cameras of an animation that loops without a jump.
-
-        On an arc, the azimuth is a sine of time, slow at the ends. Frames that show the same view share one camera
-        object, so that a caller can render it once.
-        """
+        """Return the cameras of an animation that loops without a jump. On an arc, the azimuth is a sine of time, slow
+        at the ends. Frames that show the same view share one camera object, so that a caller can render it once."""
         check_images(frames, width, height)
         if self.full:
             azimuths = self.mid_azimuth + np.arange(frames) * (2 * np.pi / frames)
@@ -87,11 +84,9 @@ class Orbit:
 
 
 def _swing_phase(frame: int, frames: int) -> int:
-    """Return the phase of a swing, -``frames``/2 to ``frames``/2, equal for frames at the same azimuth.
-
-    It goes from the middle to one end, back through the middle to the other end, and to the middle again. Integers, so
-    that phases of the way there and of the way back are exactly equal.
-    """
+    """Return the phase of a swing, -``frames``/2 to ``frames``/2, equal for frames at the same azimuth. It goes from
+    the middle to one end, back through the middle to the other end, and to the middle again. Integers, so that phases
+    of the way there and of the way back are exactly equal."""
     if 4 * frame <= frames:
         return 2 * frame
     if 4 * frame <= 3 * frames:
@@ -173,11 +168,9 @@ def _circles_around_object(splats: Splats, bounds: SceneBounds, aspect: float) -
 
 
 def _rank(surplus: Float64[np.ndarray, " steps"], radii: float) -> tuple[bool, float]:
-    """Return the sort key of a circle: full circles first, then by the scores along the longest arc.
-
-    The sum of scores is divided by the square root of the length, so that an arc four times as long ranks like scores
-    twice as high: the ends of a long arc are seldom its best views.
-    """
+    """Return the sort key of a circle: full circles first, then by the scores along the longest arc. The sum of scores
+    is divided by the square root of the length, so that an arc four times as long ranks like scores twice as high: the
+    ends of a long arc are seldom its best views."""
     good = _acceptable(surplus)
     steps = _longest_run(good)
     total = (surplus + overview_bonus(radii)).take(steps, mode="wrap").sum()
@@ -191,10 +184,8 @@ def _acceptable(surplus: Float64[np.ndarray, " steps"]) -> Bool[np.ndarray, " st
 
 
 def _longest_run(good: Bool[np.ndarray, " steps"]) -> Int[np.ndarray, " run"]:
-    """Return the steps of the longest run of good ones on a circle, in order.
-
-    A run that passes the last step continues with indices from ``len(good)`` on.
-    """
+    """Return the steps of the longest run of good ones on a circle, in order. A run that passes the last step continues
+    with indices from ``len(good)`` on."""
     count = len(good)
     if good.all():
         return np.arange(count)

@@ -101,13 +101,8 @@ def compress_here(options: SceneCompression, capture: Views | None, scene: str, 
 
 def refuse_options(manifest: Path, options: SceneCompression, *, container: str | None, unpacked: bool) -> None:
     """Raise UnsupportedError for options that levels of detail do not have."""
-    unused = {
-        "--views": options.views,
-        "--evaluate": options.evaluate,
-        "--cache": options.cache,
-        "--container": container,
-        "--unpacked": unpacked,
-    }
+    unused: dict[str, object] = {"--views": options.views, "--evaluate": options.evaluate, "--cache": options.cache}
+    unused |= {"--container": container, "--unpacked": unpacked}
     if wrong := next((name for name, value in unused.items() if value), None):
         raise UnsupportedError(f"levels of detail ({manifest.name}) are made without {wrong}")
 
@@ -160,7 +155,16 @@ compressed formats are smaller than that. Measured: docs/benchmarks.md, "Time an
 def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
     """Compress a scene into a new folder within the work folder, from where whoever submitted it moves the result."""
     scene, work = Path(arguments["scene"]), Path(arguments["work"])
-    _check_shared(scene, arguments["bytes"], work)
+    problem = None
+    if not scene.exists():
+        problem = f"does not see {scene}"
+    elif scene.is_file() and scene.stat().st_size != arguments["bytes"]:
+        problem = f"sees another file as {scene}"
+    elif not work.is_dir():
+        problem = f"does not see what this machine writes to {work.parent}"
+    if problem:
+        remedy = "--ray needs storage that all machines see at the same path"
+        raise UnsupportedError(f"the machine {socket.gethostname()} {problem}; {remedy}")
     try:
         attempt = tempfile.mkdtemp(dir=work)  # of its own: a node that was given up may go on for a while
     except OSError as error:
@@ -177,28 +181,11 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
     return {"written": str(written), "report": report.as_dict(), "table": table.getvalue()}
 
 
-def _check_shared(scene: Path, size: int, work: Path) -> None:
-    """Raise UnsupportedError if this machine does not see the scene or the work folder of another one."""
-    if not scene.exists():
-        problem = f"does not see {scene}"
-    elif scene.is_file() and scene.stat().st_size != size:
-        problem = f"sees another file as {scene}"
-    elif not work.is_dir():
-        problem = f"does not see what this machine writes to {work.parent}"
-    else:
-        return
-    raise UnsupportedError(
-        f"the machine {socket.gethostname()} {problem}; --ray needs storage that all machines see at the same path"
-    )
-
-
 @dataclass
 class ClusterCompression:
-    """Compression of several scenes, submitted at once; their results are awaited in order.
-
-    An item writes below a work folder beside its output, and the result is moved from there when its outcome has
-    arrived: a node may be lost at any moment, and nothing is written twice or in part.
-    """
+    """Compression of several scenes, submitted at once; their results are awaited in order. An item writes below a work
+    folder beside its output, and the result is moved from there when its outcome has arrived: a node may be lost at any
+    moment, and nothing is written twice or in part."""
 
     address: str
     options: SceneCompression
@@ -259,7 +246,11 @@ class ClusterCompression:
         if not scene.is_dir():  # here, because a node would say of a missing file that it does not see it
             with open_scene_file(Path(name)):
                 pass
-        work = self._work[target] = _new_work(target)
+        # The name of an output's work folder is always the same: a former command that was killed may have left one.
+        digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()
+        work = self._work[target] = target.parent / f".kissgs.{digest[:16]}.part"
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(mode=0o700)
         size = scene.stat().st_size if scene.is_file() else 0
         resources = with_memory(runner, requested, self._memory(scene, size))
         console = output()
@@ -295,15 +286,6 @@ class ClusterCompression:
         attempt = re.escape(str(self._work[target].absolute())) + r"/[^/]*/"
         message = re.sub(attempt, lambda found: f"{target.parent}/", outcome.message)
         return error_of(replace(outcome, message=message))
-
-
-def _new_work(target: Path) -> Path:
-    """Make the work folder of an output; a former command that was killed may have left one, with the same name."""
-    digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()
-    work = target.parent / f".kissgs.{digest[:16]}.part"
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(mode=0o700)
-    return work
 
 
 def with_memory(runner: Runner, requested: Resources, memory: int) -> Resources:

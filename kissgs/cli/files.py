@@ -116,12 +116,10 @@ def for_each_input(
     unreadable: type[KissgsError] = InvalidSceneError,
     during: Callable[[Pairs], AbstractContextManager[object]] | None = None,
 ) -> None:
-    """Call ``work`` for every input, and print its results.
-
-    If one of several inputs fails, the others are still processed; the exit code is then 2. A folder that is made for
-    the outputs stays if all fail: another command may be about to write into it. The context of ``during``, which gets
-    all inputs with their outputs, encloses the work. A slash at the end of ``output`` names a folder.
-    """
+    """Call ``work`` for every input, and print its results. If one of several inputs fails, the others are still
+    processed; the exit code is then 2. A folder that is made for the outputs stays if all fail: another command may be
+    about to write into it. The context of ``during``, which gets all inputs with their outputs, encloses the work. A
+    slash at the end of ``output`` names a folder."""
     inputs = expand(names)
     if writes and output is None:
         _refuse_output_as_input(inputs, suffix)

@@ -1,8 +1,6 @@
-"""Array types for signatures: dtype and shape, as ``Float32[np.ndarray, "N 3"]``.
-
-They are jaxtyping's if the tests have loaded it, which check them at run time. Otherwise annotations are not evaluated,
-and without jaxtyping a decoder needs 13 MB less and starts sooner.
-"""
+"""Array types for signatures: dtype and shape, as ``Float32[np.ndarray, "N 3"]``. They are jaxtyping's if the tests
+have loaded it, which check them at run time. Otherwise annotations are not evaluated, and without jaxtyping a decoder
+needs 13 MB less and starts sooner."""
 
 import sys
 from typing import TYPE_CHECKING

@@ -10,11 +10,9 @@ from kissgs.core.numba_kernels import compiled
 
 @njit(nogil=True, error_model="numpy")
 def write_harmonics(x: float, y: float, z: float, degree: int, basis: np.ndarray) -> None:
-    """Write the real spherical harmonics of degrees 1 to ``degree`` at a unit vector into ``basis``.
-
-    Order and signs are those of 3DGS. The associated Legendre functions, divided by sinᵐ, follow from those of the two
-    degrees below; sinᵐ cos(m phi) and sinᵐ sin(m phi) are powers of x + i y.
-    """
+    """Write the real spherical harmonics of degrees 1 to ``degree`` at a unit vector into ``basis``. Order and signs
+    are those of 3DGS. The associated Legendre functions, divided by sinᵐ, follow from those of the two degrees below;
+    sinᵐ cos(m phi) and sinᵐ sin(m phi) are powers of x + i y."""
     cosine, sine = np.sqrt(2.0), 0.0
     start = 0.28209479177387814  # of degree m and order m
     for m in range(degree + 1):

@@ -1,8 +1,6 @@
-"""Compilation of inner loops by numba, at their first call, without the GIL and without threads of their own.
-
-Each kernel has one signature, so that its bits do not depend on who calls it first; the first call compiles it or loads
-it from numba's per-user cache. Constants are literals inside the functions, as that cache does not see changed globals.
-"""
+"""Compilation of inner loops by numba, at their first call, without the GIL and without threads of their own. Each
+kernel has one signature, so that its bits do not depend on who calls it first; the first call compiles it or loads it
+from numba's per-user cache. Constants are literals inside the functions, as that cache does not see changed globals."""
 
 from __future__ import annotations
 
@@ -79,11 +77,9 @@ def _defer(kernel: Any, signature: str | Signature) -> None:  # noqa: ANN401
 
 
 def _load_called(kernel: Any) -> None:  # noqa: ANN401
-    """Load the kernels that a kernel calls, as compiling it does but loading it from the cache does not.
-
-    Its code holds copies of theirs, rounded in another way where fastmath lets LLVM choose; whichever is loaded first
-    is used, so that results would depend on whether this process or an earlier one compiled the kernel.
-    """
+    """Load the kernels that a kernel calls, as compiling it does but loading it from the cache does not. Its code holds
+    copies of theirs, rounded in another way where fastmath lets LLVM choose; whichever is loaded first is used, so that
+    results would depend on whether this process or an earlier one compiled the kernel."""
     for name in kernel.py_func.__code__.co_names:
         called = kernel.py_func.__globals__.get(name)
         if any(called is other for other in kernels):

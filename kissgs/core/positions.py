@@ -49,10 +49,8 @@ TRIED = 1 << 16  # largest number of Gaussians with which cuts are tried before 
 
 
 def coarse_share(errors: Float[np.ndarray, " N"], scales: Float32[np.ndarray, "N 3"]) -> float:
-    """Return the share of Gaussians whose position is off by more than a quarter of their visible size.
-
-    ``errors`` are those of the coordinate that is off most, world units.
-    """
+    """Return the share of Gaussians whose position is off by more than a quarter of their visible size. ``errors`` are
+    those of the coordinate that is off most, world units."""
     return float((errors > COARSE_ERROR * visible_sizes(scales)).mean()) if len(errors) else 0.0
 
 
@@ -64,10 +62,8 @@ def coarse_note(
     count: int,
 ) -> str:
     """Return a sentence with the remedy if a container's finest steps are too coarse for a scene, else an empty string.
-
     The planner's own steps may be coarser for small Gaussians, where it chooses so: that is no loss by distance. The
-    ends ``low`` and ``high`` are signed logarithms; ``count`` is that of the scene, of which the rows are a sample.
-    """
+    ends ``low`` and ``high`` are signed logarithms; ``count`` is that of the scene, of which the rows are a sample."""
     wide = means.astype(np.float64)
     extents, sizes = high.astype(np.float64) - low, visible_sizes(scales)
     chances = coarse_chances(wide, sizes, extents)
@@ -103,9 +99,7 @@ def coarse_chances(
     positions: Float64[np.ndarray, "N 3"], sizes: Float64[np.ndarray, " N"], extents: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, " N"]:
     """Return the chance of each position to be coarse in a container: errors are even, up to half a step of each axis.
-
-    Positions and :func:`visible_sizes` are in world units, extents in signed logarithms.
-    """
+    Positions and :func:`visible_sizes` are in world units, extents in signed logarithms."""
     half_steps = np.maximum(container_steps(positions, extents) / 2, 1e-300)
     return np.asarray(1 - np.minimum(COARSE_ERROR * sizes[:, None] / half_steps, 1).prod(axis=1))
 
@@ -158,9 +152,7 @@ class Cuts:
 
 def coarse_in_chunks(rows: Float32[np.ndarray, "S 4"], cuts: Cuts) -> float:
     """Return the share of positions that are coarse in containers with a range of each axis, one for each chunk.
-
-    ``rows`` are positions and visible sizes.
-    """
+    ``rows`` are positions and visible sizes."""
     if not len(rows):
         return 0.0
     chunks, coarse = cuts.chunk_of(rows[:, :3]), 0.0
@@ -225,10 +217,8 @@ def middle_of(blocks: Iterable[Float64[np.ndarray, "n 3"]], count: int) -> Origi
 
 
 def from_world(splats: Splats, positions: Float64[np.ndarray, "N 3"], origin: Origin | None = None) -> Splats:
-    """Return the scene at positions of the world, as float32 relative to an origin.
-
-    Without an origin it is that of :func:`origin_for`. A note says if float32 is too coarse for objects so far apart.
-    """
+    """Return the scene at positions of the world, as float32 relative to an origin. Without an origin it is that of
+    :func:`origin_for`. A note says if float32 is too coarse for objects so far apart."""
     origin = origin_for(positions, splats.scales) if origin is None else origin
     relative = positions - np.array(origin)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -258,9 +248,9 @@ def relative_to(origin: Origin) -> str:
     return "positions are relative to the point ({:,.0f}, {:,.0f}, {:,.0f})".format(*origin)
 
 
-def recorded(origin: Origin) -> dict[str, list[float]]:
-    """Return the entry of a container's metadata under the key "kissgs"; nothing for the origin of the world."""
-    return {} if origin == WORLD else {"origin": list(origin)}
+def recorded(origin: Origin, view: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return entries of a container's metadata under the key "kissgs": the view; the origin, if not the world's."""
+    return {**({} if origin == WORLD else {"origin": list(origin)}), **({} if view is None else {"view": view})}
 
 
 def read_origin(document: Mapping[str, Any], name: str) -> Origin:

@@ -38,11 +38,9 @@ _keeping = 0  # number of with blocks of keep_free_memory that are running
 
 
 def return_free_memory() -> None:
-    """Return what the C library has free to the system, at the end of a stage with many large temporary arrays.
-
-    glibc keeps freed arrays of up to 32 MB for later ones, which seldom fit: without this, the free memory of one stage
-    adds to the peak of the next.
-    """
+    """Return what the C library has free to the system, at the end of a stage with many large temporary arrays. glibc
+    keeps freed arrays of up to 32 MB for later ones, which seldom fit: without this, the free memory of one stage adds
+    to the peak of the next."""
     trim = _libc_function("malloc_trim")
     if trim is not None:
         trim(0)
@@ -50,12 +48,10 @@ def return_free_memory() -> None:
 
 @contextlib.contextmanager
 def keep_free_memory() -> Iterator[None]:
-    """Keep the memory of freed arrays of any size for later ones within a ``with`` block; return it at the end.
-
-    It is for long work whose steps need large arrays of about the same sizes: the system provides new memory page by
-    page and filled with zeros, which may take longer than the computation. It holds for all threads of the process,
-    until the last of several such blocks ends.
-    """
+    """Keep the memory of freed arrays of any size for later ones within a ``with`` block; return it at the end. It is
+    for long work whose steps need large arrays of about the same sizes: the system provides new memory page by page and
+    filled with zeros, which may take longer than the computation. It holds for all threads of the process, until the
+    last of several such blocks ends."""
     _count(1)
     try:
         yield
@@ -124,11 +120,9 @@ class StageTimer:
 
 
 def peak_memory() -> int:
-    """Return the peak resident memory of this process, bytes; 0 where the system does not report it (Windows).
-
-    Linux lets a process begin with the peak of the one that started it in ``getrusage``, so the peak of the memory that
-    it maps itself is read there.
-    """
+    """Return the peak resident memory of this process, bytes; 0 where the system does not report it (Windows). Linux
+    lets a process begin with the peak of the one that started it in ``getrusage``, so the peak of the memory that it
+    maps itself is read there."""
     with contextlib.suppress(OSError, StopIteration):
         status = Path("/proc/self/status").read_text().splitlines()
         return 1024 * int(next(line for line in status if line.startswith("VmHWM:")).split()[1])
@@ -162,10 +156,8 @@ class Workers:
     def map(
         self, function: Callable[[T], R], items: Sequence[T], report: Callable[[float], None] = lambda fraction: None
     ) -> list[R]:
-        """Apply ``function`` to every item, in parallel; return the results in the order of the items.
-
-        ``report`` receives the fraction done, 0 to 1, in the calling thread; an exception from it stops the work.
-        """
+        """Apply ``function`` to every item, in parallel; return the results in the order of the items. ``report``
+        receives the fraction done, 0 to 1, in the calling thread; an exception from it stops the work."""
         results = []
         # One thread needs no pool: for many small tasks, the pool takes longer than the tasks.
         for result in map(function, items) if self.threads == 1 else self._pool.map(function, items):
@@ -195,11 +187,9 @@ _blas_limits: threadpool_limits | None = None
 
 @contextlib.contextmanager
 def blas_workers(threads: int) -> Iterator[Workers]:
-    """Return workers while whose context is open BLAS runs single-threaded in this process.
-
-    Each BLAS call then runs in one thread of the pool, and its result does not depend on the number of threads. Several
-    contexts may be open at once: the last one to close restores BLAS's threads.
-    """
+    """Return workers while whose context is open BLAS runs single-threaded in this process. Each BLAS call then runs in
+    one thread of the pool, and its result does not depend on the number of threads. Several contexts may be open at
+    once: the last one to close restores BLAS's threads."""
     from threadpoolctl import threadpool_limits  # not needed for decoding
 
     global _blas_users, _blas_limits  # noqa: PLW0603  the state of BLAS is that of the process

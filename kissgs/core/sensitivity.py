@@ -90,26 +90,16 @@ class Sensitivity:
                     f"{found.dtype}; measure it for the scene that is compressed"
                 )
             if not np.isfinite(found).all() or (name in ("color_weight", "prior") and (found < 0).any()):
-                raise InvalidSceneError(
-                    f"the sensitivity is damaged: {name} has a negative or non-finite value; measure it again"
-                )
+                raise _damaged(f"{name} has a negative or non-finite value")
         for name in ("coverage", "captured"):
             found = getattr(self, name)
             outside = found[(found < 0) | (found > 1)]
             if len(outside):
-                raise InvalidSceneError(
-                    f"the sensitivity is damaged: {name} must be from 0 to 1, and has {outside[0]:g}; measure it again"
-                )
+                raise _damaged(f"{name} must be from 0 to 1, and has {outside[0]:g}")
         if not self._harmonics_are_means(splats.sh_degree):
-            raise InvalidSceneError(
-                "the sensitivity is damaged: mean_harmonics or higher_harmonics are no means of spherical harmonics; "
-                "measure it again"
-            )
+            raise _damaged("mean_harmonics or higher_harmonics are no means of spherical harmonics")
         if not 0 <= self.view_uncertainty <= 1:
-            raise InvalidSceneError(
-                f"the sensitivity is damaged: view_uncertainty must be from 0 to 1, not {self.view_uncertainty}; "
-                "measure it again"
-            )
+            raise _damaged(f"view_uncertainty must be from 0 to 1, not {self.view_uncertainty}")
 
     def _harmonics_are_means(self, sh_degree: int) -> bool:
         """Whether the squares of each degree n add up to (2 n + 1) / (4 pi) at most, as they do in each direction."""
@@ -200,6 +190,10 @@ class Sensitivity:
         alpha by all of it. So the score follows from the Hessian's opacity entry.
         """
         return self.diagonal(OPACITY)[:, 0] / _transparency(splats.opacities) ** 2
+
+
+def _damaged(problem: str) -> InvalidSceneError:
+    return InvalidSceneError(f"the sensitivity is damaged: {problem}; measure it again")
 
 
 def _transparency(opacities: Float32[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:

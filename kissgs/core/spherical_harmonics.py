@@ -9,10 +9,8 @@ from kissgs.core.splats import SH_C0
 
 
 def sh_basis(directions: Float[np.ndarray, "M 3"], degree: int) -> Float[np.ndarray, "M K"]:
-    """Return the (degree + 1)² real spherical harmonics with the signs of 3DGS, at unit vectors.
-
-    A Gaussian's colour from direction d (from the camera to it) is 0.5 + basis(d) · (sh0, shN).
-    """
+    """Return the (degree + 1)² real spherical harmonics with the signs of 3DGS, at unit vectors. A Gaussian's colour
+    from direction d (from the camera to it) is 0.5 + basis(d) · (sh0, shN)."""
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     band0 = [np.full_like(x, SH_C0)]

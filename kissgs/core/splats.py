@@ -95,10 +95,8 @@ class Splats:
 
 
 def concatenate(scenes: Sequence[Splats]) -> Splats:
-    """Return one scene with the Gaussians of all scenes, at least one, in their order.
-
-    All else, such as their SH degrees and origins, is equal.
-    """
+    """Return one scene with the Gaussians of all scenes, at least one, in their order. All else, such as their SH
+    degrees and origins, is equal."""
     arrays: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in scenes]) for name in ATTRIBUTES}
     return replace(scenes[0], **arrays)
 
@@ -113,10 +111,8 @@ def sampled_rows(blocks: Iterable[Float[np.ndarray, "n C"]], count: int) -> Floa
 
 
 def empty_splats(count: int, coefficients: int) -> Splats:
-    """Return a scene whose arrays are to be filled, with K ``coefficients`` in ``shN``.
-
-    These are zero, so that a part of lower SH degree fills only its own.
-    """
+    """Return a scene whose arrays are to be filled, with K ``coefficients`` in ``shN``. These are zero, so that a part
+    of lower SH degree fills only its own."""
     return Splats(
         means=np.empty((count, 3), np.float32),
         quats=np.empty((count, 4), np.float32),

@@ -129,12 +129,10 @@ MAX_INSIDE_SHARE, MAX_SINGLE_SHARE = 0.5, 0.3  # of an image, by Gaussians aroun
 
 
 def evaluation_views(splats: Splats, context: Context = DEFAULT_CONTEXT, *, seed: int = 0) -> Views:
-    """Draw evaluation cameras over a whole scene; all of them are test views.
-
-    Four kinds alternate, see :data:`KINDS`. A camera is drawn again only if its image is empty, or mostly covered by
-    Gaussians that contain the camera or by a single one. Cameras are added for separate parts of the scene whose loss
-    would hardly change any of these images. The cameras depend on the scene and the seed only, not on the threads.
-    """
+    """Draw evaluation cameras over a whole scene; all of them are test views. Four kinds alternate, see :data:`KINDS`.
+    A camera is drawn again only if its image is empty, or mostly covered by Gaussians that contain the camera or by a
+    single one. Cameras are added for separate parts of the scene whose loss would hardly change any of these images.
+    The cameras depend on the scene and the seed only, not on the threads."""
     if seed < 0:
         raise InvalidViewsError(f"the seed of evaluation cameras is {seed}; give a whole number from 0")
     rng, counts = np.random.Generator(np.random.PCG64(seed)), prominence(splats)

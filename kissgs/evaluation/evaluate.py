@@ -67,11 +67,9 @@ class _Fit:
 
 
 def in_scene_frame(splats: Splats, views: Views, context: Context = DEFAULT_CONTEXT) -> Views:
-    """Return views with cameras in the coordinates of the scene; their note says if there was a choice.
-
-    Each of :attr:`Views.similarities` is tried, and the best is kept if it is better than none: the one with the
-    highest median PSNR to some photographs; without photographs, the one whose cameras show most of the scene.
-    """
+    """Return views with cameras in the coordinates of the scene; their note says if there was a choice. Each of
+    :attr:`Views.similarities` is tried, and the best is kept if it is better than none: the one with the highest median
+    PSNR to some photographs; without photographs, the one whose cameras show most of the scene."""
     if not views.similarities or not views.all:
         return _moved(views, None, splats.origin)
     load_kernels(context.progress)
@@ -84,9 +82,7 @@ def fitting_views(
     splats: Splats, views: Views, context: Context = DEFAULT_CONTEXT, *, force: bool = False
 ) -> tuple[Views, str]:
     """Return views in the coordinates of the scene, as :func:`in_scene_frame` does, and what is odd about them.
-
-    Photographs that do not show the scene are refused, unless ``force``.
-    """
+    Photographs that do not show the scene are refused, unless ``force``."""
     if not views.all or not drawn_opacities(splats).any():
         return _moved(views, None, splats.origin), ""
     load_kernels(context.progress)
@@ -278,10 +274,8 @@ def compare_images(
     reference_images: dict[int, Rendering] | None = None,
 ) -> Evaluation:
     """Compare two scenes from these views alone: the test views, or the training views if there are none.
-
     ``reference_images`` are the reference's renderings by number of the view, read and filled, for comparisons of many
-    candidates with one reference.
-    """
+    candidates with one reference."""
     reference, candidate = clean(reference)[0], clean(candidate)[0]
     if context.device == "cpu":
         load_kernels(context.progress)

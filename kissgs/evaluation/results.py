@@ -119,9 +119,7 @@ class Comparison:
 
     def cells(self, names: Sequence[str] | None = None) -> list[str]:
         """Return a table row: reference, candidate, change, candidate to reference; without photographs the last.
-
-        ``names`` are metrics as :meth:`ImageMetrics.texts` names them, by default all.
-        """
+        ``names`` are metrics as :meth:`ImageMetrics.texts` names them, by default all."""
         names = list(self.candidate.texts()) if names is None else names
         *to_photo, to_reference = (
             [metrics.texts()[name] for name in names]
@@ -345,11 +343,9 @@ def over_scene(evaluation: Evaluation) -> Evaluation:
 
 
 def psnr_of(evaluation: Evaluation) -> float:
-    """Return the PSNR of the candidate to the reference as goals define it, decibels; NaN if a rendering failed.
-
-    It is the mean over views (:func:`over_scene`), limited by the worst views: at most the PSNR of their mean squared
-    error divided by :data:`MAX_ERROR_RATIO`.
-    """
+    """Return the PSNR of the candidate to the reference as goals define it, decibels; NaN if a rendering failed. It is
+    the mean over views (:func:`over_scene`), limited by the worst views: at most the PSNR of their mean squared error
+    divided by :data:`MAX_ERROR_RATIO`."""
     evaluation = over_scene(evaluation)
     mean = evaluation.mean.candidate_vs_reference.psnr
     worst = _worst([[squared_error(psnr) for psnr in _psnrs(evaluation)]]) / MAX_ERROR_RATIO
@@ -357,13 +353,10 @@ def psnr_of(evaluation: Evaluation) -> float:
 
 
 def drop_of(evaluation: Evaluation) -> float:
-    """Return the drop of PSNR from reference to candidate as goals define it, decibels; NaN if a rendering failed.
-
-    With photographs it is the drop of the mean PSNR to them. Without, the reference is assumed to have
-    :data:`ASSUMED_PSNR` to photographs, with errors independent of the new ones, so that squared errors add up. It is
-    at least the drop that the squared error that the worst views add, divided by :data:`MAX_ERROR_RATIO`, would cause
-    in all views.
-    """
+    """Return the drop of PSNR from reference to candidate as goals define it, decibels; NaN if a rendering failed. With
+    photographs it is the drop of the mean PSNR to them. Without, the reference is assumed to have :data:`ASSUMED_PSNR`
+    to photographs, with errors independent of the new ones, so that squared errors add up. It is at least the drop that
+    the squared error that the worst views add, divided by :data:`MAX_ERROR_RATIO`, would cause in all views."""
     mean = evaluation.mean
     if mean.change is None:
         drop = _drop_by(squared_error(mean.candidate_vs_reference.psnr) / squared_error(ASSUMED_PSNR))
@@ -375,11 +368,9 @@ def drop_of(evaluation: Evaluation) -> float:
 
 
 def ssim_drop_of(evaluation: Evaluation) -> float:
-    """Return the drop of SSIM from reference to candidate as goals define it; NaN if a rendering failed.
-
-    With photographs it is the drop of the mean SSIM to them, without photographs 1 - SSIM to the renderings of the
-    reference; at least the mean drop of the worst views divided by :data:`MAX_SSIM_RATIO`.
-    """
+    """Return the drop of SSIM from reference to candidate as goals define it; NaN if a rendering failed. With
+    photographs it is the drop of the mean SSIM to them, without photographs 1 - SSIM to the renderings of the
+    reference; at least the mean drop of the worst views divided by :data:`MAX_SSIM_RATIO`."""
     groups = [_ssim_drops(evaluation), _ssim_drops(over_scene(evaluation))]
     return _at_least(sum(groups[0]) / len(groups[0]), _worst(groups) / MAX_SSIM_RATIO)
 

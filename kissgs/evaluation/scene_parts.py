@@ -22,10 +22,8 @@ FAIRNESS = 0.25  # exponent of prominence where octree cells share a probability
 
 
 def prominence(splats: Splats) -> Float64[np.ndarray, " N"]:
-    """Return the prominence of each Gaussian, 0 to 1: opacity times a / (a + median of its neighbourhood's areas).
-
-    So the details of a small object count as much as a background, and an immense Gaussian at most twice as much.
-    """
+    """Return the prominence of each Gaussian, 0 to 1: opacity times a / (a + median of its neighbourhood's areas). So
+    the details of a small object count as much as a background, and an immense Gaussian at most twice as much."""
     weights = np.zeros(len(splats))
     opacities = drawn_opacities(splats)
     visible = np.flatnonzero(opacities > 0)
@@ -57,10 +55,8 @@ class GaussianSampler:
     @classmethod
     def of(cls, means: Float64[np.ndarray, "N 3"], weights: Float64[np.ndarray, " N"]) -> GaussianSampler:
         """Return a sampler whose probabilities are half proportional to the weights and half shared in an octree.
-
         There, the children of a cell share its probability by the fourth roots of their weights: a small cluster is not
-        missed beside a large one, nor a large one beside a few outliers.
-        """
+        missed beside a large one, nor a large one beside a few outliers."""
         codes = morton_codes(means)
         order = np.argsort(codes, kind="stable")
         sorted_weights = weights[order] / weights.sum()
@@ -118,11 +114,9 @@ class Part:
 
 def find_parts(splats: Splats, counts: Float64[np.ndarray, " N"]) -> tuple[list[Part], Int[np.ndarray, " N"]]:
     """Return the smallest separate parts of a scene, and each Gaussian's part, -1 for none; ``counts`` are prominences.
-
     A sample is clustered by single linkage; as in HDBSCAN, no two Gaussians are nearer than their own size. A cluster
     that has reached :data:`MIN_SHARE` of the scene is a part if the gap to the next one of at least that size is
-    :data:`MIN_GAP_RATIO` times the gap at which it reached the share.
-    """
+    :data:`MIN_GAP_RATIO` times the gap at which it reached the share."""
     part_of = np.full(len(splats), -1)
     visible = np.flatnonzero(counts > 0)
     if not len(visible):

@@ -90,11 +90,9 @@ class DirectorySource:
 
 
 class ZipSource:
-    """Files in a zip. Nothing is extracted to disk.
-
-    Without ``root`` they are known by their names alone, wherever in the zip they are. With ``root``, the name of a
-    file that must be there once, they are known by their paths from its folder.
-    """
+    """Files in a zip. Nothing is extracted to disk. Without ``root`` they are known by their names alone, wherever in
+    the zip they are. With ``root``, the name of a file that must be there once, they are known by their paths from its
+    folder."""
 
     def __init__(self, file: io.BufferedIOBase, label: str, root: str | None = None) -> None:
         if sniff_format(file) == "ply":
@@ -259,10 +257,8 @@ def sniff_format(file: io.BufferedIOBase) -> Literal["ply", "zip"] | None:
 
 @contextlib.contextmanager
 def open_source(source: Path | bytes | Mapping[str, bytes], root: str | None = None) -> Iterator[Source]:
-    """Open a container for reading: a folder, a zip file, the bytes of one, or files in memory.
-
-    ``root`` is that of :class:`ZipSource`.
-    """
+    """Open a container for reading: a folder, a zip file, the bytes of one, or files in memory. ``root`` is that of
+    :class:`ZipSource`."""
     if isinstance(source, bytes):
         yield ZipSource(io.BytesIO(source), "the input", root)
         return

@@ -39,10 +39,8 @@ def parse_json(
     parse_int: Callable[[str], Any] = int,
     error: type[KissgsError] = InvalidContainerError,
 ) -> Any:  # noqa: ANN401
-    """Parse JSON; NaN and Infinity are refused, as browsers refuse them.
-
-    The number of values is bounded before any is built, so commas and brackets in texts count as well.
-    """
+    """Parse JSON; NaN and Infinity are refused, as browsers refuse them. The number of values is bounded before any is
+    built, so commas and brackets in texts count as well."""
     if 1 + data.count(b",") + data.count(b"[") + data.count(b"{") > most:
         raise error(f"{name} has more than {most:,} values, which is the limit; export the scene again")
     try:

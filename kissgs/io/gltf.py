@@ -1,8 +1,6 @@
-"""glTF with ``KHR_gaussian_splatting``: GLB or JSON; also with the attributes in ``.spz`` inside it.
-
-All primitives of the scene's nodes are read, moved by the nodes' transforms and turned from glTF's axes (x left, y up,
-z forward) to those of a ``.ply``; ``.glb`` is written with one primitive.
-"""
+"""glTF with ``KHR_gaussian_splatting``: GLB or JSON; also with the attributes in ``.spz`` inside it. All primitives of
+the scene's nodes are read, moved by the nodes' transforms and turned from glTF's axes (x left, y up, z forward) to
+those of a ``.ply``; ``.glb`` is written with one primitive."""
 
 from __future__ import annotations
 
@@ -100,9 +98,7 @@ _KINDS = {list: "a list", dict: "an object", int: "a whole number"}
 
 class _Document:
     """Parsed glTF file, whose data is read when it is needed, one buffer view at a time: the file must still be open.
-
-    Methods raise InvalidSceneError for whatever contradicts the format.
-    """
+    Methods raise InvalidSceneError for whatever contradicts the format."""
 
     def __init__(self, opened: SceneFile, folder: Path | None) -> None:
         self.name, self._opened, self._folder = opened.name, opened, folder
@@ -325,10 +321,8 @@ def describe(source: Path | bytes, level: int = 0) -> Facts:
 def read_gltf(
     source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
 ) -> Splats:
-    """Read a scene; primitives of a lower SH degree get zeros for the coefficients above it.
-
-    What the scene has beyond Gaussians is named in ``notes``. Buffers in other files must be below its folder.
-    """
+    """Read a scene; primitives of a lower SH degree get zeros for the coefficients above it. What the scene has beyond
+    Gaussians is named in ``notes``. Buffers in other files must be below its folder."""
     with open_scene_file(source) as opened:
         document = _Document(opened, None if isinstance(source, bytes) else source.parent)
         parts, left_out = _parts(document)
@@ -515,11 +509,9 @@ def write_glb(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progre
 
 
 def write_spz_glb(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
-    """Write a scene as ``.spz`` inside ``.glb``.
-
-    The ``.spz`` has its own axes (x right, y up, z back), as the extension wants it, whose text has the library of
-    ``.spz`` turn them from and to those of glTF. Accessors have types and counts, and no data.
-    """
+    """Write a scene as ``.spz`` inside ``.glb``. The ``.spz`` has its own axes (x right, y up, z back), as the
+    extension wants it, whose text has the library of ``.spz`` turn them from and to those of glTF. Accessors have types
+    and counts, and no data."""
     ends = _ends(splats)
     packed = io.BytesIO()  # its size stands before it
     notes = spz_format.write_spz(packed, splats, progress=progress)
@@ -575,10 +567,8 @@ def _write_head(
     views: list[dict[str, int]],
     compression: dict[str, Any] | None = None,
 ) -> None:
-    """Write all that stands before the buffer; ``compression`` is the extension that gives accessors their data.
-
-    The JSON is filled up with spaces to a multiple of four bytes; its node moves positions to the world.
-    """
+    """Write all that stands before the buffer; ``compression`` is the extension that gives accessors their data. The
+    JSON is filled up with spaces to a multiple of four bytes; its node moves positions to the world."""
     compression, accessors = compression or {}, list[dict[str, Any]]()
     for column in columns:
         component = {"componentType": 5126} if column.dtype == "<f4" else {"componentType": 5121, "normalized": True}

@@ -39,10 +39,8 @@ def probe_png(data: bytes, name: str) -> tuple[int, int]:
 
 
 def decode_png(data: bytes, name: str, channels: int) -> UInt8[np.ndarray, "pixels C"]:
-    """Decompress one image, whose size has been checked, to rows of pixels of its first 3 or 4 channels.
-
-    Grey images and those with a palette, to which tools for smaller PNG turn others, become what they stand for.
-    """
+    """Decompress one image, whose size has been checked, to rows of pixels of its first 3 or 4 channels. Grey images
+    and those with a palette, to which tools for smaller PNG turn others, become what they stand for."""
     try:
         with PngImagePlugin.PngImageFile(io.BytesIO(data)) as image_file:
             pixels = np.asarray(image_file.convert("RGBA"))
@@ -55,10 +53,8 @@ def decode_png(data: bytes, name: str, channels: int) -> UInt8[np.ndarray, "pixe
 
 
 def encode_plane(image: UInt8[np.ndarray, "H W C"], *, quality: int, method: int) -> bytes:
-    """Compress one image of 1, 3 or 4 channels losslessly; ``quality`` and ``method`` set libwebp's effort.
-
-    Without ``exact``, libwebp would blacken the colour of pixels whose fourth channel is 0.
-    """
+    """Compress one image of 1, 3 or 4 channels losslessly; ``quality`` and ``method`` set libwebp's effort. Without
+    ``exact``, libwebp would blacken the colour of pixels whose fourth channel is 0."""
     image_file = Image.fromarray(image[:, :, 0] if image.shape[2] == 1 else image)
     buffer = io.BytesIO()
     image_file.save(buffer, "WEBP", lossless=True, exact=True, quality=quality, method=method)
@@ -66,10 +62,8 @@ def encode_plane(image: UInt8[np.ndarray, "H W C"], *, quality: int, method: int
 
 
 def pixels_crc32(image: UInt8[np.ndarray, "H W C"]) -> int:
-    """Return the CRC-32 of an image of 1, 3 or 4 channels as a browser decodes it, to RGBA.
-
-    Some browsers' decoders are fast but not exact, or add noise; with this checksum the web decoder detects it.
-    """
+    """Return the CRC-32 of an image of 1, 3 or 4 channels as a browser decodes it, to RGBA. Some browsers' decoders are
+    fast but not exact, or add noise; with this checksum the web decoder detects it."""
     rgba = np.full((*image.shape[:2], 4), 255, dtype=np.uint8)
     rgba[:, :, : max(image.shape[2], 3)] = image
     return zlib.crc32(rgba.data)
@@ -79,9 +73,7 @@ def decode_plane(
     data: bytes, name: str, *, width: int, height: int, channels: int, crc32: int | None = None
 ) -> UInt8[np.ndarray, "pixels C"]:
     """Decompress one image to rows of pixels: of the first channel, of 3, or of 4 (the fourth is 255 if there is none).
-
-    The size is checked before memory is allocated; ``crc32`` is that of :func:`pixels_crc32`, None if it is unknown.
-    """
+    The size is checked before memory is allocated; ``crc32`` is that of :func:`pixels_crc32`, None if it is unknown."""
     found = probe_webp(data, name)
     if found != (width, height):
         raise InvalidContainerError(
@@ -161,11 +153,9 @@ def compress_images(
 
 
 def effort_of(shape: tuple[int, ...], quality: int, method: int) -> tuple[int, int]:
-    """Return libwebp's quality and method for an image, given those of the settings.
-
-    Large images take less effort where it saves next to nothing (docs/benchmarks.md), unless the settings ask for more
-    than :data:`USUAL_EFFORT`. Those of one channel even become smaller with a lower quality.
-    """
+    """Return libwebp's quality and method for an image, given those of the settings. Large images take less effort
+    where it saves next to nothing (docs/benchmarks.md), unless the settings ask for more than :data:`USUAL_EFFORT`.
+    Those of one channel even become smaller with a lower quality."""
     height, width, channels = shape
     if height * width < LARGE or quality > USUAL_EFFORT[0] or method > USUAL_EFFORT[1]:
         return quality, method

@@ -1,8 +1,6 @@
-"""The ``.ksplat`` format: a header of 4096 bytes, one of 1024 for each section, then the sections' records.
-
-The compression level decides what a record holds: 0 floats, 1 and 2 positions relative to the centre of a bucket of
-some hundred Gaussians and half floats, 2 the view-dependent colour in bytes. The axes are those of a ``.ply``.
-"""
+"""The ``.ksplat`` format: a header of 4096 bytes, one of 1024 for each section, then the sections' records. The
+compression level decides what a record holds: 0 floats, 1 and 2 positions relative to the centre of a bucket of some
+hundred Gaussians and half floats, 2 the view-dependent colour in bytes. The axes are those of a ``.ply``."""
 
 from __future__ import annotations
 

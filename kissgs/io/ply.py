@@ -49,7 +49,6 @@ _CHUNK = BLOCK_ALIGNMENT  # Gaussians per row of element chunk, given by the for
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 """Properties of element ``vertex``: one word each."""
 
-_HALVES = (slice(0, 3), slice(3, 6))  # columns of minima and of maxima among the six bounds of an attribute
 _MAX_SCALE = 20.0  # bound of log-scales that a file holds, as the format's own tool has it
 
 
@@ -79,10 +78,8 @@ def check_compressed(ply: PlyFile) -> int:
 
 
 def read_compressed(ply: PlyFile, degree: int, progress: Progress) -> Splats:
-    """Decode all Gaussians; ``degree`` is the result of :func:`check_compressed`.
-
-    Opacities 0 and 1, which the packing can represent, become logits -inf and +inf.
-    """
+    """Decode all Gaussians; ``degree`` is the result of :func:`check_compressed`. Opacities 0 and 1, which the packing
+    can represent, become logits -inf and +inf."""
     vertex = ply.header.elements["vertex"]
     n, k = vertex.count, SH_REST_COUNTS[degree]
     splats = empty_splats(n, k)
@@ -217,7 +214,8 @@ def _fractions(
     starts = np.arange(0, len(values), _CHUNK)
     bounds[:, :3] = np.minimum.reduceat(values, starts, axis=0)
     bounds[:, 3:] = np.maximum.reduceat(values, starts, axis=0)
-    low, high = (np.repeat(bounds[:, half].astype(np.float64), _CHUNK, axis=0)[: len(values)] for half in _HALVES)
+    ends = np.repeat(bounds.astype(np.float64), _CHUNK, axis=0)[: len(values)]
+    low, high = ends[:, :3], ends[:, 3:]
     return (values - low) / np.where(high > low, high - low, 1)
 
 
@@ -283,14 +281,12 @@ def read_ply_info(source: Path | bytes, *, size: int | None = None) -> PlyInfo:
 def read_ply(
     source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
 ) -> Splats:
-    """Read a scene without cleaning it: NaN, infinities and quaternions of any length are kept.
-
-    Reads binary and ascii files, with properties in any order and of any type, and PlayCanvas' compressed ``.ply``.
-    8-bit ``red``, ``green``, ``blue``, which nerfstudio may write instead of ``f_dc_*``, become the constant SH
-    coefficients. The filters of Mip-Splatting, ``filter_3D``, are applied to scales and opacities. Elements and
-    properties that are unknown are left out and named in ``notes``; bytes after the end are ignored.
-    Needs some megabytes of memory besides the scene itself.
-    """
+    """Read a scene without cleaning it: NaN, infinities and quaternions of any length are kept. Reads binary and ascii
+    files, with properties in any order and of any type, and PlayCanvas' compressed ``.ply``. 8-bit ``red``, ``green``,
+    ``blue``, which nerfstudio may write instead of ``f_dc_*``, become the constant SH coefficients. The filters of
+    Mip-Splatting, ``filter_3D``, are applied to scales and opacities. Elements and properties that are unknown are left
+    out and named in ``notes``; bytes after the end are ignored. Needs some megabytes of memory besides the scene
+    itself."""
     with open_ply(source) as ply:
         info = _check(ply)
         refuse_more_than(reading.max_gaussians, info.count, ply.name)
@@ -301,11 +297,8 @@ def read_ply(
 
 
 def read_ply_blocks(source: Path) -> Iterator[Splats]:
-    """Yield a scene as :func:`read_ply` reads it, some 65,536 Gaussians at a time.
-
-    PlayCanvas' compressed ``.ply`` comes as one block. Errors are those of :func:`read_ply`; those of
-    the body are raised when its block is reached.
-    """
+    """Yield a scene as :func:`read_ply` reads it, some 65,536 Gaussians at a time. PlayCanvas' compressed ``.ply``
+    comes as one block. Errors are those of :func:`read_ply`; those of the body are raised when its block is reached."""
     with open_ply(source) as ply:
         info = _check(ply)
         if info.compressed:
@@ -322,19 +315,20 @@ def read_ply_blocks(source: Path) -> Iterator[Splats]:
                 waiting = []
 
 
-def write_ply(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
+def write_ply(
+    file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent, comment: str = ""
+) -> Notes:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
-
     Positions are those of the world: float64 (``property double``) where float32 cannot hold them. An antialiased scene
-    is marked by a comment (:func:`kissgs.io.ply_rows.header_bytes`).
-    """
+    is marked by a comment (:func:`kissgs.io.ply_rows.header_bytes`); ``comment`` is a further one."""
     splats = in_world(splats)
     wide = _POSITION if splats.origin != WORLD else ()
     n, k = len(splats), splats.shN.shape[1]
     rest_names = (f"f_rest_{i}" for i in range(3 * k))
     names = (*_POSITION, *_NORMAL, *_COLOUR, *rest_names, *_OPACITY, *_SCALE, *_ROTATION)
     properties = [f"property {'double' if name in wide else 'float'} {name}" for name in names]
-    file.write(header_bytes([f"element vertex {n}", *properties], splats.antialiased))
+    comments = [comment] * bool(comment)
+    file.write(header_bytes([*comments, f"element vertex {n}", *properties], splats.antialiased))
     for step in steps(n):
         part = splats.select(step)
         rest = part.shN.transpose(0, 2, 1).reshape(len(part), 3 * k)  # all of R, then G, then B
@@ -481,10 +475,8 @@ class _Columns:
 
 @np.errstate(all="ignore")  # values may be any floats; they are not cleaned here
 def _apply_filters(filters: Shaped[np.ndarray, " N"], out: Splats) -> None:
-    """Widen Gaussians by the standard deviations of their filters, and fade them as their volumes grow, in place.
-
-    Only squares of the filters count: 0 changes nothing, and NaN makes a Gaussian NaN, which cleaning removes.
-    """
+    """Widen Gaussians by the standard deviations of their filters, and fade them as their volumes grow, in place. Only
+    squares of the filters count: 0 changes nothing, and NaN makes a Gaussian NaN, which cleaning removes."""
     rows = np.flatnonzero(filters != 0)
     log_filters = np.log(np.abs(filters[rows].astype(np.float64)))[:, None]
     scales, logits = out.scales[rows].astype(np.float64), out.opacities[rows].astype(np.float64)

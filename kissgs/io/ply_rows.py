@@ -94,10 +94,8 @@ class PlyFile(SceneFile):
 
 @contextlib.contextmanager
 def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFile]:
-    """Open a file, or the bytes of one, and parse the header. The body is not read.
-
-    ``size`` is that of the whole file if ``source`` is only its beginning.
-    """
+    """Open a file, or the bytes of one, and parse the header. The body is not read. ``size`` is that of the whole file
+    if ``source`` is only its beginning."""
     with open_scene_file(source) as opened:
         header = _read_header(opened)
         yield PlyFile(opened.name, opened.file, opened.size if size is None else size, header)
@@ -156,7 +154,11 @@ def _read_header(opened: SceneFile) -> Header:
             case ["element", element, count]:
                 if element in counts:
                     raise InvalidSceneError(f"{where}: a second element {_quote(element)}; each may occur once")
-                counts[element] = _count(count, where)
+                if not re.fullmatch(r"[0-9]{1,18}", count):  # 64 bits; it is checked against the file's size later
+                    raise InvalidSceneError(
+                        f"{where}: the count is {_quote(count)}, not a whole number from 0 to 10^18"
+                    )
+                counts[element] = int(count)
                 properties[element] = {}
             case ["property", *definition] if counts:
                 _add_property(properties[next(reversed(counts))], definition, where)
@@ -211,13 +213,6 @@ def _header_lines(file: io.BufferedIOBase, name: str) -> Iterator[tuple[int, lis
         yield number, line.decode("utf-8", errors="replace").split()
 
 
-def _count(word: str, where: str) -> int:
-    # 18 digits fit 64 bits. The count is checked against the file's size before rows are read.
-    if not re.fullmatch(r"[0-9]{1,18}", word):
-        raise InvalidSceneError(f"{where}: the count is {_quote(word)}, not a whole number from 0 to 10^18")
-    return int(word)
-
-
 def _add_property(properties: dict[str, Property], definition: list[str], where: str) -> None:
     match definition:
         case ["list", length_type, item_type, name]:
@@ -269,10 +264,8 @@ def check_complete(ply: PlyFile, element: Element) -> None:
 
 
 def rows(ply: PlyFile, element: Element) -> Iterator[np.ndarray]:
-    """Yield all rows of ``element``, in order, as structured arrays with one field per property.
-
-    The fields have the types of the file; in ascii files all are float64. Each block is overwritten by the next.
-    """
+    """Yield all rows of ``element``, in order, as structured arrays with one field per property. The fields have the
+    types of the file; in ascii files all are float64. Each block is overwritten by the next."""
     return _ascii_rows(ply, element) if ply.header.encoding == "ascii" else _binary_rows(ply, element)
 
 
@@ -324,10 +317,8 @@ def _ascii_rows(ply: PlyFile, element: Element) -> Iterator[np.ndarray]:
 
 
 def _numbered_lines(ply: PlyFile, width: int) -> Iterator[list[tuple[int, str]]]:
-    """Yield the non-blank lines of an ascii body with their line numbers, one block at a time.
-
-    A last line without a line end and with fewer than ``width`` values is skipped: the file was cut there.
-    """
+    """Yield the non-blank lines of an ascii body with their line numbers, one block at a time. A last line without a
+    line end and with fewer than ``width`` values is skipped: the file was cut there."""
     ply.file.seek(ply.header.nbytes)
     number = ply.header.lines
     rest = b""
@@ -367,7 +358,4 @@ def _check_line(words: list[str], names: tuple[str, ...], where: str) -> None:
 
 def _cut_short(ply: PlyFile, element: Element, found: int) -> InvalidSceneError:
     what = "Gaussians" if element.name == "vertex" else f"rows of element {element.name!r}"
-    return InvalidSceneError(
-        f"{ply.name} is cut short: it declares {element.count:,} {what} but has room for {found:,}; "
-        "export or download it again"
-    )
+    return ply.invalid(f"is cut short: it declares {element.count:,} {what} but has room for {found:,}")

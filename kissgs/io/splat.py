@@ -1,8 +1,6 @@
-"""The ``.splat`` format: 32 bytes per Gaussian, without a header, without view-dependent colour.
-
-Position and linear standard deviations are floats; colour and opacity, after their activations, and the rotation w, x,
-y, z are bytes. The axes are those of a ``.ply``. Nothing in a file says that it is one: its name's ending must.
-"""
+"""The ``.splat`` format: 32 bytes per Gaussian, without a header, without view-dependent colour. Position and linear
+standard deviations are floats; colour and opacity, after their activations, and the rotation w, x, y, z are bytes. The
+axes are those of a ``.ply``. Nothing in a file says that it is one: its name's ending must."""
 
 from __future__ import annotations
 

@@ -134,11 +134,8 @@ def decode_three_bytes(codes: UInt8[np.ndarray, "N 3"], out: Float32[np.ndarray,
 
 
 def decode_smallest_three(codes: UInt8[np.ndarray, "N 4"], out: Float32[np.ndarray, "N 4"]) -> None:
-    """Decode rotations of versions 3 and later to w, x, y, z.
-
-    Of a word's 32 bits the highest two name the largest of x, y, z, w; the others follow, the last in the lowest ten
-    bits: nine of magnitude, one of sign.
-    """
+    """Decode rotations of versions 3 and later to w, x, y, z. Of a word's 32 bits the highest two name the largest of
+    x, y, z, w; the others follow, the last in the lowest ten bits: nine of magnitude, one of sign."""
     words = codes.view("<u4")[:, 0]
     for part in steps(len(codes)):
         word = words[part]
@@ -149,11 +146,9 @@ def decode_smallest_three(codes: UInt8[np.ndarray, "N 4"], out: Float32[np.ndarr
 
 
 def fractional_bits_for(reach: float) -> int:
-    """Return the bits after the binary point of positions up to ``reach`` from the origin along an axis.
-
-    They are 12, as the format's own library writes; fewer where a scene reaches beyond ±2048, and more where it is
-    smaller than ±4, so that it has at least 2^14 steps; 23 are the most.
-    """
+    """Return the bits after the binary point of positions up to ``reach`` from the origin along an axis. They are 12,
+    as the format's own library writes; fewer where a scene reaches beyond ±2048, and more where it is smaller than ±4,
+    so that it has at least 2^14 steps; 23 are the most."""
     exponent = int(np.frexp(reach)[1])
     return max(0, min(23 - exponent, max(12, 15 - exponent), 23))
 
@@ -259,10 +254,8 @@ def read_spz_info(source: Path | bytes) -> SpzInfo:
 def read_spz(
     source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
 ) -> Splats:
-    """Read a scene, and turn it to the axes of a ``.ply``.
-
-    Of SH degree 4 the highest band is left out, as are unknown extension records, which ``notes`` says.
-    """
+    """Read a scene, and turn it to the axes of a ``.ply``. Of SH degree 4 the highest band is left out, as are unknown
+    extension records, which ``notes`` says."""
     with open_scene_file(source) as opened:
         info = _read_header(opened)
         refuse_more_than(reading.max_compressed, info.count, opened.name)

@@ -1,8 +1,6 @@
-"""Streamed scenes: a manifest with a tree whose leaves name rows of containers, level by level.
-
-Level 0 is the finest. The environment, if there is one, belongs to every level. The package of a container's format
-says how its files are opened and decoded.
-"""
+"""Streamed scenes: a manifest with a tree whose leaves name rows of containers, level by level. Level 0 is the finest.
+The environment, if there is one, belongs to every level. The package of a container's format says how its files are
+opened and decoded."""
 
 from __future__ import annotations
 
@@ -152,10 +150,8 @@ class StreamedFormat:
         threads: int = 0,
         progress: Progress = silent,
     ) -> Splats:
-        """Decode one level of a streamed scene: the rows in the order of the files, then the environment.
-
-        Containers of a lower SH degree get zeros for the coefficients above it.
-        """
+        """Decode one level of a streamed scene: the rows in the order of the files, then the environment. Containers of
+        a lower SH degree get zeros for the coefficients above it."""
         with self.open(source) as files, Workers(threads) as pool:
             manifest = self.read_manifest(files)
             parts = list(self.parts(files, manifest, reading.level))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -93,6 +94,7 @@ class Measured:
     splats: Splats
     sensitivity: Sensitivity | None = None
     recolor: ColorRefit | None = None
+    first_view: Mapping[str, Any] | None = None
 
 
 def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
@@ -111,19 +113,19 @@ def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     if sensitivity is not None and not refits:
         return Measured(splats, sensitivity)
     count, size = settings.sensitivity_views or default_view_count(len(splats)), settings.sensitivity_view_size
-    cameras = sensitivity_cameras(splats, work.views, work.context, count=count, size=size)
+    cameras, first_view = sensitivity_cameras(splats, work.views, work.context, count=count, size=size)
     if sensitivity is None:
         uncertainty = VIEW_UNCERTAINTY[captured] if settings.view_uncertainty is None else settings.view_uncertainty
         sensitivity = _sensitivity(splats, cameras, uncertainty, work.cache if whole else None, work.context)
         return_free_memory()
     steps = settings.color_refit_iterations
     recolor = _recolor(splats, cameras, sensitivity, steps, work.context) if refits else None
-    return Measured(splats, sensitivity, recolor)
+    return Measured(splats, sensitivity, recolor, first_view)
 
 
 def plan(work: Work, scene: Measured, settings: EncodeSettings, context: Context) -> EncodingPlan:
     """Decide all levels of a scene."""
-    return plan_encoding(
+    chosen = plan_encoding(
         scene.splats,
         settings,
         context,
@@ -132,6 +134,7 @@ def plan(work: Work, scene: Measured, settings: EncodeSettings, context: Context
         container=MODELS[work.container],
         keep_costs=bool(work.settings.finetune.enabled),
     )
+    return replace(chosen, scene=replace(chosen.scene, first_view=scene.first_view))
 
 
 def write(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,7 @@ class PlannedScene:
     sh_degree: int
     origin: Origin
     antialiased: bool
+    first_view: Mapping[str, Any] | None = None  # with which viewers open the scene, for the metadata
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,7 +1,5 @@
-"""Runners of work items: separate processes on this machine, or a Ray cluster.
-
-In: a :class:`WorkItem`, a function by name with JSON arguments, and its request. Out: progress and an ``Outcome``.
-"""
+"""Runners of work items: separate processes on this machine, or a Ray cluster. In: a :class:`WorkItem`, a function by
+name with JSON arguments, and its request. Out: progress and an ``Outcome``."""
 
 from kissgs.runners.contract import (
     INTERNAL,

@@ -71,11 +71,9 @@ class WorkItem:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How an item ended.
-
-    "error" is an expected error, which another attempt would meet again; an item "crashed" if its process was ended by
-    a signal, and was "lost" if its node or the whole cluster was, or no process could be started.
-    """
+    """How an item ended. "error" is an expected error, which another attempt would meet again; an item "crashed" if its
+    process was ended by a signal, and was "lost" if its node or the whole cluster was, or no process could be
+    started."""
 
     kind: Literal["done", "error", "crashed", "lost", "cancelled"]
     result: dict[str, Any] = field(default_factory=dict)  # what the function returned
@@ -87,32 +85,25 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class RunHandle:
-    """An item that was submitted.
-
-    The outcome is set once the item's process has ended. It never has an exception, and only the runner cancels it.
-    """
+    """An item that was submitted. The outcome is set once the item's process has ended. It never has an exception, and
+    only the runner cancels it."""
 
     id: str
     outcome: Future[Outcome]
 
 
 class Runner(Protocol):
-    """Engine that runs work items, each in a process of its own.
-
-    It keeps nothing on disk: whoever submits items and is ended submits them again. All methods may be called from any
-    thread. Items that no node can run wait until there is one; :meth:`refusal` says so beforehand.
-    """
+    """Engine that runs work items, each in a process of its own. It keeps nothing on disk: whoever submits items and is
+    ended submits them again. All methods may be called from any thread. Items that no node can run wait until there is
+    one; :meth:`refusal` says so beforehand."""
 
     @property
     def nodes(self) -> tuple[Resources, ...]:
         """Resources of the nodes that can run items; none for a runner whose caller limits the number of items."""
 
     def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
-        """Queue an item.
-
-        ``progress`` receives its events in order, in a thread of the runner, and none after the outcome is set; an item
-        that is started again begins again.
-        """
+        """Queue an item. ``progress`` receives its events in order, in a thread of the runner, and none after the
+        outcome is set; an item that is started again begins again."""
 
     def cancel(self, item_id: str) -> None:
         """End an item, whether it waits or runs; do nothing if it has ended. Its outcome is then "cancelled"."""

@@ -1,7 +1,5 @@
 """Process of one work item, ``python -m kissgs.runners.item_process``: a task from standard input, events to output.
-
-Both are lines of JSON. When standard input closes, or whoever started it dies, it ends at once.
-"""
+Both are lines of JSON. When standard input closes, or whoever started it dies, it ends at once."""
 
 from __future__ import annotations
 

@@ -43,10 +43,8 @@ PREFIX = "kissgs-item-"  # beginning of the names of temporary folders of items
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Make an empty folder, and remove it with all that is in it; remove former ones whose makers were killed.
-
-    Its maker has it locked as long as it lives: a folder that can be locked is left by a process that was killed.
-    """
+    """Make an empty folder, and remove it with all that is in it; remove former ones whose makers were killed. Its
+    maker has it locked as long as it lives: a folder that can be locked is left by a process that was killed."""
     place = Path(tempfile.gettempdir())
     for left in place.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError), _opened(left) as descriptor:
@@ -238,10 +236,8 @@ def json_lines(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
 
 
 def child_environment(secret: tuple[str, ...] = ("KISSGS_", "AWS_")) -> dict[str, str]:
-    """Return this process's environment without variables whose names begin so.
-
-    By default, these are the settings of a service and the credentials of a cloud.
-    """
+    """Return this process's environment without variables whose names begin so. By default, these are the settings of a
+    service and the credentials of a cloud."""
     inherited = {name: value for name, value in os.environ.items() if not name.upper().startswith(secret)}
     libraries = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}  # its buffers count as memory
     return {**inherited, **libraries, "PYTHONUNBUFFERED": "1"}

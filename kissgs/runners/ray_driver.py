@@ -1,8 +1,6 @@
 """Driver process of :class:`kissgs.runners.ray_runner.RayRunner`: ``python -m kissgs.runners.ray_driver ADDRESS``.
-
 Lines of JSON: items to submit and to cancel come from standard input, nodes and events of items go to standard output.
-When standard input closes, it ends all items and exits.
-"""
+When standard input closes, it ends all items and exits."""
 
 from __future__ import annotations
 

@@ -22,10 +22,8 @@ Times = dict[str, int]  # times of the last change of files, by their names rela
 
 
 def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]] | None) -> Iterator[dict[str, Any]]:
-    """Run an item in a process on a node, and yield its events.
-
-    ``version`` is that of kissgs where it was submitted; ``files`` are references to blocks of its files.
-    """
+    """Run an item in a process on a node, and yield its events. ``version`` is that of kissgs where it was submitted;
+    ``files`` are references to blocks of its files."""
     node = ray.util.get_node_ip_address()
     if __version__ != version:
         message = f"the node {node} has kissgs {__version__}, and this machine {version}; install one version"
@@ -78,11 +76,9 @@ def times_of(folder: Path) -> Times:
 
 
 def changed(folder: Path, before: Times, *, complete: bool) -> Iterator[dict[str, Any]]:
-    """Yield the blocks of new and changed files as events, and bring ``before`` up to date.
-
-    Files in folders of the folder may be incomplete, and are left out, unless ``complete``. Of each file, the last
-    event has ``last``: only then is it to be seen at its destination.
-    """
+    """Yield the blocks of new and changed files as events, and bring ``before`` up to date. Files in folders of the
+    folder may be incomplete, and are left out, unless ``complete``. Of each file, the last event has ``last``: only
+    then is it to be seen at its destination."""
     for name, modified in sorted(times_of(folder).items()):
         if modified != before.get(name) and (complete or "/" not in name):
             offset = 0

@@ -1,8 +1,6 @@
-"""``RayRunner``: work items on the nodes of a Ray cluster, through a driver process, which alone uses Ray.
-
-Ray ends the process that uses it when the cluster's head is gone for a minute, replaces its signal handlers, and prints
-to its standard output. Here, the loss of that process is one more outcome.
-"""
+"""``RayRunner``: work items on the nodes of a Ray cluster, through a driver process, which alone uses Ray. Ray ends the
+process that uses it when the cluster's head is gone for a minute, replaces its signal handlers, and prints to its
+standard output. Here, the loss of that process is one more outcome."""
 
 from __future__ import annotations
 
@@ -33,11 +31,9 @@ NOT_INSTALLED = "Ray is not installed; install it on every machine with: pip ins
 
 
 class RayRunner:
-    """Runner on a Ray cluster, see :class:`kissgs.runners.Runner`.
-
-    ``address`` is HOST:PORT, or "auto" for that of ``RAY_ADDRESS`` or of a cluster on this machine, and if there is
-    none, for a new one on this machine until the runner is closed. Raises RunnerError if it cannot be reached.
-    """
+    """Runner on a Ray cluster, see :class:`kissgs.runners.Runner`. ``address`` is HOST:PORT, or "auto" for that of
+    ``RAY_ADDRESS`` or of a cluster on this machine, and if there is none, for a new one on this machine until the
+    runner is closed. Raises RunnerError if it cannot be reached."""
 
     def __init__(self, address: str = "auto") -> None:
         if find_spec("ray") is None:

@@ -63,10 +63,8 @@ def decode(
 
 
 def decode_files(files: Source, layout: SogLayout, out: Splats, pool: Workers, folder: str = "") -> None:
-    """Decode all images in parallel into ``out``, which has the container's number of Gaussians.
-
-    SH coefficients above the container's degree are left as they are. ``folder`` is the prefix of file names.
-    """
+    """Decode all images in parallel into ``out``, which has the container's number of Gaussians. SH coefficients above
+    the container's degree are left as they are. ``folder`` is the prefix of file names."""
     images = _Images(files, layout, folder)
     jobs: tuple[Callable[[_Images, Splats], None], ...] = (
         *(_decode_quats, _decode_means, _decode_rest, _decode_scales, _decode_colors),

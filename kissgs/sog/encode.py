@@ -104,7 +104,7 @@ def metadata(plan: EncodingPlan, sh_degree: int) -> bytes:
         centroids = plan.codebook.centroids
         codebook = {"count": len(centroids.levels), "bands": sh_degree, "codebook": _table(centroids)}
         document["shN"] = {**codebook, "files": list(SHN)}
-    if own := recorded(plan.scene.origin):
+    if own := recorded(plan.scene.origin, plan.scene.first_view):
         document["kissgs"] = own
     return json.dumps(document, separators=(",", ":")).encode()
 

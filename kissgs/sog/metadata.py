@@ -42,10 +42,8 @@ class Rest:
 
 @dataclass(frozen=True, slots=True)
 class SogLayout:
-    """Contents of ``meta.json``. Tables have one row per channel; NaN stands for a level without a value.
-
-    The ends of the positions' range are signed logarithms; scales, colours and opacities are as in :class:`Splats`.
-    """
+    """Contents of ``meta.json``. Tables have one row per channel; NaN stands for a level without a value. The ends of
+    the positions' range are signed logarithms; scales, colours and opacities are as in :class:`Splats`."""
 
     version: int
     count: int
@@ -196,11 +194,8 @@ def _even_table(document: dict[str, Any], key: str, channels: int) -> Float32[np
 
 
 def _codebook(document: dict[str, Any], key: str, channels: int) -> Float32[np.ndarray, "channels 256"]:
-    """Return the codebook of version 2, once per channel.
-
-    Old encoders wrote null for the first value, which is then extrapolated by the mean step; other missing values are
-    refused only if an image uses them.
-    """
+    """Return the codebook of version 2, once per channel. Old encoders wrote null for the first value, which is then
+    extrapolated by the mean step; other missing values are refused only if an image uses them."""
     values = _part(document, key).get("codebook")
     if not isinstance(values, list) or not 1 <= len(values) <= _LEVELS:
         raise _MetadataError(f"{key}.codebook is not a list of up to {_LEVELS} numbers; export the scene again")

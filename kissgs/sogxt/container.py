@@ -64,10 +64,8 @@ def is_packed(path: Path) -> bool:
 def write_container(
     files: Mapping[str, bytes], path: Path, *, overwrite: bool = False, names: Collection[str] = ()
 ) -> int:
-    """Write a container atomically: a zip if the name ends in ``.zip`` or ``.sog``, else a folder; return its bytes.
-
-    A folder is replaced only if it holds the files of a container, or those of ``names``, and nothing else.
-    """
+    """Write a container atomically: a zip if the name ends in ``.zip`` or ``.sog``, else a folder; return its bytes. A
+    folder is replaced only if it holds the files of a container, or those of ``names``, and nothing else."""
     check_destination(path, overwrite=overwrite, names={*files, *names})
     if not is_packed(path):
         _write_directory(files, path)
@@ -79,10 +77,8 @@ def write_container(
 
 
 def check_destination(path: Path, *, overwrite: bool, names: Collection[str] = FILES) -> None:
-    """Raise OutputError if a container may not be written to ``path``; called before the work starts.
-
-    ``names`` are the only files that a folder may hold to be replaced.
-    """
+    """Raise OutputError if a container may not be written to ``path``; called before the work starts. ``names`` are the
+    only files that a folder may hold to be replaced."""
     if is_packed(path):
         refuse_existing(path, overwrite=overwrite)
         return

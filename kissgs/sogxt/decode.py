@@ -1,8 +1,6 @@
-"""SOG-XT files -> ``Splats``, by one lookup table per channel.
-
-The arithmetic is that of the paper's reference decoder (docs/reference/format.md), with tables in float64 and without
-its activation of opacities and scales and their inverse.
-"""
+"""SOG-XT files -> ``Splats``, by one lookup table per channel. The arithmetic is that of the paper's reference decoder
+(docs/reference/format.md), with tables in float64 and without its activation of opacities and scales and their
+inverse."""
 
 from __future__ import annotations
 
@@ -89,10 +87,8 @@ def decode(
 
 
 def decode_files(files: Source, layout: Layout, out: Splats, pool: Workers) -> None:
-    """Decode a container whose metadata states the number of Gaussians into ``out``, which has as many.
-
-    SH coefficients of ``out`` above the container's degree are left as they are.
-    """
+    """Decode a container whose metadata states the number of Gaussians into ``out``, which has as many. SH coefficients
+    of ``out`` above the container's degree are left as they are."""
     planes = _Planes(files, layout, len(out))
     planes.load(pool)
     planes.look_up(pool, out)
@@ -146,10 +142,8 @@ class _Planes:
             raise InvalidContainerError(f"f_rest_labels.webp points outside the codebook of {side} x {side} entries")
 
     def load_codebook(self) -> None:
-        """Load the codebook's entries, coefficient by coefficient, R, G and B of each.
-
-        The image has 15 tiles of S × S pixels, three rows of five; tile = coefficient, pixel = entry.
-        """
+        """Load the codebook's entries, coefficient by coefficient, R, G and B of each. The image has 15 tiles of S × S
+        pixels, three rows of five; tile = coefficient, pixel = entry."""
         side = self.layout.codebook_side
         image = self.plane("f_rest_centroids", TILE_COLUMNS * side, TILE_ROWS * side, 3)
         tiles = image.reshape(TILE_ROWS, side, TILE_COLUMNS, side, 3).transpose(1, 3, 0, 2, 4).reshape(side * side, 45)
@@ -170,10 +164,8 @@ class _Planes:
         return decode_plane(data, file, width=width, height=height, channels=channels, crc32=checksum)
 
     def look_up(self, pool: Workers, out: Splats | None = None) -> Splats:
-        """Convert levels to values, some thousand Gaussians at a time, so that temporaries stay in the cache.
-
-        They are written to ``out`` if it is given.
-        """
+        """Convert levels to values, some thousand Gaussians at a time, so that temporaries stay in the cache. They are
+        written to ``out`` if it is given."""
         mask = self.mask[:, 0] > 0
         count = int(np.count_nonzero(mask))
         declared = self.layout.count
@@ -221,10 +213,8 @@ class _Lookup:
 
 
 def _table(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> Float64[np.ndarray, "C levels"]:
-    """Return each channel's values of all levels up to the largest that occurs.
-
-    The smallest and the largest level of the image, over all channels and cells, stand for ``low`` and ``high``.
-    """
+    """Return each channel's values of all levels up to the largest that occurs. The smallest and the largest level of
+    the image, over all channels and cells, stand for ``low`` and ``high``."""
     first, last = int(image.min()), int(image.max())
     position = (np.arange(last + 1, dtype=np.float64) - first) / max(last - first, 1)
     return np.asarray(low[:, None] + np.maximum(position, 0) * (high - low)[:, None])

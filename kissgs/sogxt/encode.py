@@ -67,6 +67,7 @@ def write_files(
         ranges=_ranges(plan.fields),
         origin=scene.origin,
         model="antialiased" if scene.antialiased else None,
+        first_view=scene.first_view,
         provenance=metadata.Provenance(
             version=__version__,
             sh_degree=scene.sh_degree,

@@ -84,6 +84,8 @@ class Layout(BaseModel):
     origin: Origin = WORLD
     model: str | None = None
     """Variant of the renderer that the scene was made for, as in SOG: "antialiased", or None."""
+    first_view: dict[str, Any] | None = None
+    """View with which viewers open the scene; in ``meta.json`` only, and not read."""
     crc32: dict[str, Annotated[int, Field(ge=0, lt=1 << 32)]] = Field(default_factory=dict)
     """CRC-32 of each image's pixels (:func:`kissgs.io.images.pixels_crc32`); in ``meta.json`` only."""
 
@@ -176,7 +178,7 @@ class Layout(BaseModel):
             document["model"] = self.model
         if self.provenance:
             own = self.provenance.model_dump(include={"version", "sh_degree"})
-            document["kissgs"] = {**own, **recorded(self.origin), "crc32": self.crc32}
+            document["kissgs"] = {**own, **recorded(self.origin, self.first_view), "crc32": self.crc32}
             document[CHECKSUM] = self.checksum
         return json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
 
@@ -273,10 +275,8 @@ def _layout_of(raw: dict[str, Any], name: str) -> Layout:
 
 
 def _compare(data: bytes, layout: Layout) -> None:
-    """Refuse a YAML file that states another scene than ``meta.json``, as ``web_decoder/scene.js`` does.
-
-    Numbers are compared by the word before them, and the word after "model", so that browsers need no YAML reader.
-    """
+    """Refuse a YAML file that states another scene than ``meta.json``, as ``web_decoder/scene.js`` does. Numbers are
+    compared by the word before them, and the word after "model", so that browsers need no YAML reader."""
     stated: dict[str, list[float]] = {"model": [False]}
     field = before = key = ""
     for word in _WORD.findall(data.decode("utf-8-sig", "replace")):
@@ -329,7 +329,8 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InvalidContainerError(f"{YAML_NAME} is not readable YAML") from error
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
-        raise InvalidContainerError(f"{YAML_NAME} lacks 'meta' or 'ops', or they are of another form") from error
+        problem = "lacks 'meta' or 'ops', or they are not of the expected form"
+        raise InvalidContainerError(f"{YAML_NAME} {problem}") from error
     _require_webp(sides.get("image_codec") if isinstance(sides, dict) else None)
     recorded = document.get("kissgs")
     return {
@@ -346,9 +347,7 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
 
 def _load_yaml(data: bytes) -> Any:  # noqa: ANN401
     """Return a document of lists, mappings with keys of text, and the plain values of YAML 1.2: see :func:`_value`.
-
-    PyYAML's loaders know more (numbers of base 60, merge keys, keys of any type), which takes minutes to expand.
-    """
+    PyYAML's loaders know more (numbers of base 60, merge keys, keys of any type), which takes minutes to expand."""
     waiting: list[tuple[Any, list[Any]]] = [(None, [])]
     anchors: dict[str | None, Any] = {}
     aliases = 0

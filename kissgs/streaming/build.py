@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -33,6 +34,7 @@ from kissgs.streaming.layout import (
     CAMERAS,
     ENVIRONMENT,
     OUT,
+    VIEW,
     ContainerFile,
     Layout,
     chunk_file,
@@ -64,11 +66,9 @@ COARSER_STEPS = 1.6  # of levels of SH degree 0, in units of the finest level's,
 
 
 def file_settings(settings: EncodeSettings, level: int, sh_degree: int) -> EncodeSettings:
-    """Return the settings of the files of a level.
-
-    Classes of steps would have an order of their own within each leaf, which costs 5 % of the bytes. Merging has a
-    larger error than the finest level's encoding, so coarser levels are less accurate (docs/method/streaming.md).
-    """
+    """Return the settings of the files of a level. Classes of steps would have an order of their own within each leaf,
+    which costs 5 % of the bytes. Merging has a larger error than the finest level's encoding, so coarser levels are
+    less accurate (docs/method/streaming.md)."""
     settings = settings.model_copy(update={"step_classes": 1})
     if level == 0:
         return settings
@@ -104,10 +104,8 @@ def measure_file(
     threads: int,
     progress: Progress = silent,
 ) -> Sensitivity:
-    """Measure the sensitivity of the Gaussians of a file; ``others`` stand for the rest of the scene.
-
-    A level of half the Gaussians is meant for images of half the size.
-    """
+    """Measure the sensitivity of the Gaussians of a file; ``others`` stand for the rest of the scene. A level of half
+    the Gaussians is meant for images of half the size."""
     size = max(MIN_SIZE, settings.sensitivity_view_size >> level)
     shown = [_shown(camera, splats) for camera in cameras]
     best = sorted(np.argsort(np.negative(shown), kind="stable")[:MAX_VIEWS])  # else each file would take more and more
@@ -251,7 +249,8 @@ def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: 
     least = min(MOST_VIEWS, VIEWS_PER_CHUNK * len(layout.filled))
     views = settings.sensitivity_views or max(default_view_count(total), least)
     size = settings.sensitivity_view_size
-    cameras = sensitivity_cameras(coarsest, None, Context(threads), count=views, size=size)
+    cameras, view = sensitivity_cameras(coarsest, None, Context(threads), count=views, size=size)
+    write_json(work / VIEW, view)  # before the cameras, which mark this step as done
     write_json(work / CAMERAS, [camera_as_dict(camera) for camera in cameras.cameras])
 
 
@@ -343,12 +342,13 @@ def make_manifest(work: Path, layout: Layout) -> None:
                 low, high = ([float(f"{value:.7g}") for value in corner] for corner in corners)
                 levels = {str(level): rows for level, rows in sorted(lods[chunk, leaf].items())}
                 leaves.append({"bound": {"min": low, "max": high}, "lods": levels, "errors": errors})
+    view = json.loads((work / VIEW).read_bytes()) if (work / VIEW).exists() else None
     has_environment = (work / OUT / layout.path(ENVIRONMENT)).exists()
     document = {
         "version": 1,
         **({"format": FORMAT} if layout.container == "sogxt" else {}),
         "asset": {"generator": f"kissgs {__version__}"},
-        **({"kissgs": own_origin} if (own_origin := recorded(layout.origin)) else {}),
+        **({"kissgs": facts} if (facts := recorded(layout.origin, view)) else {}),
         "count": totals[0],
         "counts": totals,
         "lodLevels": layout.levels,

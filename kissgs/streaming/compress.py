@@ -57,10 +57,8 @@ LEAST_SECONDS = 5.0  # time after which the pace of the work is known well enoug
 
 
 def with_time_left(progress: Progress, rate_distortion: bool) -> Progress:
-    """Return a receiver that adds the time left to notes, by the pace since its first event.
-
-    Until more of the work is done, the clock counts it down; once that is at zero, nothing is added.
-    """
+    """Return a receiver that adds the time left to notes, by the pace since its first event. Until more of the work is
+    done, the clock counts it down; once that is at zero, nothing is added."""
     shares = SHARES[rate_distortion]
     before = dict(zip(shares, itertools.accumulate(shares.values(), initial=0.0), strict=False))
     first: tuple[float, float] | None = None
@@ -225,10 +223,8 @@ def _is_made(item: dict[str, Any]) -> bool:
 
 
 def run_item(item: dict[str, Any], progress: Progress) -> dict[str, Any]:
-    """Run an item, here or on a node, unless it is made.
-
-    A node that was given up may still be at work: what it completes meanwhile, it takes the input of.
-    """
+    """Run an item, here or on a node, unless it is made. A node that was given up may still be at work: what it
+    completes meanwhile, it takes the input of."""
     work, threads = Path(item["work"]), item["threads"]
     if scratch.read_json(work / PARTITION) is None:
         raise UnsupportedError(

@@ -13,7 +13,8 @@ from kissgs.io.containers import META_NAME
 from kissgs.io.files import atomic_file
 
 CONTEXT = 280_000  # largest number of Gaussians of the level that stands for other chunks where sensitivity is measured
-PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"  # the partition's marker; cameras; the result
+# The partition's marker; cameras; the first view; the result.
+PARTITION, CAMERAS, VIEW, OUT = "partition.json", "cameras.json", "view.json", "out"
 ENVIRONMENT = "environment"  # name of the environment's container
 
 

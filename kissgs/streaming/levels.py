@@ -111,10 +111,8 @@ BACKGROUND = (0.5, 0.5, 0.5)
 
 
 def level_errors(levels: Sequence[Splats]) -> list[float]:
-    """Return the root mean square error of each level, in units of the range of colours; that of the finest is 0.
-
-    No level has a smaller error than a finer one, so that a smaller error never asks for a coarser level.
-    """
+    """Return the root mean square error of each level, in units of the range of colours; that of the finest is 0. No
+    level has a smaller error than a finer one, so that a smaller error never asks for a coarser level."""
     squared = np.zeros(len(levels))
     for camera in _cameras(levels[0]):
         images = [np.clip(render(level, camera, background=BACKGROUND, threads=1)[0], 0, 1) for level in levels]
@@ -144,10 +142,8 @@ MERGING = 0.7  # share of merging in the time for the levels of a chunk; the res
 def chunk_levels(
     chunk: Splats, levels: int, leaf: int, threads: int, progress: Progress = silent
 ) -> tuple[list[Splats], dict[str, Any]]:
-    """Split a chunk into leaves and merge each to half its Gaussians for every further level.
-
-    Returned are the levels, and the counts by level, the bounds and the errors of the leaves, as JSON.
-    """
+    """Split a chunk into leaves and merge each to half its Gaussians for every further level. Returned are the levels,
+    and the counts by level, the bounds and the errors of the leaves, as JSON."""
     order, edges = leaf_groups(chunk.means, leaf)
 
     def leaf_levels(at: int) -> list[Splats]:

@@ -129,10 +129,8 @@ def check_space(work: Path, needed: int) -> None:
 
 
 def finish(work: Path, manifest: Path, source: Path, *, overwrite: bool) -> None:
-    """Move the result into place, and delete the work folder; may be repeated after an interruption anywhere.
-
-    The work folder is renamed before it is deleted: a part of it would look like other work.
-    """
+    """Move the result into place, and delete the work folder; may be repeated after an interruption anywhere. The work
+    folder is renamed before it is deleted: a part of it would look like other work."""
     result = work / OUT
     if (result / manifest.name).exists():
         check_destination(manifest, source, overwrite=overwrite)
@@ -147,11 +145,9 @@ def finish(work: Path, manifest: Path, source: Path, *, overwrite: bool) -> None
 
 
 def remove(work: Path) -> None:
-    """Delete a claimed work folder whose work is of no use; what cannot be deleted stays.
-
-    The files by which :func:`claimed` recognises it are the last to go, so that after an interruption anywhere the same
-    command may begin anew.
-    """
+    """Delete a claimed work folder whose work is of no use; what cannot be deleted stays. The files by which
+    :func:`claimed` recognises it are the last to go, so that after an interruption anywhere the same command may begin
+    anew."""
     with contextlib.suppress(OSError):
         for path in work.iterdir():
             if path.name not in (WORK, LOCK):

@@ -22,10 +22,8 @@ class Clock:
         self._offset = wall() - steady()
 
     def start_after(self, floor: float) -> None:
-        """Advance to at least ``floor``, the latest time recorded by a previous run.
-
-        A floor more than :data:`MAX_CLOCK_LEAD_SECONDS` ahead is ignored: the clock of that run was wrong.
-        """
+        """Advance to at least ``floor``, the latest time recorded by a previous run. A floor more than
+        :data:`MAX_CLOCK_LEAD_SECONDS` ahead is ignored: the clock of that run was wrong."""
         ahead = floor - self()
         if 0 < ahead < MAX_CLOCK_LEAD_SECONDS:
             self._offset += ahead

@@ -16,11 +16,8 @@ DEFAULT: Format = "sogxt"
 
 @dataclass(frozen=True, slots=True)
 class ContainerFile:
-    """Ending and media type of a container.
-
-    A ``.sog`` is a zip as well, but some browsers unpack what is called a zip, or change the ending of its name; SOG
-    has no registered type of its own.
-    """
+    """Ending and media type of a container. A ``.sog`` is a zip as well, but some browsers unpack what is called a zip,
+    or change the ending of its name; SOG has no registered type of its own."""
 
     ending: str
     media_type: str
@@ -53,12 +50,10 @@ FINETUNE_BYTES, ENTRY_BYTES, MAX_ENTRIES = 12 * 14, 12 * 45, 1 << 16
 
 
 def checkpoint_bytes(gaussians: int, sh_degree: int, *, compact: bool = True, finetune: bool = False) -> int:
-    """Return an upper bound in bytes for the checkpoints of a scene's compaction and fine-tuning.
-
-    A compaction checkpoint holds each parameter and its two Adam moments, for at most all Gaussians of the scene. A
-    fine-tuning checkpoint holds the levels and the codebook entries, also with their moments. The larger of the two is
-    counted twice, because the previous checkpoint exists until the next one is complete.
-    """
+    """Return an upper bound in bytes for the checkpoints of a scene's compaction and fine-tuning. A compaction
+    checkpoint holds each parameter and its two Adam moments, for at most all Gaussians of the scene. A fine-tuning
+    checkpoint holds the levels and the codebook entries, also with their moments. The larger of the two is counted
+    twice, because the previous checkpoint exists until the next one is complete."""
     first = compact * (STEPS_BYTES + 3 * BYTES_PER_GAUSSIAN[sh_degree] * gaussians)
     second = finetune * (STEPS_BYTES + FINETUNE_BYTES * gaussians + ENTRY_BYTES * min(max(gaussians, 64), MAX_ENTRIES))
     return first + second + max(first, second)

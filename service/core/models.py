@@ -42,11 +42,9 @@ class Meta(Base):
 
 class Job(Base):
     """One upload, its options, its progress and its result. Times are seconds since 1970; sizes are bytes.
-
     ``disk_bytes`` is the size of its files; while the job runs, that of the upload plus ``work_bytes``, the upper bound
     for its checkpoints. ``reclaimable_bytes`` is the part that can be deleted for new uploads once the job has ended:
-    the upload, which is kept for comparisons, and the decoded scene.
-    """
+    the upload, which is kept for comparisons, and the decoded scene."""
 
     __tablename__ = "jobs"
     __table_args__ = (

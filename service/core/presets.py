@@ -68,10 +68,8 @@ TUNED_CONTAINERS = 2.0  # containers that a search for the number of Gaussians f
 
 
 def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
-    """Estimate the wall time of a job on a small server, used until this server has measured jobs of its own.
-
-    ``kind`` is :attr:`service.core.schemas.JobOptions.kind`.
-    """
+    """Estimate the wall time of a job on a small server, used until this server has measured jobs of its own. ``kind``
+    is :attr:`service.core.schemas.JobOptions.kind`."""
     name, *stages = kind.split("+")
     facts, millions = _FACTS[kissgs.Preset(name)], gaussians / 1e6
     encoding = (facts.cpu_seconds_per_million + evaluate * EVALUATION) * millions
@@ -87,11 +85,9 @@ LONGEST_FINETUNING = 2.0  # factor on the time of a job that fine-tunes with a t
 
 
 def limited_seconds(kind: str, evaluate: bool, gaussians: int, unlimited: float, limit: float) -> float:
-    """Estimate the wall time of a job with a time limit, which does not include the start and the evaluation.
-
-    Nor does it limit a search for the number of Gaussians without fine-tuning. ``kind`` is that of the same job without
-    the limit, and ``unlimited`` its time, in seconds.
-    """
+    """Estimate the wall time of a job with a time limit, which does not include the start and the evaluation. Nor does
+    it limit a search for the number of Gaussians without fine-tuning. ``kind`` is that of the same job without the
+    limit, and ``unlimited`` its time, in seconds."""
     if COMPACTED in kind and FINETUNED not in kind:
         return unlimited
     longest = LONGEST_FINETUNING if FINETUNED in kind else 1.0

@@ -1,7 +1,5 @@
-"""All errors of the service, as RFC 9457 problem documents with stable codes.
-
-Codes of the library (``kissgs.KissgsError.code``) keep their names; the other codes belong to the service.
-"""
+"""All errors of the service, as RFC 9457 problem documents with stable codes. Codes of the library
+(``kissgs.KissgsError.code``) keep their names; the other codes belong to the service."""
 
 from __future__ import annotations
 

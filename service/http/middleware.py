@@ -77,10 +77,8 @@ class RequestMiddleware:
             log.info("%s %s %d %.0f ms %s", method, target[:500], status, spent, request_id)
 
     def _refusal(self, method: str, headers: Headers) -> ProblemError | None:
-        """Return the error for a foreign host name (DNS rebinding) or a foreign origin (CSRF); None to allow.
-
-        Requests without an ``Origin`` header do not come from a page of another site.
-        """
+        """Return the error for a foreign host name (DNS rebinding) or a foreign origin (CSRF); None to allow. Requests
+        without an ``Origin`` header do not come from a page of another site."""
         host = headers.get("host", "")
         name = host.rpartition(":")[0] if re.search(r":[0-9]*$", host) else host
         if not self._settings.answers_to(name.strip("[]").lower()):

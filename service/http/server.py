@@ -1,7 +1,5 @@
 """uvicorn with timeouts for idle and slow connections, and with a shutdown that drains jobs and requests concurrently.
-
-uvicorn itself would begin to drain only after the last stream has ended.
-"""
+uvicorn itself would begin to drain only after the last stream has ended."""
 
 from __future__ import annotations
 
@@ -188,10 +186,8 @@ class Server(uvicorn.Server):
         await asyncio.gather(self._context.worker.drain(), super().shutdown(sockets))
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Stop starting jobs, end streams and long polls, then let uvicorn finish its requests.
-
-        uvicorn's handler would raise the signal again afterwards, so that the exit status would look like a crash.
-        """
+        """Stop starting jobs, end streams and long polls, then let uvicorn finish its requests. uvicorn's handler would
+        raise the signal again afterwards, so that the exit status would look like a crash."""
         if self.should_exit:
             self._context.worker.kill_running()
         self._context.worker.draining = True

@@ -189,11 +189,9 @@ class Received:
 
 
 class Spool:
-    """Writes one scene to disk. As a context manager, removes it unless :meth:`finish` has succeeded.
-
-    The header of a ``.ply`` is checked while it arrives; other formats when they are complete. ``at_most`` bytes come
-    according to the client; None if that is unknown.
-    """
+    """Writes one scene to disk. As a context manager, removes it unless :meth:`finish` has succeeded. The header of a
+    ``.ply`` is checked while it arrives; other formats when they are complete. ``at_most`` bytes come according to the
+    client; None if that is unknown."""
 
     def __init__(self, settings: ServiceSettings, admission: Admission, path: Path, at_most: int | None = None) -> None:
         self._settings, self._admission, self._path = settings, admission, path

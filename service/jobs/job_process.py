@@ -1,8 +1,6 @@
-"""Work of jobs: compression and decoding, run by :mod:`kissgs.runners` in a process of their own.
-
-Tasks name their files relative to the folder of the job, the current one of the process, and results are written below
-its folder ``work``. This module reads and writes all files of jobs that the service's own process does not.
-"""
+"""Work of jobs: compression and decoding, run by :mod:`kissgs.runners` in a process of their own. Tasks name their
+files relative to the folder of the job, the current one of the process, and results are written below its folder
+``work``. This module reads and writes all files of jobs that the service's own process does not."""
 
 from __future__ import annotations
 
@@ -59,11 +57,9 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
 
 
 def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed:
-    """Compress the scene, continuing from its checkpoint if there is one.
-
-    Checkpoints are optional: an unusable one (damaged, or of another version of kissgs) is replaced, and if none can be
-    written, because the disk is full, the job runs without.
-    """
+    """Compress the scene, continuing from its checkpoint if there is one. Checkpoints are optional: an unusable one
+    (damaged, or of another version of kissgs) is replaced, and if none can be written, because the disk is full, the
+    job runs without."""
     import kissgs
 
     checkpoint = None if task["checkpoint"] is None else Path(task["checkpoint"])

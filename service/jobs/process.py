@@ -37,10 +37,8 @@ def postponed(reason: str = "") -> Outcome:
 
 @dataclass(frozen=True, slots=True)
 class JobRunners:
-    """The runners of all jobs, and what each of them requests.
-
-    ``local`` decodes, which is quick and for which a request waits: no job of a cluster delays it.
-    """
+    """The runners of all jobs, and what each of them requests. ``local`` decodes, which is quick and for which a
+    request waits: no job of a cluster delays it."""
 
     settings: ServiceSettings
     runner: Runner
@@ -74,10 +72,8 @@ class JobRunners:
         return Resources(cpus, int(settings.job_memory), settings.job_gpus if trains else 0)
 
     def item(self, task: dict[str, Any]) -> WorkItem:
-        """Return the work item of a task; see :mod:`service.jobs.job_process`.
-
-        It is not started again when its node is lost: the database counts the starts of jobs.
-        """
+        """Return the work item of a task; see :mod:`service.jobs.job_process`. It is not started again when its node is
+        lost: the database counts the starts of jobs."""
         wanted = kissgs.Settings.model_validate(task.get("settings", {}))
         requested = self.request(trains=wanted.compact.enabled or bool(wanted.finetune.enabled))
         threads = self.settings.job_threads if self.runner_of(task) is self.local else int(requested.cpus)

@@ -211,9 +211,7 @@ class EventStream:
 
 def _in_turn(queued: Iterable[Job], turns: Mapping[str, int]) -> list[Job]:
     """Return queued jobs in the order in which :meth:`Store.claim` starts them: one of each owner, then the next ones.
-
-    First is the owner whose ``turns``, the number of its last start, is the lowest; of one owner, the oldest job.
-    """
+    First is the owner whose ``turns``, the number of its last start, is the lowest; of one owner, the oldest job."""
     waiting: dict[str, list[Job]] = {}
     for job in sorted(queued, key=lambda job: job.number):
         waiting.setdefault(job.owner, []).append(job)

@@ -85,10 +85,8 @@ class ExpiryTask:
                 await run_sync(self.context.store.heartbeat)
 
     def sweep(self) -> list[str]:
-        """Expire ended jobs and remove their files after ``keep_seconds``, and return their ids.
-
-        Their rows are deleted after as long again.
-        """
+        """Expire ended jobs and remove their files after ``keep_seconds``, and return their ids. Their rows are deleted
+        after as long again."""
         store, storage, now = self.context.store, self.context.storage, self.context.clock()
         completion, keep, expired = self.context.worker.completion, self.context.settings.keep_seconds, []
         storage.keep_reserve()

@@ -61,9 +61,7 @@ class JobCompletion:
 
     def record(self, job: Job, outcome: Outcome, work: Path | None, stopping: bool) -> None:
         """Record how a start of a job ended, and whether it is started again; the call can be repeated if it fails.
-
-        ``job`` is as it was started, ``work`` the folder of this start, if it has got one.
-        """
+        ``job`` is as it was started, ``work`` the folder of this start, if it has got one."""
         self.store.monitor.check_files()  # else files would change without a record in the database
         self.storage.check()
         current = self.store.get(job.id)
@@ -149,10 +147,8 @@ class JobCompletion:
         return self._despite_full_disk(lambda: self.end(job, State.CANCELLED, upload_kept=False, disk_bytes=0))
 
     def expire(self, number: int, job_id: str, **values: Any) -> None:  # noqa: ANN401
-        """Record that an ended job has expired, with the columns ``values``, and remove its files.
-
-        On a full disk the files go first, because the record needs space.
-        """
+        """Record that an ended job has expired, with the columns ``values``, and remove its files. On a full disk the
+        files go first, because the record needs space."""
         gone: dict[str, Any] = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0, **values}
         try:
             self.store.move(number, State.EXPIRED, **gone)
@@ -240,10 +236,8 @@ class Worker:
         return self.runners.health_problem()
 
     async def drain(self) -> None:
-        """Start no more jobs, wait up to ``drain_seconds`` for running ones, and requeue those that need longer.
-
-        The server calls it, and so does the end of the application, which another server could run.
-        """
+        """Start no more jobs, wait up to ``drain_seconds`` for running ones, and requeue those that need longer. The
+        server calls it, and so does the end of the application, which another server could run."""
         self.draining = True
         self.notifier.notify(QUEUE)
         if self._processes and not self._waits:

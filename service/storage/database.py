@@ -66,11 +66,8 @@ def check_pages(connection: sa.Connection) -> str | None:
 
 
 def keep_open(connection: sqlite3.Connection) -> None:
-    """Keep a connection open until the process ends.
-
-    Closing the last connection to a database removes its journal by name; if the database has been replaced, that would
-    be the journal of the new one.
-    """
+    """Keep a connection open until the process ends. Closing the last connection to a database removes its journal by
+    name; if the database has been replaced, that would be the journal of the new one."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(connection))
 
 
@@ -120,9 +117,7 @@ class DatabaseMonitor:
 
     def health_problem(self) -> str | None:
         """Check the database; return the problem, None if there is none. Takes 2 ms, or longer to wait for a lock.
-
-        Concurrent calls share one check, which never started before the call.
-        """
+        Concurrent calls share one check, which never started before the call."""
         called = time.monotonic()
         with self._lock:
             if self._check_started < called:
@@ -191,10 +186,8 @@ class NewDatabaseError(SettingsError):
 
 
 def connect(file: Path, *, create: bool = True) -> tuple[sa.Engine, Sessions, Sessions]:
-    """Open the database, check that it is intact, and ``create`` it and its tables if there are none.
-
-    Return the engine, sessions for writing, each with exclusive access, and sessions for reading, which wait for none.
-    """
+    """Open the database, check that it is intact, and ``create`` it and its tables if there are none. Return the
+    engine, sessions for writing, each with exclusive access, and sessions for reading, which wait for none."""
     opened: list[Any] = []
     first = _engine(file, START_SECONDS, opened)
     try:

@@ -147,10 +147,8 @@ class JobStorage:
         return folder
 
     def keep_result(self, job_id: str, work: Path) -> None:
-        """Move the result from a work folder to its final path; do nothing if that is done already.
-
-        A previous result moves to the work folder.
-        """
+        """Move the result from a work folder to its final path; do nothing if that is done already. A previous result
+        moves to the work folder."""
         result, written = self.result(job_id), work / RESULT
         if written.is_dir():
             if os.path.lexists(result):
@@ -195,10 +193,8 @@ class JobStorage:
                 self.discard(path)
 
     def remove_job(self, job_id: str) -> None:
-        """Remove all files of a job; files that cannot be removed stay, with a warning in the log.
-
-        If the job's path is not a folder, or has other content, it is moved to the orphaned folder instead.
-        """
+        """Remove all files of a job; files that cannot be removed stay, with a warning in the log. If the job's path is
+        not a folder, or has other content, it is moved to the orphaned folder instead."""
         folder = self.jobs / job_id
         if not JOB.fullmatch(job_id):
             raise ValueError(f"{job_id!r} is not a job id")
@@ -320,11 +316,9 @@ class JobStorage:
 
 
 def _complete_summary(text: bytes, sizes: dict[str, int], container: str) -> dict[str, Any] | None:
-    """Return the summary of a result that is complete; None if it is not.
-
-    ``text`` is that of ``summary.json``, ``sizes`` are the bytes of each file of the result by name, and ``container``
-    is the name of the container's file.
-    """
+    """Return the summary of a result that is complete; None if it is not. ``text`` is that of ``summary.json``,
+    ``sizes`` are the bytes of each file of the result by name, and ``container`` is the name of the container's
+    file."""
     try:
         summary: dict[str, Any] = json.loads(text)
         required = {f"files/{name}": entry["bytes"] for name, entry in summary["files"].items()}

@@ -1,8 +1,6 @@
-"""``Store``: reading and changes of the tables of jobs and events, each change in one transaction.
-
-State transitions are limited to :data:`_PREDECESSORS`, and compared and set in one step, so that of a simultaneous
-cancellation and result only one takes effect. Each change of state or progress adds an event for clients.
-"""
+"""``Store``: reading and changes of the tables of jobs and events, each change in one transaction. State transitions
+are limited to :data:`_PREDECESSORS`, and compared and set in one step, so that of a simultaneous cancellation and
+result only one takes effect. Each change of state or progress adds an event for clients."""
 
 from __future__ import annotations
 
@@ -180,10 +178,8 @@ class Store:
     # Changes -------------------------------------------------------------------------------------------------------
 
     def claim(self) -> Job | None:
-        """Set the next queued job to running and return it; None if the queue is empty.
-
-        The owners of keys take turns, so that nobody waits for all jobs of another; of one, the oldest is next.
-        """
+        """Set the next queued job to running and return it; None if the queue is empty. The owners of keys take turns,
+        so that nobody waits for all jobs of another; of one, the oldest is next."""
         with self._write() as session:
             turn = [sa.case(self.turns, value=Job.owner, else_=0)] if self.turns else []
             query = sa.select(Job).where(Job.state == State.QUEUED).order_by(*turn, Job.number).limit(1)
@@ -209,10 +205,8 @@ class Store:
                 _add_event(session, job, "progress", {"stage": stage, "fraction": fraction, **optional})
 
     def move(self, number: int, state: State, **values: Any) -> bool:  # noqa: ANN401
-        """Set a job's state and the columns ``values``; return False if its current state does not allow it.
-
-        A job that returns to the queue loses its progress.
-        """
+        """Set a job's state and the columns ``values``; return False if its current state does not allow it. A job that
+        returns to the queue loses its progress."""
         with self._write() as session:
             job = session.get(Job, number)
             if job is None or job.state not in _PREDECESSORS[state]:

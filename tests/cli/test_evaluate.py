@@ -45,7 +45,7 @@ def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder, tmp_p
     done = run("evaluate", folder / "b.zip", tmp_path / "unpacked")
     text = done.stdout.decode()
     assert done.returncode == 0, done.stderr
-    assert "24 cameras, 320x240: drawn over the whole scene, seed 0" in text
+    assert "24 cameras, 96x72: drawn over the whole scene, seed 0" in text
     assert "∞" in text
     assert "photo" not in text
 

@@ -56,7 +56,7 @@ def error(scene, original, views):
     ],
 )
 @pytest.mark.parametrize("count", [1, 59])
-@pytest.mark.quick(6)
+@pytest.mark.quick(3)
 def test_the_result_has_exactly_the_requested_count_and_its_indices(count, changes):
     scene = cloud(60)
     result = Popspa(scene, settings(**changes), five_views())(count)

@@ -14,15 +14,7 @@ import kissgs
 from kissgs.cameras.views import MIN_DISTANCE, Views, black
 from kissgs.core.context import Context
 from kissgs.core.errors import InvalidViewsError
-from kissgs.evaluation.cameras import (
-    BACKGROUNDS,
-    HEIGHT,
-    KINDS,
-    MIN_MEAN_ALPHA,
-    WIDTH,
-    evaluation_views,
-    farther,
-)
+from kissgs.evaluation.cameras import BACKGROUNDS, HEIGHT, KINDS, MIN_MEAN_ALPHA, WIDTH, evaluation_views, farther
 from kissgs.rendering.rasterizer import render
 
 ROOT = Path(__file__).parents[2]

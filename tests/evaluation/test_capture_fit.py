@@ -132,8 +132,7 @@ def test_a_scene_of_the_colmap_model_fits_the_transforms_that_nerfstudio_made_of
 
 
 @pytest.mark.parametrize(
-    "content",
-    ["[", '{"transform": [[1, 0, 0, 0]], "scale": 1}', json.dumps({"transform": np.ones((3, 4)).tolist()})],
+    "content", ["[", '{"transform": [[1, 0, 0, 0]], "scale": 1}', json.dumps({"transform": np.ones((3, 4)).tolist()})]
 )
 def test_a_damaged_file_of_transforms_is_named(tmp_path, content):
     write_transforms(tmp_path)

@@ -27,21 +27,25 @@ def objects(count, gaussians=100, apart=200.0, seed=0):
     return Splats(**arrays), np.repeat(np.arange(count), gaussians)
 
 
-FIFTY, OBJECT_OF = objects(50)
+@pytest.fixture(scope="module")
+def fifty():
+    """Fifty objects, and each Gaussian's."""
+    return objects(50)
 
 
 def parts_of(scene):
     return find_parts(scene, prominence(scene))
 
 
-def test_distant_objects_are_parts():
-    parts, part_of = parts_of(FIFTY)
+def test_distant_objects_are_parts(fifty):
+    scene, object_of = fifty
+    parts, part_of = parts_of(scene)
     assert len(parts) == 50
     for n, part in enumerate(parts):
-        inside = OBJECT_OF[part_of == n]
+        inside = object_of[part_of == n]
         most = np.bincount(inside).argmax()
         assert (inside == most).mean() > 0.9
-        center = np.median(FIFTY.means[most == OBJECT_OF], axis=0)
+        center = np.median(scene.means[most == object_of], axis=0)
         assert np.linalg.norm(part.center - center) < 10
         assert part.radius < 60
 
@@ -93,14 +97,15 @@ def test_coincident_gaussians_are_one_part():
     assert part_of[0] != part_of[700]
 
 
-def test_the_loss_of_any_object_is_visible():
+def test_the_loss_of_any_object_is_visible(fifty):
     """24 drawn cameras show only some of fifty objects; the added ones show the others."""
-    views = evaluation_views(FIFTY)
+    scene, object_of = fifty
+    views = evaluation_views(scene)
     assert 20 < sum(view.added for view in views.test) <= MAX_ADDED
     reference_images, unseen = {}, []
     for removed in range(0, 50, 12):
-        rest = FIFTY.select(np.flatnonzero(removed != OBJECT_OF))
-        found = compare_images(FIFTY, rest, views, reference_images=reference_images)
+        rest = scene.select(np.flatnonzero(removed != object_of))
+        found = compare_images(scene, rest, views, reference_images=reference_images)
         assert found.worst.comparison.candidate_vs_reference.psnr < 20
         unseen.append(
             min(view.comparison.candidate_vs_reference.psnr for view in found.views if not view.view.added) > 20
@@ -110,8 +115,8 @@ def test_the_loss_of_any_object_is_visible():
     assert f"{found.added} of the views were added for parts that the others overlook" in found.extremes
 
 
-def test_added_cameras_follow_the_drawn_ones_whatever_the_threads():
-    first, again = evaluation_views(FIFTY, Context(1)).test, evaluation_views(FIFTY, Context(3)).test
+def test_added_cameras_follow_the_drawn_ones_whatever_the_threads(fifty):
+    first, again = (evaluation_views(fifty[0], Context(threads)).test for threads in (1, 3))
     assert [view.name for view in first] == [view.name for view in again] == sorted(view.name for view in first)
     for one, other in zip(first, again, strict=True):
         assert one.camera.viewmat.tobytes() == other.camera.viewmat.tobytes()

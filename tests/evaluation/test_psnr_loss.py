@@ -9,14 +9,7 @@ from helpers.evaluations import compared, evaluation_of, evaluation_with, metric
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.evaluation.results import (
-    ASSUMED_PSNR,
-    MAX_ERROR_RATIO,
-    MAX_SSIM_RATIO,
-    drop_of,
-    psnr_of,
-    ssim_drop_of,
-)
+from kissgs.evaluation.results import ASSUMED_PSNR, MAX_ERROR_RATIO, MAX_SSIM_RATIO, drop_of, psnr_of, ssim_drop_of
 
 
 def similarities(*ssims):

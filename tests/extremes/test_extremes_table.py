@@ -16,6 +16,7 @@ HERE = [stage for stage in STAGES if stage != "browser"]
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.quick(24)
 def test_every_stage_keeps_its_promise(name):
     bound = BY_NAME[name].bound
     assert {stage: measured(name, stage) for stage in HERE if not measured(name, stage) <= bound(stage)} == {}

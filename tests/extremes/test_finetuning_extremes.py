@@ -28,7 +28,7 @@ def check(scene, preset="balanced", container="sogxt", **changes):
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_degenerate_scenes_are_tuned_without_nan(scene):
     """Every other one as SOG, which holds no scene without visible Gaussians."""
     as_sog = SCENES.index(scene) % 2 and scene.__name__ != "transparent"

@@ -2,9 +2,21 @@
 
 import contextlib
 import http.client
+import json
 import threading
 
+from kissgs.io.containers import open_source
 from kissgs.preview import PageServer
+from kissgs.sogxt.container import zip_bytes
+
+
+def with_view(container, view):
+    """Return a container, of either format, with another recorded view."""
+    with open_source(container) as source:
+        files = {name: source.read(name, 1 << 30) for name in source.names()}
+    meta = json.loads(files["meta.json"])
+    meta.setdefault("kissgs", {})["view"] = view
+    return zip_bytes({**files, "meta.json": json.dumps(meta).encode()})
 
 
 @contextlib.contextmanager

@@ -70,6 +70,7 @@ def capture_with_photographs(scene, tmp_path):
 
 
 @pytest.mark.parametrize(("goal", "most", "figure"), [("max_psnr_drop", 0.3, "psnr"), ("max_ssim_drop", 0.02, "ssim")])
+@pytest.mark.quick(1)
 def test_a_drop_is_measured_to_photographs_if_there_are_any(tmp_path, goal, most, figure):
     """A scene with low PSNR to its photographs loses less by the same errors than the model of 30 dB predicts."""
     scene = cloud(200)
@@ -160,11 +161,7 @@ def test_a_stopped_search_returns_its_best(count):
 @pytest.mark.parametrize(
     ("goal", "changes", "message"),
     [
-        (
-            {},
-            {},
-            "auto_count needs a goal: give quality, target_size, max_psnr_drop, max_ssim_drop, psnr or a time",
-        ),
+        ({}, {}, "auto_count needs a goal: give quality, target_size, max_psnr_drop, max_ssim_drop, psnr or a time"),
         ({"target_size": "1MB"}, {"method": "merge"}, "auto_count prunes; give count or ratio with method merge"),
         ({"target_size": "1MB"}, {"count": 9}, "count and auto_count cannot both be met; give one"),
         (

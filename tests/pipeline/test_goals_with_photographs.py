@@ -66,7 +66,7 @@ def test_the_same_request_gives_the_same_bytes(tmp_path):
     """Any number of threads, and also the request that the report shows."""
     scene = cloud(150)
     views = photographs(scene, tmp_path)
-    chosen = with_photographs(max_psnr_drop=1, max_ssim_drop=0.05)
+    chosen = with_photographs(max_psnr_drop=1, max_ssim_drop=0.05, max_encodes=2)
     found = kissgs.compress(scene, settings=chosen, views=views, threads=1)
     assert found.report.settings["encode"]["quality_offset_db"] == 0
     again = Settings.model_validate(found.report.settings)
@@ -77,34 +77,15 @@ def test_the_same_request_gives_the_same_bytes(tmp_path):
 
 def test_training_goes_on_while_the_scene_meets_the_goal(tmp_path):
     """A scene that is too dark: training gains more than three quarters of the Gaussians lose."""
-    points = []
     scene = cloud(300)
     dark = replace(scene, sh0=scene.sh0 - 1)
     quick = {"compact": {**QUICK, "max_compactions": 1}, "finetune": {"steps": 20, "view_size": 40}}
     settings = Settings.research("balanced", **quick, **FEW_VIEWS, max_psnr_drop=0.1)
-    views = photographs(scene, tmp_path)
-
-    def count_points(stage, fraction, note=""):
-        points.extend([stage] if (stage, fraction) == ("score", 1.0) else [])
-
-    found = kissgs.compress(dark, settings=settings, views=views, progress=count_points)
+    found = kissgs.compress(dark, settings=settings, views=photographs(scene, tmp_path))
     *_, met, missed = found.report.compaction.trials
     assert met.drop <= 0.1 < missed.drop
     assert [trial.count for trial in found.report.trials] == [met.count]
     assert met.count < 300 / 4
-
-    last = len(points)
-    points.clear()
-
-    def stop_at_the_last_point(stage, fraction, note=""):
-        count_points(stage, fraction)
-        if stage == "sparsify" and len(points) == last:
-            points.append(stage)
-            raise kissgs.StopSearch
-
-    stopped = kissgs.compress(dark, settings=settings, views=views, progress=stop_at_the_last_point)
-    assert stopped.report.compaction.count < 300 / 4
-    assert min(trial.bytes for trial in stopped.report.trials if trial.drop <= 0.1) == len(stopped.to_zip())
 
 
 @pytest.mark.quick(0)

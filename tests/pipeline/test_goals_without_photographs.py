@@ -118,7 +118,7 @@ def test_ctrl_c_keeps_the_container_of_the_encoder():
 @pytest.mark.parametrize(
     "goal", [{"max_psnr_drop": 1.0}, {"max_ssim_drop": 0.05}, {"target_size": "6kB"}, {"psnr": 20.0}]
 )
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_few_gaussians(count, goal):
     few = SMALL.select(np.arange(count))
     found = kissgs.compress(few, settings=settings(steps=3, **goal))

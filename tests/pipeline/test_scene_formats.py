@@ -224,7 +224,7 @@ READING = {
 
 @pytest.mark.parametrize("kind", STREAMED)
 @pytest.mark.parametrize("command", READING)
-@pytest.mark.quick(3)
+@pytest.mark.quick(2)
 def test_every_command_that_reads_scenes_has_the_options_for_it(command, kind, tmp_path):
     """A limit that the coarse level meets and the finest does not: the level is chosen, and the limit is heeded."""
     packed = tmp_path / "lod.zip"

@@ -3,12 +3,13 @@
 import json
 
 import pytest
-from helpers.page_server import serving
+from helpers.page_server import serving, with_view
 from helpers.preview_browser import colours, preview, psnr, software_browser  # noqa: F401  fixtures
 
 import kissgs
 from kissgs.preview import PageScene, page_scene, standalone_page
 
+VIEW = {"eye": [0.0, -15.0, -60.0], "target": [0.0, 0.0, 0.0], "up": [0.0, -1.0, 0.0], "fov": 50.0}
 NAME = "a 'b' <i>&amp; 100%41 \N{SNOWMAN}"
 
 
@@ -16,7 +17,12 @@ NAME = "a 'b' <i>&amp; 100%41 \N{SNOWMAN}"
 def container():
     """Container with more pixels per image than the page decodes without a worker."""
     scene = kissgs.sample_scene(17_000, sh_degree=1)
-    return kissgs.compress(scene, settings=kissgs.Settings(preset="fast")).to_zip()
+    return with_view(kissgs.compress(scene, settings=kissgs.Settings(preset="fast")).to_zip(), VIEW)
+
+
+@pytest.fixture(autouse=True)
+def same_view(monkeypatch):
+    monkeypatch.setattr("kissgs.preview.first_view_of", lambda *_: VIEW)
 
 
 @pytest.fixture
@@ -77,7 +83,7 @@ def test_served_and_from_disk(tmp_path, container, shown, preview):  # noqa: F81
 @pytest.mark.quick(0)
 def test_a_sog(tmp_path, shown, preview):  # noqa: F811
     scene, fast = kissgs.sample_scene(2000, sh_degree=3), kissgs.Settings(preset="fast")
-    sog = kissgs.compress(scene, container="sog", settings=fast).to_zip()
+    sog = with_view(kissgs.compress(scene, container="sog", settings=fast).to_zip(), VIEW)
     splats = kissgs.decompress(sog)
     kissgs.save(splats, tmp_path / "scene.ply")
     read = shown(page_scene(tmp_path / "scene.ply"), len(splats))

@@ -108,9 +108,7 @@ def test_on_a_grid_it_is_the_same_number_of_spacings_at_any_scale(spacing):
     scene = sample_scene(4096)
     grid = np.stack(np.meshgrid(np.arange(64), np.arange(64), [0], indexing="ij"), axis=-1).reshape(-1, 3)
     flat = replace(
-        scene,
-        means=(grid * spacing).astype(np.float32),
-        scales=np.full((4096, 3), np.log(0.1 * spacing), np.float32),
+        scene, means=(grid * spacing).astype(np.float32), scales=np.full((4096, 3), np.log(0.1 * spacing), np.float32)
     )
     found = local_scale(flat) / spacing
     assert 5 < np.median(found) < 14, "128 neighbours fill a disc of 6.4 spacings; in a corner more than twice as far"

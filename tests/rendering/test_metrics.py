@@ -55,8 +55,7 @@ def image_pair(height, width, seed=0):
 
 
 @pytest.mark.parametrize(
-    ("height", "width"),
-    [(1, 1), (1, 2), (3, 5), (11, 11), (12, 40), (131, 3), (2, 163), (130, 161), (1, 700)],
+    ("height", "width"), [(1, 1), (1, 2), (3, 5), (11, 11), (12, 40), (131, 3), (2, 163), (130, 161), (1, 700)]
 )
 def test_ssim_is_that_of_the_textbook(height, width):
     """Smaller than the window, and with one or several tiles in either direction."""

@@ -410,16 +410,16 @@ def test_sensitivity_cameras_of_a_capture_are_its_training_cameras_and_some_arou
     splats = clean(blobs(300, seed=2))[0]
     views = [kissgs.View(f"{n}", camera(120, 80, seed=n)) for n in range(9)]
     capture = kissgs.Views(tuple(views[1:]), tuple(views[:1]), BACKGROUND, "a capture")
-    found = sensitivity_cameras(splats, capture, count=4, size=60)
+    found, _ = sensitivity_cameras(splats, capture, count=4, size=60)
     assert [(c.width, c.height) for c in found.cameras[:4]] == [(60, 40)] * 4
     given = [view.camera.position.tolist() for view in views[1:]]
     assert [given.index(c.position.tolist()) for c in found.cameras[:4]] == [0, 2, 4, 7]
     np.testing.assert_allclose([c.dilation for c in found.cameras], [0.3 / 4] * 4 + [0.3] * len(found.cameras[4:]))
     np.testing.assert_allclose(sum(found.weights[4:]), 0.3 * 4)
     assert found.background is BACKGROUND
-    virtual = sensitivity_cameras(splats, None, count=4, size=60)
+    virtual, _ = sensitivity_cameras(splats, None, count=4, size=60)
     assert len(virtual.cameras) == 4
-    assert sensitivity_cameras(splats, capture, count=4, size=500).cameras[0].width == 120
+    assert sensitivity_cameras(splats, capture, count=4, size=500)[0].cameras[0].width == 120
 
 
 @pytest.mark.parametrize("name", ["mean_harmonics", "higher_harmonics"])

@@ -12,18 +12,33 @@ import { viewOf } from "./coverage.js";
 const FLIP = new Matrix4().makeScale(1, -1, -1);
 
 /**
- * Move a camera so that the whole extent is visible, from the front and slightly from above.
+ * Move a camera to a view of the scene; return what it then turns about.
  * @param {import("three").PerspectiveCamera} camera
- * @param {number} radius of the scene around the origin
+ * @param {import("./view.js").View} view
+ * @param {number[]} centre of the scene, which is the origin of the viewer
  */
-export function lookAtAll(camera, radius) {
-  const half = Math.atan(Math.min(1, camera.aspect) * Math.tan((camera.fov * Math.PI) / 360)); // the narrower angle
-  const distance = radius / Math.sin(half);
-  camera.up.set(0, 1, 0);
-  camera.position.copy(new Vector3(0, 0.25, 1).setLength(distance));
-  camera.near = radius / 500;
-  camera.far = radius * 1e5;
-  camera.lookAt(0, 0, 0);
+export function openAt(camera, { eye, target, up, fov }, centre) {
+  const [position, middle] = [eye, target].map((point) =>
+    new Vector3(...point).sub(new Vector3(...centre)).applyMatrix4(FLIP),
+  );
+  camera.up.set(up[0], -up[1], -up[2]);
+  camera.position.copy(position);
+  const distance = position.distanceTo(middle);
+  [camera.near, camera.far] = [distance / 1000, distance * 1e5];
+  camera.lookAt(middle);
+  setAngle(camera, fov);
+  return middle;
+}
+
+/**
+ * Set the angle of view along the shorter side of the image, without what buttons cover.
+ * @param {import("three").PerspectiveCamera} camera
+ * @param {number} fov degrees
+ */
+export function setAngle(camera, fov) {
+  const { fullHeight: height, offsetY } = camera.view ?? { fullHeight: 1, offsetY: 0 };
+  const slope = Math.tan((fov * Math.PI) / 360) / Math.min(1 - (2 * offsetY) / height, camera.aspect);
+  camera.fov = (360 / Math.PI) * Math.atan(slope);
   camera.updateProjectionMatrix();
 }
 

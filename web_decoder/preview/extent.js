@@ -15,7 +15,11 @@ const [NEAR, REACH] = [0.4, 2.5];
 /** Length of the mean direction from which far Gaussians do not surround a scene. Half a sphere has 0.5. */
 const ONE_SIDED = 0.7;
 
-/** @typedef {{centre: number[], radius: number}} Extent */
+/**
+ * @typedef {{centre: number[], radius: number}} Extent
+ * @typedef {[count: number, mean: (index: number) => ArrayLike<number>, weight: (index: number) => number]} Gaussians
+ *   their number, positions and opacities
+ */
 
 /**
  * Return the opacity-weighted median of a scene, and the radius that contains most of it, without outliers; 1 for a
@@ -76,13 +80,15 @@ function surrounds(offsets, distances, weights, radius) {
   return Math.hypot(...sums) < ONE_SIDED * total;
 }
 
+/** @type {(scene: import("./scene.js").Scene) => Gaussians} */
+export const gaussiansOf = ({ count, means, opacities }) => [
+  count,
+  (i) => means.subarray(3 * i, 3 * i + 3),
+  (i) => sigmoid(opacities[i]),
+];
+
 /** @param {import("./scene.js").Scene} scene */
-export const extentOfScene = ({ count, means, opacities }) =>
-  extentOf(
-    count,
-    (i) => means.subarray(3 * i, 3 * i + 3),
-    (i) => sigmoid(opacities[i]),
-  );
+export const extentOfScene = (scene) => extentOf(...gaussiansOf(scene));
 
 /**
  * Return the extent of a streamed scene by the Gaussians of its coarsest level, each of which stands for several; null
@@ -131,35 +137,39 @@ export const extentOfBoxes = (boxes, weights) =>
   );
 
 /**
- * Return the extent of a mesh, with y down and z ahead.
+ * Return the Gaussians of a mesh, with y down and z ahead.
  * @param {import("@sparkjsdev/spark").SplatMesh} mesh
  * @param {boolean} up whether y points up and z back in the mesh
+ * @returns {Gaussians}
  */
-export function extentOfMesh(mesh, up) {
+export function gaussiansOfMesh(mesh, up) {
   const sign = up ? -1 : 1;
   const [means, weights] = [new Float32Array(3 * mesh.numSplats), new Float32Array(mesh.numSplats)];
   mesh.forEachSplat((index, centre, _scales, _rotation, opacity) => {
     means.set([centre.x, sign * centre.y, sign * centre.z], 3 * index);
     weights[index] = opacity;
   });
-  return extentOf(
-    mesh.numSplats,
-    (i) => means.subarray(3 * i, 3 * i + 3),
-    (i) => weights[i],
-  );
+  return [mesh.numSplats, (i) => means.subarray(3 * i, 3 * i + 3), (i) => weights[i]];
 }
 
+/** @type {(values: number[], weights: number[], share: number) => number} */
+const quantile = (values, weights, share) => quantiles(values, weights, [share])[0];
+
 /**
+ * Return the values at which ascending shares of the weight are reached; 0 without values.
  * @param {number[]} values
  * @param {number[]} weights
- * @param {number} share
+ * @param {number[]} shares
  */
-function quantile(values, weights, share) {
+export function quantiles(values, weights, shares) {
   const order = values.map((_, i) => i).sort((a, b) => values[a] - values[b]);
-  let left = share * weights.reduce((sum, weight) => sum + weight, 0);
-  for (const i of order) {
-    left -= weights[i];
-    if (left <= 0) return values[i];
-  }
-  return values[order.at(-1) ?? 0] ?? 0;
+  const total = weights.reduce((sum, weight) => sum + weight, 0);
+  let [at, left] = [-1, 0];
+  return shares.map((share) => {
+    left += share * total;
+    while (at < order.length - 1 && (at < 0 || left > 0)) left -= weights[order[++at]];
+    const value = values[order[at]] ?? 0;
+    left -= share * total;
+    return value;
+  });
 }

@@ -1,5 +1,7 @@
 /** The files of single scenes that Spark reads: all other files are containers, which this project decodes. */
 
+import { checkedView } from "./view.js";
+
 /** @typedef {"ply" | "spz" | "splat" | "ksplat"} FileType */
 
 /** Types by Spark's names of them, which are the endings too. @type {FileType[]} */
@@ -28,18 +30,34 @@ const SPZ_FLAGS = 14;
  * @param {Uint8Array} bytes
  */
 export async function isMarked(type, bytes) {
-  if (type === "ply") return isMarkedPly(new TextDecoder("latin1").decode(bytes.subarray(0, MAX_HEADER_BYTES)));
+  if (type === "ply") return isMarkedPly(headerOf(bytes));
   return type === "spz" && ((await startOf(bytes))[SPZ_FLAGS] & 1) === 1;
 }
 
-/** Whether the last comment that says whether the scene is antialiased says so. @param {string} text */
-function isMarkedPly(text) {
-  const end = text.search(/^end_header/m);
-  const comments = text.slice(0, Math.max(end, 0)).split(/\r?\n/);
+/** Whether the last comment that says whether the scene is antialiased says so. @param {string} header */
+function isMarkedPly(header) {
+  const comments = header.split(/\r?\n/);
   const found = comments.map((line) => line.match(MARK)).findLast((match) => match !== null);
   if (!found) return false;
   const [, mode, flag = "yes"] = found;
   return mode ? /^(mip|mip-splatting|antialiased)$/i.test(mode) : /^(1|1\.0|true|yes|on|enabled)$/i.test(flag);
+}
+
+/** Return the view that a comment of a `.ply` records, or null. @param {FileType} type @param {Uint8Array} bytes */
+export function viewInFile(type, bytes) {
+  if (type !== "ply") return null;
+  const [, text] = headerOf(bytes).match(/^comment kissgs view (\{.*\})\s*$/m) ?? [];
+  try {
+    return text ? checkedView(JSON.parse(text)) : null;
+  } catch {
+    return null;
+  }
+}
+
+/** Return the header of a `.ply`, or nothing if it does not end. @param {Uint8Array} bytes */
+function headerOf(bytes) {
+  const text = new TextDecoder("latin1").decode(bytes.subarray(0, MAX_HEADER_BYTES));
+  return text.slice(0, Math.max(text.search(/^end_header/m), 0));
 }
 
 /** Return the first bytes of a `.spz`, which is gzip up to version 3. @param {Uint8Array} bytes */

@@ -2,6 +2,7 @@
 
 import { parseMeta } from "../container.js";
 import { UserError } from "./problem.js";
+import { checkedView } from "./view.js";
 
 /** @typedef {import("./choice.js").Level} Level */
 
@@ -13,6 +14,7 @@ import { UserError } from "./problem.js";
  * @property {number | null} environment index of the file that is drawn always
  * @property {(import("./coverage.js").Box & {levels: Level[]})[]} leaves levels: the coarsest first
  * @property {number} count Gaussians of the finest level of all leaves
+ * @property {import("./view.js").View | null} view the recorded one
  */
 
 const MAX_LEVELS = 64;
@@ -71,6 +73,7 @@ export function parseTree(json) {
   if (!filled.length) fail("it has no leaves");
   return {
     ...{ levels, files, rows, leaves: filled },
+    view: checkedView(document.kissgs?.view),
     environment: (environment ?? null) ? files.length - 1 : null,
     count: filled.reduce((sum, leaf) => sum + leaf.levels[leaf.levels.length - 1].count, 0),
   };

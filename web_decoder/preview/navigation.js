@@ -1,10 +1,10 @@
 /** Camera movement: mouse and touch by OrbitControls of three.js, keys here. */
 
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { Spherical, Vector3 } from "three";
+import { Quaternion, Spherical, Vector3 } from "three";
 
 const TURN_SPEED = 1.4; // radians per second
-const FLY_SPEED = 0.7; // scene radii per second
+const FLY_SPEED = 0.4; // distances of the first view per second
 const ZOOM_SPEED = 2.2; // factor of distance per second
 const FIRST_STEP = 1 / 20; // seconds of movement by a tap on a key
 
@@ -18,19 +18,17 @@ const ZOOMS = { "+": 1, "=": 1, "-": -1, _: -1 };
 /** @param {import("./viewer.js").Viewer} viewer */
 export function navigation(viewer) {
   const { camera, canvas } = viewer;
-  const controls = new OrbitControls(camera, canvas);
+  let controls = new OrbitControls(camera, canvas);
+  let distance = 1; // of the first view, which tells the size of what is seen
   /** @type {Set<string>} */
   const held = new Set();
   let [moved, last, frame] = [false, 0, 0];
-  controls.addEventListener("start", () => (moved = true));
-  controls.addEventListener("change", () => viewer.invalidate());
   canvas.addEventListener("wheel", () => (moved = true), { passive: true });
 
   /** @param {number} seconds */
   function step(seconds) {
-    const radius = viewer.extent.radius;
     for (const key of held) {
-      if (key in FLIGHTS) fly(new Vector3(...FLIGHTS[key]).multiplyScalar(FLY_SPEED * radius * seconds));
+      if (key in FLIGHTS) fly(new Vector3(...FLIGHTS[key]).multiplyScalar(FLY_SPEED * distance * seconds));
       else if (key in TURNS) turn(TURNS[key].map((direction) => direction * TURN_SPEED * seconds));
       else zoom(ZOOM_SPEED ** (-ZOOMS[key] * seconds));
     }
@@ -47,10 +45,13 @@ export function navigation(viewer) {
 
   /** @param {number[]} angles */
   function turn([around, over]) {
-    const position = new Spherical().setFromVector3(camera.position.clone().sub(controls.target));
+    const upright = new Quaternion().setFromUnitVectors(camera.up, new Vector3(0, 1, 0));
+    const offset = camera.position.clone().sub(controls.target).applyQuaternion(upright);
+    const position = new Spherical().setFromVector3(offset);
     position.theta += around;
     position.phi += over;
-    camera.position.setFromSpherical(position.makeSafe()).add(controls.target);
+    offset.setFromSpherical(position.makeSafe()).applyQuaternion(upright.invert());
+    camera.position.copy(offset.add(controls.target));
   }
 
   /** @param {number} factor */
@@ -79,9 +80,14 @@ export function navigation(viewer) {
     home() {
       release();
       moved = false;
-      viewer.lookAtAll();
-      controls.target.set(0, 0, 0);
-      controls.minDistance = viewer.extent.radius / 200;
+      const target = viewer.home();
+      controls.dispose();
+      controls = new OrbitControls(camera, canvas); // which keeps the direction of up that the camera has now
+      controls.addEventListener("start", () => (moved = true));
+      controls.addEventListener("change", () => viewer.invalidate());
+      controls.target.copy(target);
+      distance = camera.position.distanceTo(target);
+      controls.minDistance = distance / 500;
       controls.update();
     },
     /**

@@ -6,6 +6,8 @@ import { UserError } from "./problem.js";
 /** @typedef {import("./scene.js").Scene} Scene */
 
 const BACKGROUNDS = { dark: "#0b0a10", white: "#ffffff" };
+/** Longest wait for the first image, milliseconds. */
+const LONGEST_WAIT = 10_000;
 const MAX_PIXEL_RATIO = 2; // a higher one costs much and is hardly visible
 
 const LOST = "The graphics driver has reset, so the rendering is gone; reload the page to draw it again.";
@@ -52,7 +54,9 @@ export function stage(failed) {
   function fit() {
     const { clientWidth: width, clientHeight: height } = container;
     if (!width || !height || canvas.hidden) return;
-    for (const viewer of viewers()) viewer.resize(width, height, Math.min(MAX_PIXEL_RATIO, devicePixelRatio));
+    const covered = container.getBoundingClientRect().bottom - byId("tools").getBoundingClientRect().top;
+    const ratio = Math.min(MAX_PIXEL_RATIO, devicePixelRatio);
+    for (const viewer of viewers()) viewer.resize(width, height, ratio, Math.min(Math.max(covered, 0), height / 3));
     if (!live?.camera.moved) live?.camera.home();
   }
 
@@ -120,12 +124,13 @@ export function stage(failed) {
      * Begin a scene that the caller draws in parts, and return the viewer.
      * @param {import("./extent.js").Extent} extent
      * @param {() => void} ended called when another scene is shown, or none
+     * @param {import("./view.js").View | null} first the recorded view
      */
-    async stream(extent, ended) {
+    async stream(extent, ended, first) {
       const { viewer } = await ready;
       endFormer();
       endStream = ended;
-      viewer.setExtent(extent);
+      viewer.setExtent(extent, first);
       reveal(true);
       return viewer;
     },
@@ -144,6 +149,14 @@ export function stage(failed) {
       paint();
     },
     endComparison,
+    /** Wait until the scene is in the image, or cannot be soon. */
+    async drawn() {
+      for (const end = performance.now() + LONGEST_WAIT; performance.now() < end;) {
+        await new Promise((resolve) => setTimeout(resolve, 20));
+        if (failure) return;
+        if (live?.viewer.hasDrawn) return live.viewer.finished();
+      }
+    },
     /** Show nothing until the next scene. */
     conceal() {
       endFormer();

@@ -76,7 +76,7 @@ export async function openStreamed(address, load, view) {
     failed: lose,
   });
   const weights = tree.leaves.map((leaf) => leaf.levels.at(-1)?.count ?? 0);
-  const viewer = await view.stream(extentOfBoxes(tree.leaves, weights), close);
+  const viewer = await view.stream(extentOfBoxes(tree.leaves, weights), close, tree.view);
 
   let interval = INTERVAL;
   function soon(wait = interval) {

@@ -2,15 +2,16 @@
 
 import * as THREE from "three";
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
-import { lookAtAll, setPinhole, sightOf } from "./camera.js";
+import { openAt, setAngle, setPinhole, sightOf } from "./camera.js";
 import { CLASSIC, WIDE_RANGES, dilation, drawFromOutside } from "./classic.js";
-import { isMarked, pointsUp } from "./file_types.js";
-import { extentOfMesh, extentOfScene } from "./extent.js";
+import { extentOf, extentOfScene, gaussiansOf, gaussiansOfMesh } from "./extent.js";
+import { isMarked, pointsUp, viewInFile } from "./file_types.js";
 import { marker } from "./marker.js";
 import { pack } from "./pack.js";
 import { readPixels } from "./pixels.js";
 import { isAntialiased, originOf } from "./scene.js";
 import { meshOf } from "./streamed_meshes.js";
+import { checkedView, viewOfDense, viewOfExtent } from "./view.js";
 
 /**
  * @typedef {import("./scene.js").Scene} Scene
@@ -32,8 +33,13 @@ export class Viewer {
   #placed = false;
   /** @type {Extent} */
   #extent = { centre: [0, 0, 0], radius: 1 };
+  /** The view that home() returns to. */
+  #view = viewOfExtent(this.#extent);
   /** @type {import("./pack.js").Encoding} */
   #encoding = WIDE_RANGES;
+  /** Whether a scene that is drawn in parts has a recorded view. */
+  #recorded = false;
+  #filled = false;
   #requested = 0;
   #disposed = false;
 
@@ -87,6 +93,7 @@ export class Viewer {
     if (scene !== this.#shown || !this.#placed) {
       const extent = extentOfScene(scene);
       this.#extent = held && scene === this.#shown ? { ...extent, centre: this.#extent.centre } : extent;
+      this.#view = checkedView(scene.meta?.kissgs?.view) ?? viewOfDense(...gaussiansOf(scene));
     }
     [this.#shown, this.#placed] = [scene, placed];
     const spacing = this.#extent.radius / Math.cbrt(scene.count);
@@ -107,12 +114,14 @@ export class Viewer {
   async setFile(type, bytes, beside) {
     const splatEncoding = beside?.encoding ?? WIDE_RANGES;
     const fileType = /** @type {SplatFileType} */ (type); // its values are these names
-    const marked = await isMarked(type, bytes); // the mesh may take the bytes away
+    const [marked, view] = [await isMarked(type, bytes), viewInFile(type, bytes)]; // the mesh may take the bytes away
     const mesh = new SplatMesh({ fileBytes: bytes, fileType, splatEncoding });
     await mesh.initialized;
     this.#shown = null;
     this.antialiased = marked;
-    this.#extent = beside?.extent ?? extentOfMesh(mesh, pointsUp(type));
+    const gaussians = gaussiansOfMesh(mesh, pointsUp(type));
+    this.#extent = beside?.extent ?? extentOf(...gaussians);
+    this.#view = view ?? viewOfDense(...gaussians);
     const [x, y, z] = this.#extent.centre.map((value, axis) => value + (beside?.origin[axis] ?? 0));
     mesh.position.set(-x, y, z);
     this.#replace(mesh, pointsUp(type));
@@ -122,10 +131,13 @@ export class Viewer {
   /**
    * Begin a scene that will be drawn in parts, and has none yet.
    * @param {Extent} extent
+   * @param {import("./view.js").View | null} [view] the recorded one
    */
-  setExtent(extent) {
+  setExtent(extent, view = null) {
     this.#shown = null;
     this.#extent = extent;
+    this.#view = view ?? viewOfExtent(extent);
+    this.#recorded = view !== null;
     this.setParts(new Map([...this.#meshes.keys()].map((key) => [key, null])));
   }
 
@@ -137,6 +149,7 @@ export class Viewer {
   refineExtent({ centre, radius }, held) {
     const former = this.#extent.centre;
     this.#extent = { centre: held ? former : centre, radius };
+    if (!this.#recorded) this.#view = viewOfExtent({ centre, radius });
     const [x, y, z] = former.map((value, axis) => value - this.#extent.centre[axis]);
     for (const mesh of this.#meshes.values()) mesh.position.add(new THREE.Vector3(x, -y, -z));
     this.invalidate();
@@ -178,10 +191,10 @@ export class Viewer {
     this.#scene.add(mesh);
   }
 
-  /** Move the camera so that the whole scene is visible. */
-  lookAtAll() {
-    lookAtAll(this.camera, this.#extent.radius);
+  /** Move the camera to the view that the scene opens with; return what it then turns about. */
+  home() {
     this.invalidate();
+    return openAt(this.camera, this.#view, this.#extent.centre);
   }
 
   /** @param {Pinhole} pinhole */
@@ -201,12 +214,14 @@ export class Viewer {
    * @param {number} width CSS pixels
    * @param {number} height
    * @param {number} ratio pixels per CSS pixel
+   * @param {number} covered CSS pixels at the bottom that the scene is not centred in, since buttons are over them
    */
-  resize(width, height, ratio) {
+  resize(width, height, ratio, covered) {
     this.#renderer.setPixelRatio(ratio);
     this.#renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
-    this.camera.updateProjectionMatrix();
+    this.camera.setViewOffset(width, height, 0, covered / 2, width, height);
+    setAngle(this.camera, this.#view.fov);
     this.#draw(); // at once: a resized canvas is blank until then
   }
 
@@ -221,6 +236,7 @@ export class Viewer {
    * @param {import("./scene.js").Gaussian | null} gaussian
    */
   mark(gaussian) {
+    if (!gaussian && !this.#marker.object.visible) return; // a frame may take seconds
     this.#marker.show(gaussian, this.#extent.centre);
     this.invalidate();
   }
@@ -234,6 +250,7 @@ export class Viewer {
     cancelAnimationFrame(this.#requested);
     this.#requested = 0;
     this.#renderer.render(this.#scene, this.camera);
+    this.#filled = this.#spark.display.numSplats > 0;
     this.afterFrame();
   }
 
@@ -249,7 +266,17 @@ export class Viewer {
 
   /** Whether the latest frame has Gaussians in it: Spark sorts them before it draws them. */
   get hasDrawn() {
-    return this.#spark.display.numSplats > 0;
+    return this.#filled;
+  }
+
+  /** Wait until the graphics driver has drawn all frames until now; software takes seconds for one. */
+  async finished() {
+    const gl = /** @type {WebGL2RenderingContext} */ (this.#renderer.getContext());
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    while (fence && !this.#disposed && gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.UNSIGNALED)
+      await new Promise((resolve) => setTimeout(resolve, 10));
+    gl.deleteSync(fence);
   }
 
   async #sorted() {

@@ -65,9 +65,7 @@ MAX_SIDE = 1_000_000  # maximum side of a photograph, pixels; the largest stitch
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
     """Intrinsics from a camera file; lengths in pixels of a photograph of ``width`` x ``height``, angles in radians.
-
-    Defaults: the size of the photograph; the angle of view or the other focal length; the centre of the image.
-    """
+    Defaults: the size of the photograph; the angle of view or the other focal length; the centre of the image."""
 
     width: int | None = None
     height: int | None = None
@@ -150,13 +148,11 @@ class _SearchFolder:
 def find_photos(
     names: Sequence[str], root: Path, *, scale: int | None = None, images: Path | None = None
 ) -> tuple[FoundPhoto, ...] | None:
-    """Find the file of each photograph, in order; None if there is no folder of photographs.
-
-    The default is the full-size folder, else that of scale 4, at which the protocol of 3DGS trains outdoor scenes, else
-    the largest; ``input`` if there is no ``images`` of any scale. If no file has the exact name, one with another
-    Unicode form, extension or case is accepted; a folder may have another Unicode form, too. An absolute path that does
-    not exist is searched for in the capture's folder.
-    """
+    """Find the file of each photograph, in order; None if there is no folder of photographs. The default is the
+    full-size folder, else that of scale 4, at which the protocol of 3DGS trains outdoor scenes, else the largest;
+    ``input`` if there is no ``images`` of any scale. If no file has the exact name, one with another Unicode form,
+    extension or case is accepted; a folder may have another Unicode form, too. An absolute path that does not exist is
+    searched for in the capture's folder."""
     if images is not None and scale is not None:
         raise InvalidViewsError("--images and --scale exclude each other; give only one of them")
     listing = _FolderListing()
@@ -237,10 +233,8 @@ class _FolderListing:
         return self._folders[folder]
 
     def variants(self, folder: Path) -> dict[int, Path]:
-        """Return the existing ones of ``folder`` and its scaled copies, by scale.
-
-        If there is no ``images`` of any scale, ``input`` takes its place with scale 1.
-        """
+        """Return the existing ones of ``folder`` and its scaled copies, by scale. If there is no ``images`` of any
+        scale, ``input`` takes its place with scale 1."""
         if folder not in self._variants:
             whole = self.spelled(folder)
             found = {1: whole} if _is_folder(whole) else {}

@@ -71,7 +71,10 @@ class _TrainerCamera(BaseModel):
 
 def read_cameras(path: Path) -> tuple[View, ...]:
     """Read the cameras of a file, in its order; a camera without a name is named after the file."""
-    document = _parse(path)
+    try:
+        document: object = json.loads(read_json(path))
+    except (ValueError, RecursionError) as error:
+        raise InvalidViewsError(f"{path} is not JSON: {str(error).lower()}") from error
     if not isinstance(document, list):
         return (_view(document, f"{path}", path.stem),)
     if not document:
@@ -91,13 +94,6 @@ def write_camera(path: Path, camera: Camera, *, overwrite: bool = False) -> None
     entries = (f'  "{name}": {json.dumps(value)}' for name, value in camera_as_dict(camera).items())
     with atomic_file(path, overwrite=overwrite) as file:
         file.write(("{\n" + ",\n".join(entries) + "\n}\n").encode())
-
-
-def _parse(path: Path) -> object:
-    try:
-        return json.loads(read_json(path))
-    except (ValueError, RecursionError) as error:
-        raise InvalidViewsError(f"{path} is not JSON: {str(error).lower()}") from error
 
 
 def _view(entry: object, where: str, name: str) -> View:
@@ -167,18 +163,15 @@ def pick_view(views: Sequence[View], which: str, source: str) -> View:
             raise InvalidViewsError(f"there is no view {which} in {source}; numbers go from 0 to {len(views) - 1}")
         return views[int(which)]
     if not found:
-        found = [view for view in views if composed(which) in _names(view)]
+        paths = [PurePosixPath(composed(view.name)) for view in views]
+        names = [(str(path), path.name, path.stem) for path in paths]
+        found = [view for view, known in zip(views, names, strict=True) if composed(which) in known]
     if len(found) == 1:
         return found[0]
     if found:
         raise InvalidViewsError(f"{len(found)} views in {source} have the name {quoted(which)}; give the number of one")
     first, last = views[0].name, views[-1].name
     raise InvalidViewsError(f"there is no view {quoted(which)} in {source}; the first is {first}, the last {last}")
-
-
-def _names(view: View) -> tuple[str, str, str]:
-    path = PurePosixPath(composed(view.name))
-    return str(path), path.name, path.stem
 
 
 def _split(which: str) -> tuple[str, str] | None:
@@ -247,12 +240,10 @@ class _DataparserTransforms(BaseModel):
 
 
 def read_transforms(path: Path) -> Capture:
-    """Read a ``transforms.json`` with the split that it defines, if any.
-
-    nerfstudio's ``train_filenames`` are for training, and ``test_filenames`` (``val_filenames`` if that is empty) are
-    held out. If there is only one of these lists, all other frames are in the other part. If there are both, frames in
-    neither are left out, and frames in both are held out.
-    """
+    """Read a ``transforms.json`` with the split that it defines, if any. nerfstudio's ``train_filenames`` are for
+    training, and ``test_filenames`` (``val_filenames`` if that is empty) are held out. If there is only one of these
+    lists, all other frames are in the other part. If there are both, frames in neither are left out, and frames in both
+    are held out."""
     document = _read(path, _Transforms)
     images = _posed_images(path, document)
     splits = _splits(path, document)
@@ -276,10 +267,8 @@ def read_split_transforms(folder: Path) -> Capture:
 
 
 def similarities(folders: Iterable[Path], applied: Float64[np.ndarray, "4 4"] | None) -> tuple[Similarity, ...]:
-    """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have.
-
-    The first of ``folders`` that has a ``dataparser_transforms.json`` counts.
-    """
+    """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have. The first of
+    ``folders`` that has a ``dataparser_transforms.json`` counts."""
     found = []
     path = next((path for folder in folders if (path := folder / DATAPARSER_TRANSFORMS).is_file()), None)
     if path is not None:

@@ -30,11 +30,9 @@ class SceneBounds:
 
 
 def scene_bounds(splats: Splats, start: tuple[Vec3, float] | None = None) -> SceneBounds:
-    """Estimate centre, radius and up direction of a scene; without any opacity, the unit sphere around the origin.
-
-    A capture has most Gaussians where its photographs point. The centre is a mode of that density, by opacity, found by
-    mean shift from the weighted median of the positions, or from the centre and radius ``start``.
-    """
+    """Estimate centre, radius and up direction of a scene; without any opacity, the unit sphere around the origin. A
+    capture has most Gaussians where its photographs point. The centre is a mode of that density, by opacity, found by
+    mean shift from the weighted median of the positions, or from the centre and radius ``start``."""
     means = splats.means.astype(np.float64)
     weights = opacity(splats)
     if not weights.sum() > 0:
@@ -81,11 +79,10 @@ def weighted_quantiles(
 
 
 def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.ndarray, "N 3"]) -> Vec3:
-    """Return the up direction: the normal of the ground, or the axis that files use if there is no ground.
-
-    The short axes of flat Gaussians are surface normals; most of them near one file axis select that axis. The sign
-    follows from the skew of heights: objects stand on the ground, so that density falls off upwards.
-    """
+    """Return the up direction: the normal of the ground, or the axis that files use if there is no ground. The short
+    axes of flat Gaussians are surface normals; most of them near one file axis select that axis. The sign follows from
+    the skew of heights if there is ground: objects stand on it, so that density falls off upwards. Without ground,
+    density tells nothing: a person has more Gaussians in the face than in the legs."""
     axis = UP_AXES[0]
     if not weights.any():
         return axis
@@ -103,7 +100,9 @@ def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.
     mean = weights @ heights / weights.sum()
     deviation = np.sqrt(weights @ (heights - mean) ** 2 / weights.sum())
     skew = weights @ ((heights - mean) / max(deviation, 1e-30)) ** 3 / weights.sum()
-    return -axis if skew < -0.3 else axis
+    ground = flat_weights * (np.abs(normals @ axis) > np.cos(np.radians(15)))
+    above = ground.sum() > 0.2 * flat_weights.sum() and ground @ heights > mean * ground.sum()
+    return -axis if skew < -0.3 and above else axis
 
 
 def _ground_normal(axis: Vec3, normals: Float64[np.ndarray, "N 3"], weights: Float64[np.ndarray, " N"]) -> Vec3:
@@ -140,7 +139,7 @@ class ViewScorer:
 
     def __init__(self, proxy: Splats, bounds: SceneBounds, pool: Workers, progress: Progress) -> None:
         self.bounds = bounds
-        self._proxy, self._pool, self._progress = proxy, pool, progress
+        self.proxy, self._pool, self._progress = proxy, pool, progress
         self._log_sizes = proxy.scales.max(axis=1)
         self._central = np.linalg.norm(proxy.means - bounds.centre, axis=1) < 2 * bounds.radius
         self._measured = 0
@@ -158,7 +157,7 @@ class ViewScorer:
 
     def _stats(self, camera: Camera) -> ViewStats:
         """Render log size, log depth and centrality as the three colours, so that blending averages what is visible."""
-        proxy = self._proxy
+        proxy = self.proxy
         log_depth = np.log(np.maximum(proxy.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3], 1e-12))
         values = self._log_sizes, log_depth, CENTRE_SCALE * self._central  # colours from 0 to 1 stand for -30 to 30
         colours = np.stack([(np.clip(value / 60 + 0.5, 0, 1) - 0.5) / SH_C0 for value in values], axis=1)
@@ -189,12 +188,9 @@ def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.
 
 
 def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[np.ndarray, " n"]:
-    """Return the view score of each camera, at most 1.
-
-    1 is a sharp image of the scene's centre, without holes and with nothing right in front of the camera. Size and
-    angle of Gaussians are compared with the best tenth of the views that show enough. The image of an object that
-    stands alone need only not be much emptier than the others.
-    """
+    """Return the view score of each camera, at most 1. 1 is a sharp image of the scene's centre, without holes and with
+    nothing right in front of the camera. Size and angle of Gaussians are compared with the best tenth of the views that
+    show enough. The image of an object that stands alone need only not be much emptier than the others."""
     names = ("alpha", "log_size", "log_angle", "near", "centre")
     alpha, log_size, log_angle, near, centre = (np.array([getattr(view, name) for view in stats]) for name in names)
     enough = alpha >= 0.5 * alpha.max()
@@ -260,14 +256,14 @@ def object_cameras(splats: Splats, bounds: SceneBounds, size: tuple[int, int]) -
     means = splats.means.astype(np.float64)
     width, height = size
     for number, direction in enumerate(directions(bounds.up, OBJECT_ELEVATIONS, AZIMUTHS)):
-        camera = _framing_camera(means, weights, bounds, direction, size)
+        camera = framing_camera(means, weights, bounds, direction, size)
         if number % CLOSE_UP_INTERVAL == CLOSE_UP_INTERVAL - 1:
             position = bounds.centre + 0.5 * (camera.position - bounds.centre)
             camera = look_at(position, bounds.centre, bounds.up, fov=FIELD_OF_VIEW, width=width, height=height)
         yield camera
 
 
-def _framing_camera(
+def framing_camera(
     means: Float64[np.ndarray, "N 3"],
     weights: Float64[np.ndarray, " N"],
     bounds: SceneBounds,

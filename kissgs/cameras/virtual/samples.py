@@ -18,6 +18,7 @@ from kissgs.cameras.virtual.candidates import (
     proxy_scene,
     scene_bounds,
 )
+from kissgs.cameras.virtual.first_view import Record, first_view
 from kissgs.cameras.virtual.select import ScoredCandidates, score_candidates, select_diverse, split_views, with_size
 from kissgs.core.array_types import Bool, Float32, Int
 from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress
@@ -61,10 +62,8 @@ class Region:
 def find_regions(
     splats: Splats, size: tuple[int, int], pool: Workers, progress: Progress, *, camera_count: int
 ) -> list[Region]:
-    """Return the regions of a scene, at least one; shares add up to 1.
-
-    ``camera_count`` is the number of cameras that will be selected for the first region, at most.
-    """
+    """Return the regions of a scene, at least one; shares add up to 1. ``camera_count`` is the number of cameras that
+    will be selected for the first region, at most."""
     candidates = score_candidates(splats, size, pool, progress).refined(camera_count)
     proxy = proxy_scene(splats)
     visible, coverage, spacing = drawn_opacities(proxy), Coverage(proxy), local_scale(proxy)
@@ -109,10 +108,8 @@ def _updated_coverage(coverage: Coverage, proxy: Splats, region: Region, pool: W
 
 
 def _densest_part(proxy: Splats, remaining: Int[np.ndarray, " m"], spacing: Float32[np.ndarray, " n"]) -> SceneBounds:
-    """Return the bounds of the part where the Gaussians ``remaining`` are densest.
-
-    Mean shift starts at the 5 % quantile of spacing, because the smallest spacings are often single pairs.
-    """
+    """Return the bounds of the part where the Gaussians ``remaining`` are densest. Mean shift starts at the 5 %
+    quantile of spacing, because the smallest spacings are often single pairs."""
     densest = remaining[np.argsort(spacing[remaining], kind="stable")[len(remaining) // 20]]
     start = proxy.means[densest].astype(np.float64), 4 * float(spacing[densest])
     return scene_bounds(proxy.select(remaining), start)
@@ -150,11 +147,18 @@ def scene_views(splats: Splats, context: Context = DEFAULT_CONTEXT, *, width: in
     """Return views of every region of a scene, more of regions that show more; every 8th is held out."""
     check_images(count, width, height)
     with Workers(context.threads) as pool:
-        regions = find_regions(splats, (width, height), pool, context.progress, camera_count=count)
+        return _scene_views(splats, (width, height), count, pool, context)[0]
+
+
+def _scene_views(
+    splats: Splats, size: tuple[int, int], count: int, pool: Workers, context: Context
+) -> tuple[Views, ScoredCandidates]:
+    """Return :func:`scene_views`, and the candidates of the densest region."""
+    regions = find_regions(splats, size, pool, context.progress, camera_count=count)
     context.progress("cameras", 1.0)
     counts = allocate_cameras(regions, count)
     cameras = [camera for region, n in zip(regions, counts, strict=True) for camera in region.cameras(n)]
-    return split_views(with_size(cameras[:count], width, height))
+    return split_views(with_size(cameras[:count], *size)), regions[0].candidates
 
 
 # Cameras of the sensitivity and of the colour refit: a capture's and some virtual ones, or virtual ones alone.
@@ -175,30 +179,33 @@ def default_view_count(gaussians: int) -> int:
 
 def sensitivity_cameras(
     splats: Splats, views: Views | None, context: Context = DEFAULT_CONTEXT, *, count: int, size: int
-) -> WeightedCameras:
-    """Return the cameras, each with its weight, that measure sensitivity and refit colours.
-
-    Of a capture, at most ``count`` training views are used, and two thirds as many virtual cameras are added; without
-    any, ``count`` are virtual. ``size`` is the longer side of the images, pixels; larger ones are sampled.
-    """
+) -> tuple[WeightedCameras, Record]:
+    """Return the cameras, each with its weight, that measure sensitivity and refit colours; and the first view. Of a
+    capture, at most ``count`` training views are used, and two thirds as many virtual cameras are added; without any,
+    ``count`` are virtual. ``size`` is the longer side of the images, pixels; larger ones are sampled."""
     if views is None or not views.train:
         side = size * 4 // 5
-        virtual = scene_views(splats, context, width=side, height=side, count=count)
+        with Workers(context.threads) as pool:
+            virtual, candidates = _scene_views(splats, (side, side), count, pool, context)
+            opening = first_view(candidates)
         cameras = [view.camera for view in virtual.all]
         for n in range(1, len(cameras), 2):  # a wider field of view
             K = cameras[n].K.copy()
             K[[0, 1], [0, 1]] *= WIDE_FOCAL_SCALE
             cameras[n] = Camera(cameras[n].viewmat, K, cameras[n].width, cameras[n].height)
-        return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
+        return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background), opening
     captured = [view.camera for view in views.train]
     chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
     selected = [captured[n].sampled_at_most(size) for n in chosen]  # virtual cameras see what is between the samples
     side = round(float(np.sqrt(selected[0].width * selected[0].height)))
-    virtual = scene_views(splats, context, width=side, height=side, count=max(1, count * 2 // 3))
+    with Workers(context.threads) as pool:
+        virtual, candidates = _scene_views(splats, (side, side), max(1, count * 2 // 3), pool, context)
+        opening = first_view(candidates, selected)
     weight = VIRTUAL_WEIGHT * len(selected) / len(virtual.all)
     cameras = [*selected, *(view.camera for view in virtual.all)]
     weights = [1.0] * len(selected) + [weight] * len(virtual.all)
-    return WeightedCameras(cameras, weights, views.background, captured=len(selected))
+    weighted = WeightedCameras(cameras, weights, views.background, captured=len(selected))
+    return weighted, opening
 
 
 # Random poses, from where photographs might have been taken, to train or to measure losses with.
@@ -217,11 +224,9 @@ Pose = tuple[Vec3, Vec3]  # position and look-at target, world units
 
 
 def random_poses(splats: Splats, context: Context = DEFAULT_CONTEXT, *, side: int, count: int, seed: int = 0) -> Views:
-    """Return views for square images from random poses around every region of a scene; every 8th is held out.
-
-    The region with the largest share gets ``count`` of them; together there are at most :data:`MAX_COUNT_FACTOR` times
-    as many, and fewer where few poses show the scene.
-    """
+    """Return views for square images from random poses around every region of a scene; every 8th is held out. The
+    region with the largest share gets ``count`` of them; together there are at most :data:`MAX_COUNT_FACTOR` times as
+    many, and fewer where few poses show the scene."""
     check_images(count, side, side)
     rng = np.random.default_rng(seed)
     cameras: list[Camera] = []

@@ -212,11 +212,9 @@ def overview_bonus(radii: float) -> float:
 
 
 def select_diverse(candidates: ScoredCandidates, count: int) -> list[int]:
-    """Return the indices of ``count`` good candidates that are far from each other, in order of azimuth.
-
-    Starting with the best, each further one is the farthest from all that are selected, where distance counts less for
-    lower scores. Of fewer than ``count``, some are returned repeatedly.
-    """
+    """Return the indices of ``count`` good candidates that are far from each other, in order of azimuth. Starting with
+    the best, each further one is the farthest from all that are selected, where distance counts less for lower scores.
+    Of fewer than ``count``, some are returned repeatedly."""
     scores, good = candidates.scores, candidates.good()
     if len(good) < count:
         good = np.argsort(-scores, kind="stable")[:count]
