@@ -176,7 +176,7 @@ def test_damaged_files_are_explained_by_the_reader_of_their_ending(tmp_path):
         "a.glb": "is not readable JSON",
         "a.gltf": "is not readable JSON",
         "a.sog": "is not a readable zip file",
-        "a.splat": "is not a .splat file",
+        "a.splat": "is no .splat file",
         "a.ksplat": "is cut short",
     }.items():
         (tmp_path / name).write_bytes(b"nothing here")
