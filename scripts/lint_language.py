@@ -2,7 +2,7 @@
 """Check the language of code and docs: ``lint_language.py [PATH ...]``, by default every file that git tracks.
 
 Two rules. A docstring opens with a verb or with a noun phrase that stands alone, not with a fragment ("Of the scene",
-"What is left"). Names and sentences use the field's words (docs/glossary.md), not words that only this project knows.
+"What is left"). Names and sentences use the field's words, not words that only this project knows.
 """
 
 import ast
@@ -31,9 +31,9 @@ PRIVATE_WORDS = re.compile(
     r")(?![a-z])",
     re.IGNORECASE,
 )
-"""Words with a plain equivalent in docs/glossary.md; camelCase and snake_case parts count as words."""
+"""Words with a plain equivalent in the field; camelCase and snake_case parts count as words."""
 
-IGNORED = re.compile(r"scripts/lint_language\.py|LICENSE|.*/package-lock\.json|.*constraints.*|docs/glossary\.md")
+IGNORED = re.compile(r"scripts/lint_language\.py|LICENSE|.*/package-lock\.json|.*constraints.*")
 
 
 def main(arguments: list[str]) -> int:

@@ -61,7 +61,7 @@ EXTREMES = [
     Extreme(
         "far-away",
         "a world of 1, 1e6 from the origin",
-        "kept, but float32 has no more than 16 places in 1 there",
+        "kept, with float32's 16 places in 1",
         lambda: changed(means=cloud()["means"] + [1e6, -1e6, 1e6]),
         lambda: seen_from([1e6 + 0.3, -1e6 - 0.4, 1e6 - 3], [1e6, -1e6, 1e6], 0.8),
         bounds={"step": 5e-2},  # positions cannot move, so the next images differ a little
@@ -240,7 +240,7 @@ EXTREMES = [
         Extreme(
             f"degree-{degree}",
             f"SH degree {degree}",
-            "kept, with its degree",
+            KEPT,
             lambda degree=degree: extreme_scenes.cloud(9, degree),
         )
         for degree in (0, 1, 2, 3)
