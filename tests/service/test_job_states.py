@@ -43,7 +43,7 @@ def test_a_long_poll_ends_with_the_job(service):
 
 def test_listing(start):
     service = start()
-    submitted = [service.cancel(service.submit())["id"] for _ in range(3)]
+    submitted = [service.cancel(service.submit(options=SLOW))["id"] for _ in range(3)]
     page = service.http.get("/v1/jobs", params={"limit": 2}).json()
     assert [job["id"] for job in page["jobs"]] == submitted[:0:-1]
     rest = service.http.get("/v1/jobs", params={"limit": 2, "cursor": page["next"]}).json()
