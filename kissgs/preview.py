@@ -22,7 +22,6 @@ from typing import Any
 from urllib.parse import quote, unquote, urlsplit
 
 from kissgs._version import __version__
-from kissgs.cameras.virtual.first_view import first_view_of
 from kissgs.core.context import Context, Progress, silent
 from kissgs.core.errors import InvalidSceneError, KissgsError, UnsupportedError
 from kissgs.core.positions import WORLD
@@ -180,6 +179,8 @@ def page_scene(
     splats, cleaned, _ = open_scene(source, reading, threads, progress)
     found = _as_container(source, reading)
     if found is None:
+        from kissgs.cameras.virtual.first_view import first_view_of  # loads the rasteriser
+
         file = io.BytesIO()
         view = first_view_of(splats, Context(threads, progress=progress))
         comment = "" if view is None else f"comment kissgs view {json.dumps(view)}"

@@ -92,10 +92,15 @@ def status_table(status: Mapping[str, Any], target: str) -> RenderableType:
             psnr=float("inf" if psnr is None else psnr), ssim=evaluation["ssim"], ms_ssim=evaluation["ms_ssim"]
         )
         patches = evaluation.get("detail")  # services of older versions state none
-        detail = "" if patches is None else f"; {detail_text(Detail(**patches), 'renderings')}"
+        detail = "" if patches is None else f"; {detail_text(_detail(patches), 'renderings')}"
         details.append(Text(f"{mean.summary} to the scene's own renderings{detail}"))
     changed = {"invisible": status.get("invisible") or 0, **(status.get("cleaned") or {})}
     return Group(head, *details, parts_table(dict(sorted(sizes["files"].items())), status["kept"]), *_changes(changed))
+
+
+def _detail(patches: Mapping[str, Any]) -> Detail:
+    """Return the figures of a service's JSON, where a failed rendering is the text "NaN"."""
+    return Detail(*(float(patches[name]) for name in ("worst", "worst_percent", "share_below")))
 
 
 def _result(

@@ -81,7 +81,7 @@ class Attempt:
         return f"{self.bytes / 1000:,.0f} kB{quality and f' at {quality}'}"
 
     def quality(self) -> str:
-        """Return the figures of quality in one phrase, empty where the goal is a size."""
+        """Return the figures of quality in one phrase, empty where they are unknown."""
         against = {"photos": " to photographs", "renderings": " by its renderings"}.get(self.against or "", "")
         parts = [
             None if self.psnr is None else f"{self.psnr:.2f} dB",
@@ -137,7 +137,7 @@ class Limit:
             detail = attempt.detail
             return None if detail is None else -(detail.worst if self.name == "patch" else detail.worst_percent)
         figures = {"target_size": attempt.bytes, "psnr": attempt.psnr, "max_psnr_drop": attempt.drop}
-        return figures.get(self.name, attempt.ssim_drop)
+        return {**figures, "max_ssim_drop": attempt.ssim_drop}[self.name]
 
     def loss(self, attempt: Attempt, digits: Callable[[float], str] | None = None) -> str:
         """Return what is limited of an attempt in words, such as "0.003 of SSIM"; empty for bytes and a PSNR."""
@@ -212,7 +212,7 @@ class Goal:
 
     @property
     def by_size(self) -> bool:
-        """Whether the goal is a size, so that no rendering is needed to evaluate it."""
+        """Whether the goal is a size, so that a search needs no renderings."""
         return self.limits[0].name == "target_size"
 
     @property

@@ -16,7 +16,7 @@ from kissgs.compaction.popspa import PathPoint, Popspa, TrainingPath
 from kissgs.compaction.result import Compacted, CountTrial
 from kissgs.compaction.search_evaluation import SearchEvaluation
 from kissgs.core.context import Context, SearchNote, ignore_stop_search
-from kissgs.core.errors import StopSearch, UnsupportedError
+from kissgs.core.errors import InvalidViewsError, StopSearch, UnsupportedError
 from kissgs.core.splats import Splats
 from kissgs.evaluation.results import ESTIMATED_DROP, Evaluation, drop_of
 from kissgs.finetuning.result import FinetuneReport
@@ -193,8 +193,8 @@ class Search:
             self.best = self.closest
         if self.best is None or self.best.bytes > (self.goal.most_bytes or math.inf):
             raise UnsupportedError(self._failure())
-        evaluates = self.goal.by_size and self.work.time is None and not self.stopped
-        return self._evaluated(self.best) if evaluates else self.best
+        compares = self.goal.by_size and self.work.time is None and not self.stopped
+        return self._compared(self.best) if compares else self.best
 
     # The searches: all Gaussians, fewer of them trained on photographs, and fewer without photographs.
 
@@ -510,15 +510,23 @@ class Search:
             self.work.context.progress("evaluate", 0.0)
         except StopSearch:
             self.stopped = True
-        most, threads = ReadOptions.allowing(len(self.work.original)), self.work.context.threads
-        return self.compare(read_scene(made.encoded.files, most, threads=threads), Context(threads))
+        return self.compare(self._decoded(made), Context(self.work.context.threads))
 
-    def _evaluated(self, best: Attempt) -> Attempt:
-        """Return the best container of a size, which need not have been compared, with what it loses."""
-        evaluated = best.with_evaluation(self._evaluate(best.made))
+    def _decoded(self, made: Container) -> Splats:
+        most = ReadOptions.allowing(len(self.work.original))
+        return read_scene(made.encoded.files, most, threads=self.work.context.threads)
+
+    def _compared(self, best: Attempt) -> Attempt:
+        """Return the best container of a size, which need not have been compared, with what it loses. Where that cannot
+        be found out, because the search is stopped or a photograph is damaged, the container stands without figures."""
+        try:
+            evaluation = self.compare(self._decoded(best.made), self.work.context.stage("evaluate"))
+        except (StopSearch, InvalidViewsError):
+            return best
+        compared = best.with_evaluation(evaluation)
         last = max(n for n, attempt in enumerate(self.attempts) if attempt == best)  # equal but for the container
-        self.attempts[last] = replace(evaluated, container=None)
-        return evaluated
+        self.attempts[last] = replace(compared, container=None)
+        return compared
 
     def _loss(self, made: Container) -> float:
         """Return the drop of PSNR of a container, decibels; infinite if a rendering failed. If the photographs equal

@@ -99,10 +99,17 @@ def image_renderer(splats: Splats) -> ImageRenderer:
     parameters = tensors_of(splats, "cuda")
 
     def render(camera: Camera, background: Sequence[float]) -> RenderedImage:
-        views = torch.from_numpy(camera.viewmat[None]), torch.from_numpy(camera.K[None]), camera.width, camera.height
-        model = torch.tensor([list(background)]), camera.dilation, splats.antialiased
         with torch.no_grad():
-            images, alphas = rasterize_on_cuda(parameters, *views, *model)
+            images, alphas = rasterize_on_cuda(
+                parameters,
+                viewmats=torch.from_numpy(camera.viewmat[None]),
+                Ks=torch.from_numpy(camera.K[None]),
+                width=camera.width,
+                height=camera.height,
+                backgrounds=torch.tensor([list(background)]),
+                dilation=camera.dilation,
+                antialiased=splats.antialiased,
+            )
         return images[0].cpu().numpy(), alphas[0].cpu().numpy()
 
     return render

@@ -278,6 +278,11 @@ class ServiceProcess(Service):
             self.process.send_signal(number)
         return self.process.wait(timeout=300)
 
+    def memory(self):
+        """Return the peak resident memory of the server process, bytes."""
+        text = Path(f"/proc/{self.process.pid}/status").read_text()
+        return int(re.search(r"VmHWM:\s+([0-9]+) kB", text)[1]) << 10
+
 
 def read_response(connection):
     """Return one HTTP response from a connection."""

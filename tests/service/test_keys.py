@@ -1,13 +1,9 @@
 """Authorisation by keys, origins and host names; oracle: SHA-256 of the standard library."""
 
 import hashlib
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from helpers.service import FAST, SLOW, SMALL, problem, scene_bytes
-
-from service.core.settings import ServiceSettings, SettingsError
-from service.http.app import create_app
+from helpers.service import FAST, SLOW, SMALL, problem
 
 KEYS = {"alice": ["kissgs_a1", "kissgs_a2"], "bob": ["kissgs_b"]}
 
@@ -102,17 +98,3 @@ def test_unknown_host_names_are_refused(service):
         problem(service.http.get("/v1/jobs", headers={"Host": host}), 403, "foreign")
     for host in ("localhost", f"LOCALHOST:{service.port}", "127.0.0.1", f"[::1]:{service.port}"):
         assert service.http.get("/v1/jobs", headers={"Host": host}).status_code == 200
-
-
-def test_simultaneous_requests_with_one_idempotency_key(start):
-    service = start(KISSGS_MAX_UPLOADS=32)
-    with ThreadPoolExecutor(8) as pool:
-        jobs = list(pool.map(lambda _: service.submit(scene_bytes(6_000, 2), **{"Idempotency-Key": "same"}), range(8)))
-    assert len({job["id"] for job in jobs}) == 1
-    assert len(service.http.get("/v1/jobs").json()["jobs"]) == 1
-    assert service.ended(jobs[0])["state"] == "succeeded"
-    assert len(list((service.folder / "jobs").iterdir())) == 1
-    assert service.leftovers() == []
-    with pytest.raises(SettingsError, match="another service is using"):
-        create_app(ServiceSettings(data_dir=service.folder))
-    assert service.http.get("/livez").status_code == 200

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import hashlib
 import os
+import resource
 import signal
 import socket
 import threading
@@ -36,6 +37,24 @@ def slowest(service, count=60):
         spent.append(time.perf_counter() - begun)
         time.sleep(0.01)
     return max(spent)
+
+
+@pytest.mark.quick(0)
+def test_idle_connections_do_not_fail_jobs(start_process):
+    """Idle connections once used up all file descriptors, so that jobs could not open their files."""
+    service = start_process()
+    resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (300, 300))
+    jobs = [service.submit() for _ in range(3)]
+    connections = []
+    for _ in range(400):
+        with contextlib.suppress(OSError):
+            connections.append(socket.create_connection(("127.0.0.1", service.port), timeout=300))
+    time.sleep(3)
+    for connection in connections:
+        connection.close()
+    for job in jobs:
+        status = service.ended(job)
+        assert status["state"] == "succeeded", status
 
 
 @pytest.mark.quick(0)

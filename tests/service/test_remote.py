@@ -90,6 +90,13 @@ def unreachable():
         yield f"http://127.0.0.1:{unused.getsockname()[1]}"
 
 
+@pytest.mark.quick(0)
+def test_an_unreachable_service(unreachable, scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(client, "RETRY_SECONDS", 0.0)
+    with kissgs.Remote(unreachable) as remote, pytest.raises(kissgs.RemoteError, match="cannot reach"):
+        remote.compress(scene, tmp_path / "x.zip")
+
+
 def test_the_note_about_a_service_that_is_down_leaves_its_address_to_the_command(unreachable, scene, tmp_path):
     """Regression: the command printed the address before the note, which had it once more."""
 
@@ -150,6 +157,19 @@ def test_the_service_restarts_during_a_job(tmp_path):
             service.restart()
             client.result(60)
     assert (tmp_path / "x.zip").read_bytes() == kissgs.compress(scene, settings=FAST).to_zip()
+
+
+@pytest.mark.quick(0)
+def test_a_full_queue_is_retried(start, scene, tmp_path):
+    service = start(KISSGS_MAX_QUEUE=1)
+
+    def run(i):
+        with kissgs.Remote(service.url) as remote:
+            remote.compress(scene, tmp_path / f"{i}.zip", settings=FAST)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(run, range(5)))
+    assert len({(tmp_path / f"{i}.zip").read_bytes() for i in range(5)}) == 1
 
 
 def test_a_container_damaged_in_transit(service, scene, tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from kissgs.cameras.views import Vec3, black
 from kissgs.cameras.virtual.candidates import SceneBounds, framing_camera, opacity, proxy_scene, weighted_quantiles
 from kissgs.cameras.virtual.select import THUMBNAIL_SIZE, ScoredCandidates, overview_bonus, score_candidates
 from kissgs.core.array_types import Float64
-from kissgs.core.context import DEFAULT_CONTEXT, Context
+from kissgs.core.context import DEFAULT_CONTEXT, Context, load_kernels
 from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
@@ -25,6 +25,9 @@ Record = dict[str, list[float] | float]
 
 FIELDS_OF_VIEW = {"object": 60.0, "background": 55.0, "enclosed": 55.0}
 """Recorded angle of view by the kind of scene, degrees. The edges of a scene with a background dissolve."""
+
+MIN_FOV, MAX_FOV = 1.0, 150.0
+"""Smallest and largest angle of view that viewers accept, degrees."""
 
 REACH = 3.0
 """Distance from the median of an object, in units of the one within which 75 % of the opacity lies, beyond which
@@ -73,6 +76,7 @@ def first_view_of(splats: Splats, context: Context = DEFAULT_CONTEXT) -> Record 
     """Return the record of a clean scene without a capture; None if nothing of it is visible."""
     if not opacity(splats).any():
         return None
+    load_kernels(context.progress)
     with Workers(context.threads) as pool:
         candidates = score_candidates(splats, (THUMBNAIL_SIZE, THUMBNAIL_SIZE), pool, context.progress)
     return first_view(candidates)
@@ -145,5 +149,5 @@ def _record(camera: Camera, bounds: SceneBounds, up: Vec3, fov: float) -> Record
         "eye": rounded(camera.position, decimals),
         "target": rounded(target, decimals),
         "up": rounded(up, 4),
-        "fov": round(fov, 1),
+        "fov": round(min(max(fov, MIN_FOV), MAX_FOV), 1),
     }
