@@ -15,6 +15,21 @@ from kissgs.pipeline.limited_time import SearchTime
 from kissgs.rendering.sensitivity import WeightedCameras
 
 
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_container_of_a_size_has_figures_unless_a_photograph_is_damaged(tmp_path, damaged):
+    scene = cloud(300)
+    views = photographs(scene, tmp_path)
+    if damaged:
+        photo = views.test[0].photo
+        photo.write_bytes(photo.read_bytes()[: photo.stat().st_size // 2])
+    plain = {"compact": {"ratio": 1}, "finetune": {"enabled": False}}
+    settings = Settings.research("balanced", target_size=9000, **plain, **FEW_VIEWS)
+    found = kissgs.compress(scene, settings=settings, views=views)
+    assert len(found.to_zip()) <= 9000
+    compared = [trial for trial in found.report.trials if trial.detail is not None]
+    assert [trial.bytes for trial in compared] == ([] if damaged else [len(found.to_zip())])
+
+
 @pytest.mark.parametrize(
     "goal", [{"max_ssim_drop": 0.05}, {"max_psnr_drop": 0.5}, {"quality": "good"}, {"target_size": 6200}]
 )
