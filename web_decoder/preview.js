@@ -93,6 +93,7 @@ async function openContainer(source, load) {
     refine(scene, STAGES.whole);
     await view.settled;
     if (scene.count) await view.drawn(); // statistics and planes take seconds, in which nothing is drawn
+    if (load.signal.aborted) return;
     announce(`${source.name}: ${count(scene.count)} Gaussians.`);
   } catch (error) {
     if (shown?.source === source && !load.signal.aborted) refine(shown.scene, lastStageOf(arrived));

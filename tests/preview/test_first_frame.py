@@ -19,14 +19,19 @@ const draw = WebGL2RenderingContext.prototype.drawElementsInstanced;
 window.events = [];
 WebGL2RenderingContext.prototype.drawElementsInstanced = function (...all) {
   if (all[4] > 1000) window.events.push("scene");
+  window.latest = all[4];
   return draw.apply(this, all);
 };
 new MutationObserver(() => {
   for (const id of ["statistics", "planes"])
     if (document.getElementById(id)?.childElementCount && !window.events.includes(id)) window.events.push(id);
+  window.before = document.getElementById("statistics")?.childElementCount ? (window.before ?? window.latest) : null;
 }).observe(document, { childList: true, subtree: true });
 """
-"""Script that notes the order in which the scene, its statistics and its planes appear."""
+"""Script that notes the order in which the scene, its statistics and its planes appear.
+
+``before`` is the number of Gaussians in the latest frame before the statistics.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +88,7 @@ def assert_whole(box, tolerance=0.06):
     assert abs(top + bottom - 1) < tolerance
 
 
-def test_the_recorded_view_is_whole_and_home_and_the_centre_of_orbits(container, opened):
+def test_the_recorded_view_is_whole_and_home_and_the_centre_of_orbits(container, opened, tmp_path):
     tab, image = opened(page_with(container, RECORD))
     assert_whole(extent(tab, image))
     assert np.ptp(extent(tab, image)[2:]) > 0.3, "z is up, so that the box is tall"
@@ -99,6 +104,20 @@ def test_the_recorded_view_is_whole_and_home_and_the_centre_of_orbits(container,
     tab.page.keyboard.press("Home")
     inside = slice(8, -8)  # without the mark of the focus
     assert psnr(tab.still_image()[inside, inside], image[inside, inside]) > 50
+    kissgs.save(kissgs.decompress(container), tmp_path / "scene.ply")
+    tab.drop(("scene.ply", (tmp_path / "scene.ply").read_bytes()))
+    tab.page.get_by_role("slider").wait_for()
+    tab.page.locator("#viewport").focus()
+    tab.page.keyboard.press("ArrowLeft")
+    turned = tab.still_image()
+    for height in (500, 400):
+        tab.page.set_viewport_size({"width": 820, "height": height})
+        resized = tab.still_image()
+    assert psnr(resized, turned) > 50, "the original keeps the recorded angle of view"
+    smaller = kissgs.compress(box((0.3, 0.4, 0.9), 600, 0.05), settings=kissgs.Settings(preset="fast"))
+    tab.drop(("smaller.zip", smaller.to_zip()))
+    tab.shown(600)
+    assert 0 < tab.page.evaluate("before") <= 600, "its frame, not one of the former scene, is before its statistics"
 
 
 def test_narrow_windows_show_it_whole(container, opened):

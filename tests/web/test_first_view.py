@@ -19,7 +19,7 @@ def test_only_possible_records_are_taken():
         {"up": [0, 0, -2]},  # along the line of sight
         {"up": [0, 0, 0]},
         {"target": [1, 2, 3]},
-        {"target": [1, 2, 3.0000001]},
+        {"target": [1, 2, 3.000000001]},
         {"eye": [1, 2]},
         {"eye": [1, 2, "3"]},
         {"eye": [1, 2, 1e16]},
@@ -29,10 +29,12 @@ def test_only_possible_records_are_taken():
         {"fov": "60"},
     ]
     impossible = [*({**VIEW, **change} for change in changes), None, 5, [], {}]
-    found = views(records=[VIEW, {**VIEW, "up": [0, -3, 1], "more": 1}, *impossible])["records"]
+    far = {**VIEW, "eye": [5e5, 4e6, 97], "target": [5e5, 4e6, 100]}
+    found = views(records=[VIEW, {**VIEW, "up": [0, -3, 1], "more": 1}, far, *impossible])["records"]
     assert found[0] == VIEW
     assert found[1] == {**VIEW, "up": pytest.approx([0, -0.9487, 0.3162], abs=1e-4)}
-    assert found[2:] == [None] * len(impossible)
+    assert found[2] == far, "near its target, far from the origin"
+    assert found[3:] == [None] * len(impossible)
 
 
 def test_a_ply_has_it_in_a_comment():

@@ -51,7 +51,7 @@ export function checkedView(view) {
   if (![eye, target, up].every(isPoint) || !(Number.isFinite(fov) && fov >= 1 && fov <= 150)) return null;
   const sight = minus(target, eye);
   const size = Math.hypot(...eye, ...target);
-  if (!(Math.hypot(...sight) > 1e-6 * size) || !(Math.hypot(...up) > 1e-6)) return null;
+  if (!(Math.hypot(...sight) > 1e-9 * size) || !(Math.hypot(...up) > 1e-6)) return null;
   return Math.abs(dot(unit(sight), unit(up))) < STEEPEST ? { eye, target, up: unit(up), fov } : null;
 }
 

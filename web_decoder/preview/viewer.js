@@ -39,6 +39,7 @@ export class Viewer {
   #encoding = WIDE_RANGES;
   /** Whether a scene that is drawn in parts has a recorded view. */
   #recorded = false;
+  /** Whether a frame has had Gaussians of this scene in it. */
   #filled = false;
   #requested = 0;
   #disposed = false;
@@ -90,6 +91,7 @@ export class Viewer {
    * @param {boolean} [held] whether the user has moved the camera, so that the origin must not change
    */
   setScene(scene, { placed = true, sized = true, spherical = true } = {}, held = false) {
+    if (scene !== this.#shown) this.#filled = false;
     if (scene !== this.#shown || !this.#placed) {
       const extent = extentOfScene(scene);
       this.#extent = held && scene === this.#shown ? { ...extent, centre: this.#extent.centre } : extent;
@@ -108,7 +110,7 @@ export class Viewer {
    * Show a file that Spark reads.
    * @param {import("./file_types.js").FileType} type
    * @param {Uint8Array} bytes
-   * @param {Viewer} [beside] viewer whose frame is used
+   * @param {Viewer} [beside] viewer whose frame and view are used
    * @returns {Promise<number>} the number of Gaussians
    */
   async setFile(type, bytes, beside) {
@@ -117,11 +119,14 @@ export class Viewer {
     const [marked, view] = [await isMarked(type, bytes), viewInFile(type, bytes)]; // the mesh may take the bytes away
     const mesh = new SplatMesh({ fileBytes: bytes, fileType, splatEncoding });
     await mesh.initialized;
-    this.#shown = null;
+    [this.#shown, this.#filled] = [null, false];
     this.antialiased = marked;
-    const gaussians = gaussiansOfMesh(mesh, pointsUp(type));
-    this.#extent = beside?.extent ?? extentOf(...gaussians);
-    this.#view = view ?? viewOfDense(...gaussians);
+    if (beside) [this.#extent, this.#view] = [beside.#extent, beside.#view];
+    else {
+      const gaussians = gaussiansOfMesh(mesh, pointsUp(type));
+      this.#extent = extentOf(...gaussians);
+      this.#view = view ?? viewOfDense(...gaussians);
+    }
     const [x, y, z] = this.#extent.centre.map((value, axis) => value + (beside?.origin[axis] ?? 0));
     mesh.position.set(-x, y, z);
     this.#replace(mesh, pointsUp(type));
@@ -134,7 +139,7 @@ export class Viewer {
    * @param {import("./view.js").View | null} [view] the recorded one
    */
   setExtent(extent, view = null) {
-    this.#shown = null;
+    [this.#shown, this.#filled] = [null, false];
     this.#extent = extent;
     this.#view = view ?? viewOfExtent(extent);
     this.#recorded = view !== null;
@@ -250,7 +255,8 @@ export class Viewer {
     cancelAnimationFrame(this.#requested);
     this.#requested = 0;
     this.#renderer.render(this.#scene, this.camera);
-    this.#filled = this.#spark.display.numSplats > 0;
+    // Until the Gaussians of another scene are sorted, Spark goes on with those of the former one.
+    this.#filled ||= this.#spark.display.mapping.some(({ node, count }) => count > 0 && node.parent === this.#scene);
     this.afterFrame();
   }
 
@@ -264,7 +270,7 @@ export class Viewer {
     this.#draw();
   }
 
-  /** Whether the latest frame has Gaussians in it: Spark sorts them before it draws them. */
+  /** Whether Gaussians of this scene have been drawn: Spark sorts them before. */
   get hasDrawn() {
     return this.#filled;
   }
