@@ -48,8 +48,8 @@ RECOVERABLE_DB = 1.5
 BYTES_PER_GAUSSIAN, BYTES_OF_SH, OVERHEAD_BYTES = 8.6, 4.0, 4000
 SIZE_BY_COUNT = 0.6  # exponent of the number of Gaussians to which the size of a container grows at equal lambda
 HALF_LEFT = 1.0  # margin of a point before any encoding that leaves half of the allowed loss to the encoder
-# Margin that ends a search, as log2 of the number of Gaussians, some 3 % of the bytes; less in a time that is given.
-NEAR_LOG2, NEAR_IN_TIME = 0.09, 0.06
+# Margin that ends a search, as log2 of the number of Gaussians: 0.03 dB of PSNR; less in a time that is given.
+NEAR_LOG2, NEAR_IN_TIME = 0.094, 0.06
 UNKNOWN_DROP = 1e6  # larger than any finite drop of PSNR, decibels
 
 NOT_FINETUNED = "no fine-tuned container meets the goal better: this one is not fine-tuned"
