@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import yaml
 import torch
 from helpers.reference_sog import read_files
 from helpers.training_scenes import around, cloud, targets_of
@@ -65,7 +66,7 @@ def tuned(
 @pytest.mark.parametrize(("degree", "rate_weight"), [(2, 0.0), (0, 0.0), (2, 2.0)])
 @pytest.mark.quick(2)
 def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree, rate_weight):
-    """Gains are 1.1 to 2.0 dB with twelve small training images; a weight of bits trades some of them for bytes."""
+    """Gains are 0.4 to 2.0 dB with twelve small training images; a weight of bits trades some of them for bytes."""
     encoded, report = tuned(cloud(150, degree), steps=150, rate_weight=rate_weight)
     assert report.kept
     assert report.psnr_after > report.psnr_before + (0 if rate_weight else 0.8)
@@ -264,7 +265,8 @@ def test_more_gaussians_are_pruned_before_fine_tuning(monkeypatch, encode, finet
     assert found.report.finetuning.bytes_before == compressed(encode).report.container_bytes
     assert (found.report.pruned_by_rd > compressed(encode).report.pruned_by_rd) == fewer
     threshold = float(max(encode, finetune) if encode else 0)
-    assert f"prune_threshold_bits: {threshold}\n".encode() in found.files[YAML_NAME]
+    settings = yaml.safe_load(found.files[YAML_NAME])["kissgs"]["settings"]
+    assert settings["prune_threshold_bits"] == threshold
 
 
 @pytest.mark.quick(0)

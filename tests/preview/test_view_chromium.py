@@ -22,7 +22,7 @@ def container():
 
 @pytest.fixture(autouse=True)
 def same_view(monkeypatch):
-    monkeypatch.setattr("kissgs.preview.first_view_of", lambda *_: VIEW)
+    monkeypatch.setattr("kissgs.cameras.virtual.first_view.first_view_of", lambda *_: VIEW)
 
 
 @pytest.fixture
