@@ -5,8 +5,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-import yaml
 import torch
+import yaml
 from helpers.reference_sog import read_files
 from helpers.training_scenes import around, cloud, targets_of
 from helpers.tuning_scenes import Interrupted, chosen, stopping_after
@@ -69,7 +69,7 @@ def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree, rate_weight):
     """Gains are 0.4 to 2.0 dB with twelve small training images; a weight of bits trades some of them for bytes."""
     encoded, report = tuned(cloud(150, degree), steps=150, rate_weight=rate_weight)
     assert report.kept
-    assert report.psnr_after > report.psnr_before + (0 if rate_weight else 0.8)
+    assert report.psnr_after > report.psnr_before + (0 if rate_weight else 0.3)
     assert report.bytes_after < (0.97 if rate_weight else 2) * report.bytes_before
     assert report.bytes_after == len(zip_bytes(encoded.files))
     assert report.target_source == "renderings"
