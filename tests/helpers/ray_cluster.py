@@ -99,9 +99,14 @@ class RayCluster:
         kill_tree(next(node for node in self.nodes if pid in tree(node.pid)))
 
     def left_by_items(self):
-        """Return the paths of temporary folders of items, on all nodes that run."""
+        """Return the paths of temporary folders of items, on all nodes that run; a node may need a moment after a job."""
         running = [node for node in self.nodes if node.poll() is None]
-        return [str(path) for node in running for path in self._temporary[node.pid].glob("kissgs-*")]
+        for _ in range(100):
+            left = [str(path) for node in running for path in self._temporary[node.pid].glob("kissgs-*")]
+            if not left:
+                break
+            time.sleep(0.1)
+        return left
 
     def restore(self):
         """Start a node for each one that was killed."""
