@@ -99,7 +99,7 @@ class RayCluster:
         kill_tree(next(node for node in self.nodes if pid in tree(node.pid)))
 
     def left_by_items(self):
-        """Return the paths of temporary folders of items, on all nodes that run; a node may need a moment after a job."""
+        """Return the paths of temporary folders of items, on all running nodes, which may need a moment after a job."""
         running = [node for node in self.nodes if node.poll() is None]
         for _ in range(100):
             left = [str(path) for node in running for path in self._temporary[node.pid].glob("kissgs-*")]
