@@ -209,8 +209,8 @@ class QuantizedScene:
                 tables = self.tables()
                 for name, latents in self.latents.items():
                     if latents.grad is not None:
-                        own = latents.grad, latents, tables.get(name), self._weights[name]
-                        self.planes[name].attract(*own, rates["attraction"])
+                        plane, factor = self.planes[name], rates["attraction"]
+                        plane.attract(latents.grad, latents, tables.get(name), self._weights[name], factor)
         self._adam.step(rates)
         with torch.no_grad():
             for name, latents in self.latents.items():

@@ -178,13 +178,19 @@ class Tuner:
         """Estimate the derivative of the loss with respect to the mean squared image error. All of the loss but the
         error itself is taken as proportional to the root of the error, as for errors on top of those to photographs."""
         settings, losses, errors = self.settings, [], []
-        options: dict[str, Any] = {"ssim_weight": settings.ssim_weight, "mse_weight": 0.0}
-        options |= {"antialiased": scene.antialiased, "threads": self.context.threads}
         with torch.no_grad(), torch_threads(1):  # the sums depend on the number of threads
             parameters = scene.gaussians()
             for n in islice(self.targets.order((settings.seed,)), min(LOSS_VIEWS, len(self.targets))):
                 self.context.progress("finetune", 0.0)
-                loss, error = image_loss(parameters, self.targets, n, **options)
+                loss, error = image_loss(
+                    parameters,
+                    self.targets,
+                    n,
+                    ssim_weight=settings.ssim_weight,
+                    mse_weight=0.0,
+                    antialiased=scene.antialiased,
+                    threads=self.context.threads,
+                )
                 losses.append(float(loss))
                 errors.append(error)
         return float(np.mean(losses)) / (2 * max(float(np.mean(errors)), 1e-10)) + settings.mse_weight

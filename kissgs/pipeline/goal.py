@@ -117,6 +117,8 @@ LOSSES = {
 
 @dataclass(frozen=True, slots=True)
 class Limit:
+    """A limit of one figure."""
+
     name: str  # of the setting; "detail" or "patch" for losses that a quality alone limits
     value: float  # bytes, decibels, or a difference of SSIM
     slope: float  # typical change of the margin per doubling of lambda
@@ -136,8 +138,13 @@ class Limit:
         if self.name in ("detail", "patch"):
             detail = attempt.detail
             return None if detail is None else -(detail.worst if self.name == "patch" else detail.worst_percent)
-        figures = {"target_size": attempt.bytes, "psnr": attempt.psnr, "max_psnr_drop": attempt.drop}
-        return {**figures, "max_ssim_drop": attempt.ssim_drop}[self.name]
+        figures = {
+            "target_size": attempt.bytes,
+            "psnr": attempt.psnr,
+            "max_psnr_drop": attempt.drop,
+            "max_ssim_drop": attempt.ssim_drop,
+        }
+        return figures[self.name]
 
     def loss(self, attempt: Attempt, digits: Callable[[float], str] | None = None) -> str:
         """Return what is limited of an attempt in words, such as "0.003 of SSIM"; empty for bytes and a PSNR."""

@@ -329,8 +329,6 @@ def compress(
         delete_checkpoints(*checkpoints)
     clock.stop()
     container_bytes, file_bytes = stored_sizes(encoded.files, packed=work.packed)
-    names = ("invisible", "pruned_by_rd", "clipped_colors", "form_error", "rd_lambda")
-    figures: dict[str, Any] = {name: getattr(encoded, name) for name in names}
     report = Report(
         source_count=source_count,
         count=len(encoded.order),
@@ -341,6 +339,11 @@ def compress(
         cleaned=cleaned,
         compaction=None if compacted is None else compacted.report,
         finetuning=made.finetuning,
+        invisible=encoded.invisible,
+        pruned_by_rd=encoded.pruned_by_rd,
+        clipped_colors=encoded.clipped_colors,
+        form_error=encoded.form_error,
+        rd_lambda=encoded.rd_lambda,
         note="; ".join(filter(None, [*notes, encoded.coarse, encoded.note, note, choice.note])),
         max_quantization_error=encoded.errors,
         trials=trials,
@@ -349,7 +352,6 @@ def compress(
         peak_memory=peak_memory(),
         settings=_settings_as_used(settings, made.settings, requested),
         evaluation=evaluation,
-        **figures,
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
     remaining = () if target is not None else tuple(path for path in checkpoints if path is not None)

@@ -66,8 +66,17 @@ class Encoded:
 
     @classmethod
     def of(cls, plan: EncodingPlan, files: dict[str, bytes]) -> Encoded:
-        names = ("form_error", "clipped_colors", "errors", "rd_lambda", "note", "coarse")
-        figures: dict[str, Any] = {name: getattr(plan, name) for name in names}
-        order, scene, side = plan.grid.cells[plan.grid.mask], plan.scene, plan.codebook.side
-        invisible, pruned = scene.count - scene.visible, scene.visible - len(order)
-        return cls(files, order, invisible=invisible, pruned_by_rd=pruned, codebook_side=side, **figures)
+        order, scene = plan.grid.cells[plan.grid.mask], plan.scene
+        return cls(
+            files=files,
+            order=order,
+            form_error=plan.form_error,
+            invisible=scene.count - scene.visible,
+            pruned_by_rd=scene.visible - len(order),
+            clipped_colors=plan.clipped_colors,
+            errors=plan.errors,
+            rd_lambda=plan.rd_lambda,
+            codebook_side=plan.codebook.side,
+            note=plan.note,
+            coarse=plan.coarse,
+        )

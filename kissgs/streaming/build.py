@@ -275,9 +275,15 @@ def make_file(
             sensitivity = measure_file(splats, others, cameras, file.level, settings, threads, progress)
             del others
         context = Context(threads, progress=progress)
-        model = MODELS[layout.container]
-        kept: dict[str, Any] = {"groups": groups, "keep_costs": False}
-        plan = plan_encoding(splats, settings, context, sensitivity=sensitivity, container=model, **kept)
+        plan = plan_encoding(
+            splats,
+            settings,
+            context,
+            sensitivity=sensitivity,
+            container=MODELS[layout.container],
+            groups=groups,
+            keep_costs=False,
+        )
         del sensitivity, splats
         encoded = write_files(layout.container, plan, settings, context)
         write_container(encoded.files, work / OUT / layout.path(file.name), overwrite=True)

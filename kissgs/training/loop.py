@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -85,17 +85,28 @@ def train(
     the result depends on the seed but not on the number of threads; on a GPU it is not reproducible. If the receiver of
     progress raises, the scene is in the state after the last completed step."""
     order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
-    options: dict[str, Any] = {"ssim_weight": plan.ssim_weight, "mse_weight": plan.mse_weight}
-    options |= {"antialiased": scene.antialiased, "threads": context.threads, "receive": scene.receive}
     with torch_threads(context.threads), keep_free_memory():
         step, pace = first, plan.pace
         pace.update(step)
         while step < pace.steps:
             context.progress(plan.stage, step / pace.steps, running.text(len(scene)))
             parameters = scene.gaussians()
-            found = [image_loss(parameters, targets, n, **options) for n in islice(order, plan.batch)]
-            loss = torch.stack([loss for loss, _ in found]).mean()
-            running.add(float(loss.detach()), sum(error for _, error in found) / plan.batch)
+            losses, errors = [], []
+            for n in islice(order, plan.batch):
+                loss, error = image_loss(
+                    parameters,
+                    targets,
+                    n,
+                    ssim_weight=plan.ssim_weight,
+                    mse_weight=plan.mse_weight,
+                    antialiased=scene.antialiased,
+                    threads=context.threads,
+                    receive=scene.receive,
+                )
+                losses.append(loss)
+                errors.append(error)
+            loss = torch.stack(losses).mean()
+            running.add(float(loss.detach()), sum(errors) / plan.batch)
             for regularizer in plan.regularizers:
                 penalty = regularizer.penalty(step, parameters)
                 loss = loss if penalty is None else loss + penalty
@@ -123,11 +134,18 @@ def image_loss(
     """Render target ``n``; return the photometric loss, differentiable, and the mean squared error. ``antialiased`` and
     ``receive`` are as in :func:`kissgs.rendering.differentiable.rasterize`."""
     camera, target = targets.cameras[n], targets.image(n)
-    matrices = (camera.viewmat, camera.K, targets.backgrounds[n])
-    viewmat, K, background = (torch.from_numpy(matrix)[None] for matrix in matrices)  # float64, for poses far away
-    model: dict[str, Any] = {"dilation": camera.dilation, "antialiased": antialiased, "threads": threads}
-    view = viewmat, K, camera.width, camera.height
-    image, _ = rasterize(parameters, *view, backgrounds=background, receive=receive, **model)
+    image, _ = rasterize(
+        parameters,
+        viewmats=torch.from_numpy(camera.viewmat)[None],  # float64: poses far from the origin need it
+        Ks=torch.from_numpy(camera.K)[None],
+        width=camera.width,
+        height=camera.height,
+        backgrounds=torch.from_numpy(targets.backgrounds[n])[None],
+        dilation=camera.dilation,
+        antialiased=antialiased,
+        threads=threads,
+        receive=receive,
+    )
     targets_there = torch.from_numpy(target)[None].to(image.device)
     loss = photometric_loss(image, targets_there, ssim_weight=ssim_weight, mse_weight=mse_weight, threads=threads)
     return loss, float(np.square(image[0].detach().cpu().numpy() - target).mean())

@@ -235,9 +235,22 @@ def _step_by_torch(leaf: _Leaf, rate: float, smallest: float, largest: float) ->
     most = 1.0 if leaf.factors is None or not len(leaf.factors) else float(leaf.factors.max())
     before = None if leaf.factors is None else leaf.value.detach().clone()
     steps = torch.tensor(leaf.steps - 1.0, device=leaf.value.device)
-    constants: dict[str, Any] = {"beta1": BETA1, "beta2": BETA2, "eps": EPSILON, "weight_decay": 0.0}
-    constants |= {"fused": True, "amsgrad": False, "maximize": False}
-    torch_adam([leaf.value], [gradient], [leaf.mean], [leaf.square], [], [steps], lr=rate * most, **constants)
+    torch_adam(
+        [leaf.value],
+        [gradient],
+        [leaf.mean],
+        [leaf.square],
+        [],
+        [steps],
+        fused=True,
+        amsgrad=False,
+        beta1=BETA1,
+        beta2=BETA2,
+        lr=rate * most,
+        weight_decay=0.0,
+        eps=EPSILON,
+        maximize=False,
+    )
     if before is not None and leaf.factors is not None:
         leaf.value.sub_(before).mul_(leaf.factors / most).add_(before)
     leaf.value.clamp_(smallest, largest)
