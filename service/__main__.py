@@ -7,6 +7,7 @@ import sys
 
 
 def main() -> None:
+    """Entry point."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # None if closed. Not every encoding has all characters of the help
         sys.stdout.reconfigure(errors="backslashreplace")
     try:

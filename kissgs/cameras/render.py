@@ -49,6 +49,7 @@ class Orbit:
 
     @property
     def full(self) -> bool:
+        """Whether the path is a full circle."""
         return self.sweep >= 2 * np.pi
 
     @property
@@ -221,6 +222,8 @@ HELD_OUT = " · held out"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedImages:
+    """Result of a render job."""
+
     images: Sequence[UInt8[np.ndarray, "H W 3"]]  # one image or contact sheet, or the frames of an animation
     views: Sequence[View]  # in the world's coordinates; of a contact sheet, those of all its cells
     description: str  # description of the views, for people

@@ -37,6 +37,7 @@ app = typer.Typer(
 
 
 def run() -> None:
+    """Run the command line."""
     if logging.lastResort is not None:  # prints the warnings of the library
         logging.lastResort.setFormatter(logging.Formatter("kissgs: %(message)s"))
     unwinding(_run)

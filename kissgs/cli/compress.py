@@ -63,6 +63,7 @@ class CompactionOptions:
     changes: Annotated[list[str] | None, Option("--set", metavar="NAME=VALUE", hidden=True)] = None
 
     def settings(self) -> Settings:
+        """Return the settings that these options stand for."""
         given = {name: getattr(self, name) for name in ("method", "count", "ratio", "max_psnr_drop")}
         settings = chosen(self.preset, self.changes, group="compact", compact=given)
         if not settings.compact.enabled:

@@ -85,6 +85,7 @@ class SceneCompression(BaseModel):
 
 
 def compress_here(options: SceneCompression, capture: Views | None, scene: str, target: Path) -> Result:
+    """Compress a scene."""
     piped = str(target) == "-"
     searches = resolved(options.settings, capture).searches
     with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:

@@ -298,6 +298,7 @@ def discard_stdout() -> None:
 
 
 def write_stdout(data: bytes) -> None:
+    """Write bytes to standard output."""
     with stdout():
         sys.stdout.buffer.write(data)
 
@@ -326,4 +327,5 @@ def show(what: RenderableType) -> None:
 
 
 def print_json(report: object) -> None:
+    """Print indented JSON."""
     write_stdout((json.dumps(report, indent=2) + "\n").encode())

@@ -62,6 +62,7 @@ def count_of(text: str) -> int:
 
 
 def share_of(text: str) -> float:
+    """Parse a share: 0.2 or 20%."""
     word = text.strip()
     try:
         return float(word.removesuffix("%")) * (0.01 if word.endswith("%") else 1.0)
@@ -161,6 +162,7 @@ class SceneOptions:
     quiet: Annotated[bool, Option("--quiet", "-q", hidden=True)] = False
 
     def reading(self, origin: Literal["auto"] | None = None) -> ReadOptions:
+        """Return the options of reading scenes."""
         from kissgs.io.scene_format import ReadOptions
 
         return ReadOptions(
@@ -259,6 +261,7 @@ class EncodingOptions:
     origin: OriginOption = None
 
     def settings(self, *, time: str | None = None, seed: int | None = None) -> Settings:
+        """Return the settings that these options stand for."""
         return chosen(
             self.preset,
             self.changes,
@@ -272,6 +275,8 @@ class EncodingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
+    """Options of the commands that train."""
+
     views: ViewsOption = None
     force_views: Annotated[
         bool, Option("--force-views", help="Accept --views whose photographs do not show the scene.")

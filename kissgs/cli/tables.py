@@ -61,6 +61,7 @@ def _changes(changed: Mapping[str, int]) -> list[Text]:
 
 
 def report_table(report: Report, target: str) -> RenderableType:
+    """Format the report of one compression."""
     sizes, counts = (report.source_bytes, report.container_bytes), (report.source_count, report.count)
     head = _result(target, sizes, counts, report.sh_degree, sum(report.seconds.values()), report.cpu_seconds)
     head.append(f", peak memory {size(report.peak_memory)}")
@@ -123,6 +124,7 @@ def _result(
 
 
 def compaction_table(report: CompactionReport, target: str) -> RenderableType:
+    """Format the report of one compaction."""
     head = Text.assemble(
         (target, "bold"),
         f"  {report.source_count:,} -> ",
@@ -133,6 +135,7 @@ def compaction_table(report: CompactionReport, target: str) -> RenderableType:
 
 
 def streamed_table(report: StreamedReport, target: str) -> RenderableType:
+    """Format the report of a streamed compression."""
     stored = report.counts[0] + report.environment_count
     head = Text.assemble(
         (target, "bold"),

@@ -113,10 +113,12 @@ class Status:
     steps: Sequence[CompactionStep]
 
     def as_state(self) -> State:
+        """Return the status as an array for the checkpoint, see :meth:`from_state`."""
         return {STATUS_ENTRY: np.frombuffer(json.dumps(asdict(self)).encode(), np.uint8)}
 
     @classmethod
     def from_state(cls, state: State) -> Status:
+        """Return the status in a checkpoint."""
         values = json.loads(state[STATUS_ENTRY].tobytes())
         return cls(**{**values, "steps": [CompactionStep(**step) for step in values["steps"]]})
 
@@ -238,6 +240,7 @@ class SceneTraining:
         return self._model
 
     def splats(self) -> Splats:
+        """Return the current scene."""
         if self._model is not None:
             return self._model.splats()
         source = self.compactor.splats

@@ -53,6 +53,7 @@ class SearchNote:
     note: str = ""  # the state, changed by the search
 
     def __call__(self, stage: str, fraction: float, note: str = "") -> None:
+        """See :class:`Progress`."""
         self.progress(stage, fraction, "; ".join(filter(None, [self.note, note])))
 
 
@@ -63,6 +64,8 @@ SETTLING_STEPS = 3  # steps that Pace leaves out of its mean: they load or compi
 
 @dataclass(frozen=True, slots=True)
 class Deadline:
+    """Time until which work shall be finished."""
+
     end: float  # on the clock of :func:`time.perf_counter`, seconds
 
     @classmethod
@@ -76,6 +79,7 @@ class Deadline:
         return self.end - time.perf_counter()
 
     def earlier(self, seconds: float) -> Deadline:
+        """Return the deadline that is ``seconds`` before this one."""
         return Deadline(self.end - seconds)
 
 

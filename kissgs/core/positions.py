@@ -141,9 +141,11 @@ class Cuts:
 
     @property
     def chunks(self) -> int:
+        """Number of chunks."""
         return 1 << self.depth
 
     def chunk_of(self, means: Float32[np.ndarray, "n 3"]) -> UInt16[np.ndarray, " n"]:
+        """Return the chunk of each position."""
         node, rows = np.ones(len(means), np.int64), np.arange(len(means))
         for _ in range(self.depth):
             node = 2 * node + (means[rows, self.axes[node]] >= self.values[node])
@@ -186,6 +188,7 @@ WORLD: Origin = (0.0, 0.0, 0.0)  # origin of a scene whose positions are those o
 
 
 def world_positions(splats: Splats) -> Float64[np.ndarray, "N 3"]:
+    """Return the positions in the world, float64 ``(N, 3)``."""
     return splats.means.astype(np.float64) + np.array(splats.origin)
 
 

@@ -112,6 +112,7 @@ class StageTimer:
             self.receiver(stage, fraction)
 
     def stop(self) -> None:
+        """End the current stage."""
         if self._stage is not None:
             spent = time.perf_counter() - self._since
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + spent

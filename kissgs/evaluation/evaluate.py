@@ -329,6 +329,7 @@ def background_of(view: View, default: Float32[np.ndarray, "3"]) -> Float32[np.n
 
 
 def render_clamped(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], context: Context) -> Rendering:
+    """Return a rendering with its values clamped to [0, 1]."""
     colour = background.tolist()
     image, _ = render(splats, camera, background=colour, threads=context.threads, device=context.device)
     return np.clip(image, 0, 1)

@@ -194,6 +194,7 @@ class QuantizedScene:
 
     @property
     def antialiased(self) -> bool:
+        """See :class:`kissgs.Splats`."""
         return self._plan.scene.antialiased
 
     @property
@@ -245,9 +246,11 @@ class QuantizedScene:
         return replace(self._plan, fields=fields, codebook=codebook, errors=errors)
 
     def state(self) -> dict[str, np.ndarray]:
+        """Return the state of the training, see :meth:`restore`."""
         return self._adam.state()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from a :meth:`state` of a scene with an equal plan."""
         self._adam.restore(state)
 
 
@@ -408,9 +411,11 @@ class RateLoss(Regularizer):
         return self._weight * sum((rate.bits(latents[name]) for name, rate in self._rates.items()), torch.tensor(0.0))
 
     def state(self) -> dict[str, np.ndarray]:
+        """Return the rate tables by field, see :meth:`restore`."""
         return {f"{name}.bits": rate.table for name, rate in self._rates.items()}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from a :meth:`state`."""
         for name, rate in self._rates.items():
             rate.table = state[f"{name}.bits"]
 

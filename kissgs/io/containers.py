@@ -47,16 +47,21 @@ class Source(Protocol):
 
 
 class MemorySource:
+    """Files in memory."""
+
     def __init__(self, files: Mapping[str, bytes]) -> None:
         self._files = files
 
     def names(self) -> frozenset[str]:
+        """See :class:`Source`."""
         return frozenset(self._files)
 
     def size(self, name: str) -> int:
+        """See :class:`Source`."""
         return len(self._files[name])
 
     def read(self, name: str, limit: int) -> bytes:
+        """See :class:`Source`."""
         if name not in self._files:
             raise _missing(name)
         _refuse_larger(name, self.size(name), limit)
@@ -74,12 +79,15 @@ class DirectorySource:
             raise InvalidContainerError(f"cannot read {folder}: {reason_of(error)}") from error
 
     def names(self) -> frozenset[str]:
+        """See :class:`Source`."""
         return self._names
 
     def size(self, name: str) -> int:
+        """See :class:`Source`."""
         return (self._folder / name).stat().st_size
 
     def read(self, name: str, limit: int) -> bytes:
+        """See :class:`Source`."""
         try:
             if not is_below(name) or not (self._folder / name).is_file():
                 raise _missing(name)
@@ -117,12 +125,15 @@ class ZipSource:
                 self._entries[name] = entry
 
     def names(self) -> frozenset[str]:
+        """See :class:`Source`."""
         return frozenset(self._entries)
 
     def size(self, name: str) -> int:
+        """See :class:`Source`."""
         return self._entries[self._key(name)].packed
 
     def read(self, name: str, limit: int) -> bytes:
+        """See :class:`Source`."""
         entry = self._entries.get(self._key(name))
         if entry is None:
             raise _missing(name)
@@ -285,6 +296,7 @@ def _missing(name: str) -> InvalidContainerError:
 
 
 def stored_size(files: Source, name: str) -> int:
+    """Return the size of a file, bytes."""
     try:
         return files.size(name)
     except (KeyError, OSError, ValueError) as error:

@@ -179,6 +179,7 @@ class SceneFile:
     size: int
 
     def read(self, offset: int, count: int) -> bytes:
+        """Return ``count`` bytes at ``offset``."""
         if offset + count > self.size:
             raise self.cut_short(offset + count)
         self.file.seek(offset)

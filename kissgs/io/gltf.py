@@ -494,6 +494,7 @@ class _Column:
 
 
 def write_glb(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
+    """Write a scene in glTF's axes."""
     ends = _ends(splats)
     columns, views, start = list(_columns(splats)), list[dict[str, int]](), 0
     for column in columns:

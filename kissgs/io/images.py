@@ -25,6 +25,7 @@ _HEADER = struct.Struct(">I4sIIB")
 
 
 def is_png(data: bytes) -> bool:
+    """Whether bytes begin like PNG."""
     return data.startswith(_MAGIC)
 
 

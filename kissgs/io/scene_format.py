@@ -95,6 +95,8 @@ Write = Callable[[BinaryWriter, Splats, bool, Progress], Notes]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Codec:
+    """Code of one format."""
+
     info: Callable[[Path | bytes, int], Facts]  # describe a file, or a level of detail of a streamed scene
     read: Read
     sniff: Callable[[bytes, int], Match] = lambda head, size: Match.NO  # from a file's first bytes and its size

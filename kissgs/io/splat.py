@@ -32,6 +32,7 @@ ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("
 def read_splat(
     source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
 ) -> Splats:
+    """Read a scene."""
     with open_scene_file(source) as opened:
         count = _count(opened)
         refuse_more_than(reading.max_gaussians, count, opened.name)

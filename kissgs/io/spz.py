@@ -247,6 +247,7 @@ class SpzInfo:
 
 
 def read_spz_info(source: Path | bytes) -> SpzInfo:
+    """Read the header."""
     with open_scene_file(source) as opened:
         return _read_header(opened)
 
@@ -382,6 +383,7 @@ def _read_extensions(extensions: bytes, name: str) -> tuple[str, list[str]]:
 
 
 def write_spz(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progress: Progress = silent) -> Notes:
+    """Write a scene."""
     count = len(splats)
     refuse_empty(splats, ".spz")
     reach = float(np.abs(splats.means).max())

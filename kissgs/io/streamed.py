@@ -42,6 +42,8 @@ class Container:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
+    """Contents of a manifest."""
+
     levels: int
     filenames: tuple[str, ...]  # files of the containers: their metadata, or they themselves
     rows: tuple[tuple[tuple[int, int, int], ...], ...]  # by level: (file, offset, count), in order, without overlap
@@ -83,6 +85,8 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class StreamedFormat:
+    """Format of streamed scenes."""
+
     title: str
     manifest: str  # file name of the manifest
     containers: str | None  # value of the manifest's key "format", which it may lack; None: any value is valid
@@ -90,6 +94,7 @@ class StreamedFormat:
 
     @property
     def codec(self) -> Codec:
+        """Code of the format."""
         return Codec(info=self.describe, read=self.decode)
 
     def describe(self, path: Path | bytes, level: int) -> Facts:

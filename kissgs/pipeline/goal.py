@@ -224,6 +224,7 @@ class Goal:
 
     @property
     def psnr_drop(self) -> float | None:
+        """The largest drop of PSNR, decibels; None if it is not limited."""
         return next((limit.value for limit in self.limits if limit.name == "max_psnr_drop"), None)
 
     def decisive(self, attempt: Attempt) -> Limit:

@@ -118,6 +118,8 @@ RENDERED = ((15.0, SearchPlan(0)), (30.0, SearchPlan(1)), (60.0, SearchPlan(2)),
 
 @dataclass(frozen=True, slots=True)
 class SearchTime:
+    """The time of a search."""
+
     deadline: Deadline  # until which the best container shall be ready
     encode_seconds: float  # expected of an encoding of the whole scene without training
 

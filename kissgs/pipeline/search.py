@@ -121,10 +121,12 @@ class Search:
 
     @property
     def encode_settings(self) -> EncodeSettings:
+        """Settings of the encoder, with the goal."""
         return self.work.settings.encode
 
     @property
     def tunes(self) -> bool:
+        """Whether the settings ask for fine-tuning."""
         return bool(self.work.settings.finetune.enabled)
 
     @property

@@ -28,6 +28,7 @@ class Vectors:
     weights: Float32[np.ndarray, " N"]
 
     def take(self, members: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M D"]:
+        """Return a copy of some of the vectors."""
         return self.table[self.rows[members]]
 
     def mean_and_rms(self, pool: Workers) -> tuple[Float32[np.ndarray, " D"], float]:
@@ -66,6 +67,7 @@ class Clustering:
         pool.map(lambda part: kernels.means(*arrays, *part, self.centroids, self.totals, self.errors), self.parts())
 
     def sort_members(self) -> None:
+        """Sort the vectors by label again, after labels have changed."""
         self.members, self.edges = sorted_by_label(self.labels, len(self.centroids))
 
     def reassign(self, pool: Workers) -> None:

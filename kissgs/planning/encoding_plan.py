@@ -66,6 +66,7 @@ class Encoded:
 
     @classmethod
     def of(cls, plan: EncodingPlan, files: dict[str, bytes]) -> Encoded:
+        """Return the files of a plan with the plan's figures."""
         order, scene = plan.grid.cells[plan.grid.mask], plan.scene
         return cls(
             files=files,

@@ -179,6 +179,8 @@ OUTLIERS = 1e-3  # share of entries at either end of a dimension that may be cli
 
 @dataclass(frozen=True, slots=True)
 class Clusters:
+    """Result of a clustering."""
+
     centroids: Float32[np.ndarray, "K D"]
     labels: Int32[np.ndarray, " N"]  # centroid of each vector
     step: float  # step of the lattice that the centroids lie on; 0 for none

@@ -76,6 +76,8 @@ class Rows(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Computed:
+    """Rows that a function computes."""
+
     count: int
     of: Callable[[slice], np.ndarray]
 
@@ -150,6 +152,7 @@ class Quantized:
         return self.table[-1].astype(np.float32)
 
     def values(self) -> Float64[np.ndarray, "N C"]:
+        """Return the values that the levels stand for."""
         shared = self.table.shape[1] == 1
         return np.asarray(self.table[self.levels, 0 if shared else np.arange(self.levels.shape[1])])
 
@@ -421,5 +424,6 @@ def refit_table(
 def without_unused(
     table: Float32[np.ndarray, " levels"], levels: Integer[np.ndarray, "N C"]
 ) -> tuple[Float32[np.ndarray, " used"], UInt8[np.ndarray, "N C"]]:
+    """Return the table without the values that no level uses, and the levels in it."""
     used, index = np.unique(levels, return_inverse=True)
     return table[used], index.reshape(levels.shape).astype(np.uint8)

@@ -52,6 +52,7 @@ class ErrorModel:
     view_uncertainty: float
 
     def error_at(self, rd_lambda: float) -> float:
+        """Estimate the mean squared error of the scene planned with ``rd_lambda``."""
         costs, count = self.costs, len(self.costs.color)
         pruned = costs.removal[costs.pruned_by_rd(rd_lambda, self.prune_bits)]
         rounding = GROWTH * DIMENSIONS * (count - len(pruned)) * rd_lambda / (2 * np.log(2))

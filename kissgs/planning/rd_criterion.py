@@ -55,6 +55,7 @@ class Costs:
         return found
 
     def take(self, chosen: Int[np.ndarray, " k"]) -> Costs:
+        """Return the costs of the Gaussians ``chosen``."""
         return Costs(**{name: getattr(self, name).take(chosen) for name in Costs.__slots__})
 
     def of_rounding(self) -> Costs:

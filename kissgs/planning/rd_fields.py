@@ -275,6 +275,7 @@ class RdFields:
     largest: Mapping[str, Rows]  # see largest_changes
 
     def shapes(self, values: StoredShapes, hessians: Rows) -> dict[str, Quantized]:
+        """Quantise opacity, log-scales and rotation."""
         criterion, tables, pool = self.criterion, self.planning.container.tables, self.planning.pool
         wanted: StoredShapes | Float64[np.ndarray, "M 8"] = values
         steps = {
@@ -334,6 +335,7 @@ def decoded_entries(codebook: Codebook, coefficients: int) -> Float32[np.ndarray
 def decoded_scene(
     fields: dict[str, Quantized], sh0: Float32[np.ndarray, "M 3"], shN: Float32[np.ndarray, "M K 3"]
 ) -> Splats:
+    """Return the decoded scene."""
     quats = decoded_quats(fields)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     return Splats(

@@ -37,6 +37,7 @@ def with_sign(quats: Float64[np.ndarray, "N 4"], omitted: UInt8[np.ndarray, " N"
 def stored_components(
     quats: Float64[np.ndarray, "N 4"], omitted: UInt8[np.ndarray, " N"]
 ) -> Float64[np.ndarray, "N 3"]:
+    """Return the three components that are stored."""
     return np.take_along_axis(quats, KEPT[omitted], axis=1)
 
 
@@ -114,6 +115,7 @@ class StoredShapes:
         return np.concatenate([opacities, scales, quats / quats[:, :1] if self.w_is_one else quats], axis=1)
 
     def take(self, chosen: Int[np.ndarray, " K"] | Bool[np.ndarray, " M"]) -> StoredShapes:
+        """Return the rows ``chosen``."""
         return StoredShapes(self.splats, self.index[chosen], self.forms[chosen], self.w_is_one)
 
     def field(self, name: str) -> Computed:

@@ -160,6 +160,7 @@ class CodebookErrorModel:
     unweighted: float = 0.0  # squared image error of a codebook of that size with equal weights
 
     def error(self, entries: float) -> float:
+        """Return the squared image error of a codebook with that number of entries."""
         return self.weighted * (self.entries / entries) ** SH_SHRINK
 
     def best_size(self, rd_lambda: float, count: int, ratio: float, entry_bits: float = ENTRY_BITS) -> int:

@@ -56,6 +56,7 @@ def reframed(camera: Camera, width: int, height: int) -> Camera:
 
 
 def png(pixels: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """Return the image as a PNG file."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, "PNG")
     return stream.getvalue()

@@ -30,6 +30,7 @@ class Resources:
     gpus: float = 0.0  # a fraction shares one
 
     def fits(self, free: Resources) -> bool:
+        """Whether ``free`` resources suffice."""
         return self.cpus <= free.cpus and self.memory <= free.memory and self.gpus <= free.gpus
 
     def __str__(self) -> str:

@@ -80,6 +80,7 @@ class Throttle:
         self._last, self._next = ("", -1.0, ""), 0.0
 
     def __call__(self, stage: str, fraction: float, note: str = "") -> None:
+        """See :class:`kissgs.Progress`."""
         now = time.monotonic()
         event = stage, round(min(1.0, max(0.0, fraction)), 4), note
         if event == self._last or (stage == self._last[0] and now < self._next):

@@ -256,9 +256,11 @@ class LocalRunner:
 
     @property
     def nodes(self) -> tuple[Resources, ...]:
+        """See :class:`kissgs.runners.Runner`."""
         return ()
 
     def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
+        """See :class:`kissgs.runners.Runner`."""
         item_id, process, outcome = secrets.token_hex(8), ItemProcess(item), Future[Outcome]()
         with self._lock:
             if self._closed:
@@ -274,17 +276,21 @@ class LocalRunner:
         return RunHandle(item_id, outcome)
 
     def cancel(self, item_id: str) -> None:
+        """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             if item_id in self._items:
                 self._items[item_id][0].kill()
 
     def refusal(self, resources: Resources) -> str | None:
+        """See :class:`kissgs.runners.Runner`."""
         return None
 
     def health_problem(self) -> str | None:
+        """See :class:`kissgs.runners.Runner`."""
         return "the runner is closed" if self._closed else None
 
     def close(self) -> None:
+        """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             self._closed = True
             items = list(self._items.values())

@@ -55,9 +55,11 @@ class RayRunner:
 
     @property
     def nodes(self) -> tuple[Resources, ...]:
+        """See :class:`kissgs.runners.Runner`."""
         return self._nodes
 
     def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
+        """See :class:`kissgs.runners.Runner`."""
         item_id, outcome = secrets.token_hex(8), Future[Outcome]()
         with self._lock:
             if self._closed:
@@ -71,14 +73,17 @@ class RayRunner:
         return RunHandle(item_id, outcome)
 
     def cancel(self, item_id: str) -> None:
+        """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             if item_id in self._items:
                 self._send({"cancel": item_id})
 
     def refusal(self, resources: Resources) -> str | None:
+        """See :class:`kissgs.runners.Runner`."""
         return self._problem or refusal_of(resources, self._nodes)
 
     def health_problem(self) -> str | None:
+        """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             ended = self._driver is None and not self._closed
             if ended and time.monotonic() > self._last_attempt + RECONNECT_SECONDS:
@@ -90,6 +95,7 @@ class RayRunner:
             return self._problem
 
     def close(self) -> None:
+        """See :class:`kissgs.runners.Runner`."""
         with self._lock:
             self._closed = True
             driver, outcomes = self._driver, [outcome for _, outcome in self._items.values()]

@@ -27,6 +27,7 @@ _FREE_PIXELS = 1 << 20  # beyond four per Gaussian: encoders may round sides up 
 
 
 def describe(path: Path | bytes, level: int) -> Facts:
+    """Return the facts of a SOG container."""
     with open_source(path) as files:
         layout = read_layout(files)
         parts = {name: stored_size(files, name) for name in (META_NAME, *layout.images)}

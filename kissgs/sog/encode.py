@@ -41,6 +41,7 @@ FILES = (META_NAME, *MEANS, QUATS, SCALES, SH0, *SHN)  # names of all files that
 
 
 def write_files(plan: EncodingPlan, settings: EncodeSettings, context: Context = DEFAULT_CONTEXT) -> Encoded:
+    """Make the files of a plan."""
     if not plan.grid.mask.any():
         raise UnsupportedError("a SOG file cannot hold a scene without visible Gaussians; write SOG-XT (.zip) instead")
     context.progress("images", 0.0)

@@ -66,14 +66,17 @@ class SogLayout:
 
     @property
     def images(self) -> list[str]:
+        """Names of the images."""
         return [*self.files.values(), *([self.rest.centroids, self.rest.labels] if self.rest else [])]
 
     @property
     def antialiased(self) -> bool:
+        """Whether the scene was trained with antialiasing."""
         return is_antialiased(self.model)
 
     @property
     def sh_degree(self) -> int:
+        """SH degree, 0 to 3."""
         return SH_REST_COUNTS.index(self.rest.coefficients) if self.rest else 0
 
     def value_ranges(self) -> dict[str, tuple[float, float]]:

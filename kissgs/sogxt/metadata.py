@@ -91,6 +91,7 @@ class Layout(BaseModel):
 
     @property
     def antialiased(self) -> bool:
+        """Whether the scene was trained with antialiasing."""
         return is_antialiased(self.model)
 
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
@@ -237,6 +238,7 @@ MISSING = object()  # placeholder for a missing checksum: other encoders and ear
 
 
 def read_layout(source: Source) -> Layout:
+    """Read and check the metadata of a container."""
     names = source.names()
     if JSON_NAME in names:
         layout = _layout_of(_from_json(source.read(JSON_NAME, MAX_METADATA_BYTES)), JSON_NAME)

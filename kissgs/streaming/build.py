@@ -312,6 +312,7 @@ def coarse_note(work: Path, layout: Layout) -> str:
 
 
 def read_environment(work: Path, layout: Layout) -> Splats:
+    """Return the Gaussians of the environment."""
     rows = read_rows(environment_file(work), layout.sh_degree, layout.environment)
     return from_rows(rows, antialiased=layout.antialiased)
 

@@ -51,6 +51,7 @@ class Layout:
 
     @property
     def manifest(self) -> str:
+        """File name of the manifest."""
         return next(name for name, container in MANIFESTS.items() if container == self.container)
 
     @property
@@ -95,6 +96,7 @@ def continuation(work: Path) -> str:
 
 
 def read_layout(work: Path) -> Layout:
+    """Return the layout of a scene that is partitioned."""
     found = json.loads((work / PARTITION).read_bytes())
     return Layout(**{**found, **{name: tuple(found[name]) for name in ("counts", "notes", "origin")}})
 
@@ -115,10 +117,12 @@ def chunk_file(work: Path, chunk: int) -> Path:
 
 
 def environment_file(work: Path) -> Path:
+    """Return the file of the Gaussians of the environment."""
     return work / "environment.f32"
 
 
 def level_file(work: Path, chunk: int, level: int) -> Path:
+    """Return the file of the Gaussians of one level of a chunk."""
     return work / f"chunk_{chunk}_level_{level}.f32"
 
 
@@ -138,5 +142,6 @@ def read_counts(work: Path, name: str) -> dict[str, Any]:
 
 
 def write_json(path: Path, values: object) -> None:
+    """Write JSON atomically."""
     with atomic_file(path, overwrite=True) as file:
         file.write(json.dumps(values, separators=(",", ":")).encode())

@@ -26,6 +26,7 @@ from kissgs.rendering.rasterizer import render
 
 
 def row_bytes(sh_degree: int) -> int:
+    """Return the bytes of one Gaussian."""
     return 4 * (14 + 3 * SH_REST_COUNTS[sh_degree])
 
 
@@ -46,6 +47,7 @@ def from_rows(rows: Float32[np.ndarray, "N F"], *, antialiased: bool) -> Splats:
 
 
 def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
+    """Append rows to a file."""
     with _explained("write", path), path.open("ab") as file:
         file.write(np.ascontiguousarray(rows).data)
 
@@ -63,6 +65,7 @@ def sync(path: Path) -> None:
 
 
 def read_rows(path: Path, sh_degree: int, count: int) -> Float32[np.ndarray, "N F"]:
+    """Read a file of ``count`` rows."""
     with _explained("read", path):
         values, size = np.fromfile(path, np.float32), path.stat().st_size
     if size != count * row_bytes(sh_degree):
@@ -204,4 +207,5 @@ class Environment:
         return found if np.linalg.norm(directions.mean(axis=0)) < ONE_SIDED else none
 
     def contains(self, means: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Return whether each position belongs to the environment."""
         return np.linalg.norm(means.astype(np.float64) - self.center, axis=1) > self.radius

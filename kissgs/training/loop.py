@@ -62,6 +62,8 @@ class Regularizer(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class TrainingPlan:
+    """Settings of a training."""
+
     stage: str  # in progress events
     pace: Pace
     rates: LrSchedule
@@ -159,6 +161,7 @@ class RunningMeans:
     error: float = math.nan
 
     def add(self, loss: float, error: float) -> None:
+        """Add the values of a step."""
         first = math.isnan(self.loss)
         self.loss = loss if first else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
         self.error = error if first else SMOOTHING * self.error + (1 - SMOOTHING) * error

@@ -295,9 +295,11 @@ class GaussianModel:
 
     @property
     def antialiased(self) -> bool:
+        """See :class:`kissgs.Splats`."""
         return self._rest.antialiased
 
     def gaussians(self) -> dict[str, Tensor]:
+        """Return the parameters themselves."""
         return self.parameters
 
     def __len__(self) -> int:
@@ -315,6 +317,7 @@ class GaussianModel:
             self._adam.step(rates)
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
+        """Keep only the Gaussians at ``index``, with their Adam moments."""
         self._adam.keep(index)
 
     def splats(self) -> Splats:

@@ -49,6 +49,7 @@ class SupervisionViews:
 
     @property
     def eval_views(self) -> Views:
+        """Evaluation views, for :func:`kissgs.evaluate`."""
         return Views((), self.test, self.background, self.source)
 
 

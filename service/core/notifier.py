@@ -24,6 +24,7 @@ class JobNotifier:
         return event
 
     def notify(self, name: str) -> None:
+        """Wake all subscribers of ``name``."""
         event = self._waiting.pop(name, None)
         if event is not None:
             event.set()

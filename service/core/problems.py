@@ -108,6 +108,7 @@ class ProblemError(Exception):
 
 
 def problem(code: str, detail: str, *, errors: list[dict[str, Any]] | None = None) -> Problem:
+    """Build the document of one problem."""
     kind = PROBLEM_TYPES[code]
     return Problem(
         type=f"/v1/problems/{code}",
@@ -121,10 +122,12 @@ def problem(code: str, detail: str, *, errors: list[dict[str, Any]] | None = Non
 
 
 def invalid(detail: str) -> ProblemError:
+    """Return the problem of an invalid request."""
     return ProblemError("invalid-request", detail)
 
 
 def disk_full(detail: str) -> ProblemError:
+    """Return the problem of a full disk."""
     return ProblemError("disk-full", detail, retry_after=600)
 
 

@@ -45,6 +45,7 @@ class StrictConnection(h11.Connection):
     """h11 that refuses requests whose end other programs may see elsewhere, and take the rest for a request."""
 
     def next_event(self) -> h11.Event | type[h11.NEED_DATA] | type[h11.PAUSED]:
+        """Return the next event."""
         event = super().next_event()
         if isinstance(event, h11.Request):
             names = {name for name, _ in event.headers}
@@ -139,6 +140,7 @@ class TimeoutProtocol(H11Protocol):
         self.transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
+        """Cancel the timers of the connection."""
         for timer in (self._listening, self._watching):
             if timer is not None:
                 timer.cancel()
@@ -156,6 +158,7 @@ def allow_connections() -> None:
 
 
 def listen(settings: ServiceSettings) -> socket.socket:
+    """Open the listening socket."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
         listener = socket.create_server((settings.host, settings.port), family=family, backlog=2048)
@@ -197,6 +200,7 @@ class Server(uvicorn.Server):
 
 
 def config_of(app: object) -> uvicorn.Config:
+    """Return the uvicorn configuration for an application."""
     return uvicorn.Config(
         app,  # type: ignore[arg-type]
         http=TimeoutProtocol,

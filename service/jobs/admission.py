@@ -57,6 +57,7 @@ class Admission:
 
     @property
     def uploads(self) -> int:
+        """Number of uploads in progress."""
         return self._uploads.total()
 
     @contextlib.contextmanager

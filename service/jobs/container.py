@@ -37,6 +37,7 @@ class Readiness:
         self._checked = 0.0
 
     async def health(self, check: Callable[[], Awaitable[Health]]) -> Health:
+        """Return the latest result, or that of a new check."""
         clock = asyncio.get_running_loop().time
         async with self._lock:
             if self._found is None or clock() - self._checked > READY_SECONDS:
@@ -47,6 +48,8 @@ class Readiness:
 
 @dataclass(frozen=True, slots=True)
 class ServiceContainer:
+    """All parts of a running service."""
+
     settings: ServiceSettings
     store: Store
     storage: JobStorage

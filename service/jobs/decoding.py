@@ -71,6 +71,7 @@ class Decoder:
         self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id), reclaimable_bytes=reclaimable)
 
     def stop(self, job_id: str) -> None:
+        """Kill the decoding of a job, if it is running."""
         process = self._processes.get(job_id)
         if process is not None:
             process.kill()

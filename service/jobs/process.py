@@ -46,6 +46,7 @@ class JobRunners:
 
     @classmethod
     def open(cls, settings: ServiceSettings) -> JobRunners:
+        """Open the runner that the settings name."""
         local = runners.LocalRunner()
         if settings.ray_address is None:
             return cls(settings, local, local)
@@ -61,6 +62,7 @@ class JobRunners:
         self.local.close()
 
     def runner_of(self, task: dict[str, Any]) -> Runner:
+        """Return the runner of a task."""
         return self.local if task["function"] == DECODE else self.runner
 
     def request(self, *, trains: bool = False) -> Resources:

@@ -29,6 +29,7 @@ class QueueEstimator:
         self._latest: Queue | None = None
 
     def current(self) -> Queue:
+        """Return the estimates at this moment."""
         with self._lock:
             changes = self._store.changes  # first, so that a change during the reading is read the next time
             if self._latest is None or changes != self._changes:
@@ -97,6 +98,7 @@ _OF_RESULTS = ("source_format", "compacted", "finetuning", "invisible", "cleaned
 
 
 def job_status(job: Job, queue: Queue) -> JobStatus:
+    """Return the current status of a job."""
     waits, runs, result = job.state == State.QUEUED, job.state == State.RUNNING, job.result or {}
     estimate = None
     if waits or runs:

@@ -221,6 +221,7 @@ class Worker:
     _postponed_reason: str = ""
 
     def start(self) -> None:
+        """Start to run jobs."""
         self._loops = [asyncio.create_task(self._loop(i)) for i in range(self.settings.workers)]
 
     def health_problem(self) -> str | None:
@@ -250,6 +251,7 @@ class Worker:
         await asyncio.gather(*self._loops, return_exceptions=True)
 
     def kill_running(self) -> None:
+        """Kill all job processes."""
         for process in self._processes.values():
             process.kill()
 

@@ -83,6 +83,7 @@ class JobStorage:
         self._lock.close()
 
     def new_upload(self) -> Path:
+        """Return a new path for an upload."""
         return self.incoming / f"{secrets.token_hex(8)}.part"
 
     def discard(self, path: Path) -> None:
@@ -112,6 +113,7 @@ class JobStorage:
         sync_folder(self.jobs)
 
     def upload(self, job_id: str) -> Path:
+        """Return the path of the job's upload."""
         paths = [self.jobs / job_id / name for name in UPLOAD_FILES]
         return next((path for path in paths if path.exists()), paths[0])
 
@@ -124,6 +126,7 @@ class JobStorage:
         return self.jobs / job_id / "decoded.ply"
 
     def discard_checkpoints(self, job_id: str) -> None:
+        """Remove the checkpoints of a job."""
         for path in (self.jobs / job_id).glob("checkpoint*.npz"):
             self.discard(path)
 
@@ -132,16 +135,20 @@ class JobStorage:
         return [path for path in (self.upload(job_id), self.decoded(job_id)) if path.exists()]
 
     def reclaimable_bytes(self, job_id: str) -> int:
+        """Return the bytes that an ended job can do without."""
         return sum(path.stat().st_size for path in self.reclaimable_files(job_id))
 
     def upload_name(self, job_id: str) -> str | None:
+        """Return the name of the job's upload; None if there is none."""
         path = self.upload(job_id)
         return path.name if path.is_file() else None
 
     def checkpoints(self, job_id: str) -> list[str]:
+        """Return the names of the job's checkpoints."""
         return sorted(path.name for path in (self.jobs / job_id).glob("checkpoint*.npz"))
 
     def new_work(self, job_id: str) -> Path:
+        """Create a new work folder for a job process."""
         folder = self.jobs / job_id / f"work-{secrets.token_hex(8)}"
         folder.mkdir()
         return folder
@@ -182,6 +189,7 @@ class JobStorage:
         return found
 
     def job_bytes(self, job_id: str) -> int:
+        """Return the size of all files of a job, bytes."""
         return sum(path.stat().st_size for path in (self.jobs / job_id).rglob("*") if path.is_file())
 
     # Removal ----------------------------------------------------------------------------------------------------------
@@ -239,6 +247,7 @@ class JobStorage:
         return self.jobs / ORPHANED
 
     def job_ids(self) -> set[str]:
+        """Return the ids of all jobs that have a folder."""
         return {path.name for path in self.jobs.iterdir() if JOB.fullmatch(path.name) and path.is_dir()}
 
     def set_aside(self, job_id: str, why: str) -> None:
@@ -259,6 +268,7 @@ class JobStorage:
             log.warning(text, self.orphaned, len(unknown))
 
     def count_orphaned(self) -> int:
+        """Return the number of entries of the orphaned folder."""
         try:
             return sum(1 for _ in self.orphaned.iterdir())
         except OSError:
@@ -289,10 +299,12 @@ class JobStorage:
         return None
 
     def check(self) -> None:
+        """Check that files can be stored."""
         if problem := self.health_problem():
             raise OSError(problem)
 
     def free_bytes(self) -> int:
+        """Return the free bytes of the disk."""
         return shutil.disk_usage(self.root).free
 
     def keep_reserve(self) -> None:

@@ -48,6 +48,7 @@ class Store:
         self.changes = 0  # of the queue so far
 
     def close(self) -> None:
+        """Close all connections."""
         self._engine.dispose()
         self.monitor.close()
 
@@ -89,6 +90,7 @@ class Store:
         return job if job is not None and owner in (None, job.owner) else None
 
     def by_idempotency_key(self, owner: str, key: str) -> Job | None:
+        """Return the job that ``owner`` submitted with this key; None if there is none."""
         return self._one(sa.select(Job).where(Job.owner == owner, Job.idempotency_key == key))
 
     def listing(self, owner: str, *, limit: int, before: int | None = None, state: State | None = None) -> list[Job]:
@@ -116,16 +118,19 @@ class Store:
     # Sums ----------------------------------------------------------------------------------------------------------
 
     def counts(self) -> dict[State, int]:
+        """Return the number of jobs in each state."""
         with self._reading() as session:
             rows = session.execute(sa.select(Job.state, sa.func.count()).group_by(Job.state)).all()
         found = {State(state): count for state, count in rows}
         return {state: found.get(state, 0) for state in State}
 
     def active_of(self, owner: str) -> int:
+        """Return the number of queued and running jobs of an owner."""
         with self._reading() as session:
             return _count(session, Job.owner == owner, Job.state.in_(ACTIVE))
 
     def disk_bytes(self) -> int:
+        """Return the disk space of all jobs, bytes."""
         return self._one(sa.select(sa.func.sum(Job.disk_bytes))) or 0
 
     def rates(self, preset: str, evaluate: bool) -> list[float]:
@@ -138,6 +143,7 @@ class Store:
         return [spent / count for spent, count in latest if spent and count >= 10_000][:21]
 
     def ids(self, *states: State) -> set[str]:
+        """Return the ids of all jobs in ``states``, by default of all jobs."""
         return set(self._all(sa.select(Job.id).where(Job.state.in_(states or tuple(State)))))
 
     def due(self, states: Iterable[State], before: float) -> list[tuple[int, str]]:
@@ -152,6 +158,7 @@ class Store:
         return self._one(query.order_by(Job.number).limit(1))
 
     def reclaimable_bytes(self) -> int:
+        """Return the bytes of all reclaimable files of ended jobs."""
         query = sa.select(sa.func.sum(Job.reclaimable_bytes)).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
         return self._one(query) or 0
 
@@ -228,6 +235,7 @@ class Store:
             session.execute(sa.update(Job).where(Job.number == number).values(**values))
 
     def forget(self, number: int) -> None:
+        """Remove a job and its events."""
         with self._write() as session:
             session.execute(sa.delete(Event).where(Event.job == number))
             session.execute(sa.delete(Job).where(Job.number == number))

@@ -132,6 +132,8 @@ MAX_LISTED_FOLDERS = 4  # maximum number of folders named in a message
 
 @dataclass(frozen=True, slots=True)
 class FoundPhoto:
+    """File of a photograph."""
+
     path: Path
     factor: int  # original size divided by this photograph's size, according to the folder's name
     folder: Path  # folder of photographs that contains the file, perhaps in a subfolder

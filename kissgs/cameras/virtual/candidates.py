@@ -127,6 +127,8 @@ CENTRE_SCALE = 30.0  # of the mark of central Gaussians, to use half the range o
 
 @dataclass(frozen=True, slots=True)
 class ViewStats:
+    """Statistics of a thumbnail."""
+
     alpha: float  # mean alpha, 0 to 1
     log_size: float  # median logarithm of the largest scale, world units; large where no photograph shows a part
     log_angle: float  # median logarithm of the angle that these scales subtend, radians

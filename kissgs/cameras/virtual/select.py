@@ -55,6 +55,7 @@ class ScoredCandidates:
 
     @property
     def bounds(self) -> SceneBounds:
+        """Bounds of the scene, or of the region."""
         return self.scorer.bounds
 
     @property

@@ -46,6 +46,7 @@ class Projection(NamedTuple):
 
     @classmethod
     def of(cls, splats: Splats, camera: Camera) -> Projection:
+        """Return the projection of a scene into the image of a camera."""
         pose = camera.viewmat, camera.K, np.ascontiguousarray(camera.position), int(camera.width), int(camera.height)
         depths, dilation = (constants.NEAR, constants.FAR), float(camera.dilation)
         antialiased = bool(splats.antialiased)
