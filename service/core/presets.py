@@ -28,8 +28,6 @@ class _Facts:
     tuning: tuple[float, float]  # of all Gaussians
 
 
-_STATED = ("title", "description", "bytes_per_gaussian", "psnr_change", "cpu_seconds_per_million")
-
 _FACTS: dict[kissgs.Preset, _Facts] = {
     kissgs.Preset.FAST: _Facts(
         "Fast", "Takes seconds; for previews and quick checks.", 13.02, -0.37, 13, (10, 120), (50, 300)
@@ -54,7 +52,11 @@ def presets() -> Presets:
             PresetFacts(
                 name=name,
                 settings=kissgs.Settings(preset=name).model_dump(mode="json"),
-                **{each: getattr(facts, each) for each in _STATED},
+                title=facts.title,
+                description=facts.description,
+                bytes_per_gaussian=facts.bytes_per_gaussian,
+                psnr_change=facts.psnr_change,
+                cpu_seconds_per_million=facts.cpu_seconds_per_million,
             )
             for name, facts in _FACTS.items()
         ],

@@ -92,9 +92,8 @@ class Queue:
         return min(300.0, max(1.0, min(map(self._remaining, self._running), default=1.0) / self._workers))
 
 
-_OF_JOBS = ("id", "name", "upload_bytes", "gaussians", "sh_degree", "starts", "problem")
 _OF_RESULTS = ("source_format", "compacted", "finetuning", "invisible", "cleaned", "evaluation")
-"""Columns of a job, and entries of a result's summary, that the status has under the same names."""
+"""Entries of a result's summary that the status has under the same names."""
 
 
 def job_status(job: Job, queue: Queue) -> JobStatus:
@@ -116,7 +115,13 @@ def job_status(job: Job, queue: Queue) -> JobStatus:
         timings=_timings(job, queue.now),
         links=_links(job),
         expires_at=as_datetime(job.expires_at) if job.expires_at is not None else None,
-        **{name: getattr(job, name) for name in _OF_JOBS},
+        id=job.id,
+        name=job.name,
+        upload_bytes=job.upload_bytes,
+        gaussians=job.gaussians,
+        sh_degree=job.sh_degree,
+        starts=job.starts,
+        problem=job.problem,
         **{name: result.get(name) for name in _OF_RESULTS},
     )
 

@@ -63,13 +63,13 @@ def tuned(
     return work(plan, plan, scene, written(settings, container), checkpoint)
 
 
-@pytest.mark.parametrize(("degree", "rate_weight"), [(2, 0.0), (0, 0.0), (2, 2.0)])
+@pytest.mark.parametrize(("degree", "rate_weight", "gain"), [(2, 0.0, 0.8), (0, 0.0, 0.3), (2, 2.0, 0)])
 @pytest.mark.quick(2)
-def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree, rate_weight):
-    """Gains are 0.4 to 2.0 dB with twelve small training images; a weight of bits trades some of them for bytes."""
+def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree, rate_weight, gain):
+    """Gains are 2.4 dB of degree 2 and 0.4 of degree 0, with twelve images; a weight of bits trades some for bytes."""
     encoded, report = tuned(cloud(150, degree), steps=150, rate_weight=rate_weight)
     assert report.kept
-    assert report.psnr_after > report.psnr_before + (0 if rate_weight else 0.3)
+    assert report.psnr_after > report.psnr_before + gain
     assert report.bytes_after < (0.97 if rate_weight else 2) * report.bytes_before
     assert report.bytes_after == len(zip_bytes(encoded.files))
     assert report.target_source == "renderings"

@@ -32,12 +32,34 @@ Object.assign(WebGL2RenderingContext.prototype, {
 });
 const request = window.requestAnimationFrame;
 window.requestAnimationFrame = (call) => { frames++; return request(call); };
+// Spark sorts in a worker, which answers a request of a number with the same number, after perhaps some "status".
+const asked = new Set();
+window.Worker = class extends Worker {
+  #requests = new Map();
+  constructor(...all) {
+    super(...all);
+    this.addEventListener("message", ({ data }) => data?.status ?? asked.delete(this.#requests.get(data?.id)));
+  }
+  postMessage(message, ...others) {
+    super.postMessage(message, ...others);
+    if (message?.id === undefined) return;
+    const request = {};
+    this.#requests.set(message.id, request);
+    asked.add(request);
+  }
+  terminate() {
+    for (const request of this.#requests.values()) asked.delete(request);
+    super.terminate();
+  }
+};
 window.resourceCounts = () => {
   const alive = [...contexts].filter(([context]) => !context.isContextLost());
-  return { contexts: alive.length, textures: alive.reduce((sum, [, textures]) => sum + textures, 0), frames };
+  const textures = alive.reduce((sum, [, textures]) => sum + textures, 0);
+  return { contexts: alive.length, textures, frames, asked: asked.size };
 };
 """
-"""Script that counts live WebGL contexts, their textures and requested animation frames."""
+"""Script that counts live WebGL contexts, their textures, requested animation frames, and requests to Spark's worker
+without an answer."""
 
 
 @pytest.fixture(scope="module")
@@ -107,11 +129,12 @@ class Preview:
         return np.asarray(Image.open(io.BytesIO(screenshot)).convert("RGB")).astype(int)
 
     def still_image(self, seconds=300):
-        """Return a screenshot when no frame has been requested for 0.3 s, so that Spark has finished sorting."""
+        """Return a screenshot when Spark has sorted, and no frame has been requested for 0.3 s."""
         end, frames, still = time.monotonic() + seconds, -1, 0
         while time.monotonic() < end:
-            before, frames = frames, self.page.evaluate("resourceCounts().frames")
-            still = still + 1 if frames == before else 0
+            counts = self.page.evaluate("resourceCounts()")
+            still = still + 1 if counts["frames"] == frames and not counts["asked"] else 0
+            frames = counts["frames"]
             if still == 3:
                 return self.pixels()
             self.page.wait_for_timeout(100)

@@ -88,7 +88,7 @@ def test_a_sog(tmp_path, shown, preview):  # noqa: F811
     kissgs.save(splats, tmp_path / "scene.ply")
     read = shown(page_scene(tmp_path / "scene.ply"), len(splats))
     served = shown(page_scene(sog), len(splats))
-    assert psnr(read[:-80], served[:-80]) > 30  # another order of few Gaussians; below are the buttons
+    assert psnr(read[:-80], served[:-80]) > 40  # below are the buttons, which differ
     path = tmp_path / "page.html"
     path.write_bytes(standalone_page(page_scene(sog)))
     tab = preview(offline=True)

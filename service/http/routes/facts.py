@@ -26,12 +26,6 @@ router = APIRouter()
 
 API_VERSION = "1.0"
 
-_SAME_NAMES = (
-    *("max_upload_bytes", "max_header_bytes", "max_gaussians", "max_queue", "max_uploads"),
-    *("job_seconds", "keep_seconds", "sync_seconds"),
-)
-"""Limits that are settings of the same names."""
-
 
 @router.get("/v1/limits", tags=["facts"], operation_id="limits", summary="Get the limits")
 async def get_limits(context: Service) -> Limits:
@@ -44,7 +38,14 @@ async def get_limits(context: Service) -> Limits:
         max_jobs_per_key=settings.max_jobs_per_key if settings.keys else None,
         job_memory_bytes=settings.job_memory,
         max_wait_seconds=MAX_WAIT_SECONDS,
-        **{name: getattr(settings, name) for name in _SAME_NAMES},
+        max_upload_bytes=settings.max_upload_bytes,
+        max_header_bytes=settings.max_header_bytes,
+        max_gaussians=settings.max_gaussians,
+        max_queue=settings.max_queue,
+        max_uploads=settings.max_uploads,
+        job_seconds=settings.job_seconds,
+        keep_seconds=settings.keep_seconds,
+        sync_seconds=settings.sync_seconds,
         keys_required=bool(settings.keys),
         training=can_train(),
     )
