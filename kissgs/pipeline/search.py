@@ -45,7 +45,7 @@ RENDERED_POINTS = 5  # last point pruned without training on renderings, from wh
 RECOVERABLE_DB = 1.5
 # Expected of a trained container, before the first one is made: bytes per Gaussian, those of view-dependent colour in
 # addition, and those that are no images.
-BYTES_PER_GAUSSIAN, BYTES_OF_SH, OVERHEAD_BYTES = 8.6, 4.0, 4000
+BYTES_PER_GAUSSIAN, BYTES_OF_SH, OVERHEAD_BYTES = 8.6, 4.0, 3300
 SIZE_BY_COUNT = 0.6  # exponent of the number of Gaussians to which the size of a container grows at equal lambda
 HALF_LEFT = 1.0  # margin of a point before any encoding that leaves half of the allowed loss to the encoder
 # Margin that ends a search, as log2 of the number of Gaussians: 0.03 dB of PSNR; less in a time that is given.

@@ -220,7 +220,7 @@ def test_a_stopped_search_for_a_count_encodes_what_it_has(tmp_path, stage):
     assert found.report.trials[-1].drop <= 9
     stopped.clear()
     with pytest.raises(kissgs.StopSearch):
-        kissgs.compress(scene, settings=with_photographs(target_size=4100), views=views, progress=stop)
+        kissgs.compress(scene, settings=with_photographs(target_size=3400), views=views, progress=stop)
 
 
 def darkening(monkeypatch):
