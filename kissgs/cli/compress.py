@@ -91,7 +91,7 @@ def compact(
 ) -> None:
     """Reduce the number of Gaussians of scenes at nearly equal quality: score, prune and train (POPSpa), or merge.
 
-    The preset fast only prunes; balanced, small and paper also train.
+    The preset fast only prunes; balanced and paper also train.
     """
     from kissgs.cli.signals import stoppable
     from kissgs.cli.tables import compaction_table
