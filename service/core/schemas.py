@@ -27,7 +27,7 @@ class JobOptions(kissgs.Settings):
         json_schema_extra={
             "examples": [
                 {"preset": "balanced"},
-                {"preset": "small", "encode": {"seed": 7}},
+                {"preset": "fast", "encode": {"seed": 7}},
                 {"compact": {"ratio": 0.2}},
                 {"finetune": {"enabled": True}},
                 {"encode": {"target_size": 3_000_000}, "time_limit": 120},

@@ -171,7 +171,7 @@ REPEATED = {
     "quality": {"encode": {"quality": "same"}},
     "loss and time": {"encode": {"max_psnr_drop": 0.25}, "time_limit": "1min"},
     "share": {"preset": "fast", "compact": {"ratio": 0.125}},
-    "count": {"preset": "small", "compact": {"count": 120}},
+    "count": {"preset": "paper", "compact": {"count": 120}},
     "loss by pruning": {"compact": {"max_psnr_drop": 0.3}},
     "time": {"time_limit": 45},
 }
