@@ -170,11 +170,10 @@ def _output_format(output: str, to: str | None) -> str:
 def sample(
     output: Annotated[Path, Argument(help="Output NAME.ply; other formats as for convert.")],
     gaussians: Annotated[int, Option(min=0, help="Number of Gaussians.")] = 60_000,
-    degree: Annotated[int, Option(min=0, max=3, help="Degree of the spherical harmonics.")] = 3,
     force: ForceOption = False,
 ) -> None:
     """Write a synthetic sample scene: shiny, textured objects on a table."""
     from kissgs.pipeline.scene_files import save
     from kissgs.synthetic import sample_scene
 
-    save(sample_scene(gaussians, sh_degree=degree), output, overwrite=force)
+    save(sample_scene(gaussians), output, overwrite=force)

@@ -193,10 +193,9 @@ def compact(
     Raises:
         KissgsError: one of its subclasses, with a message for the user.
     """
-    from kissgs.cameras.captures.load import as_views
     from kissgs.compaction.budget import compact_scene
 
-    views = as_views(views)
+    views = _loaded(views)
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_ply(target, overwrite=overwrite)
@@ -277,10 +276,9 @@ def compress(
     Raises:
         KissgsError: one of its subclasses, with a message for the user.
     """
-    from kissgs.cameras.captures.load import as_views
     from kissgs.pipeline.encoding import Work
 
-    views = as_views(views)
+    views = _loaded(views)
     requested, keep_all = settings or Settings(), sensitivity is not None
     settings = resolved(requested, views, keep_all=keep_all)
     target, kind = None if destination is None else Path(destination), named_container(container, destination)
@@ -360,6 +358,15 @@ def compress(
     order = encoded.order if compacted is None else compacted.index[encoded.order]
     remaining = () if target is not None else tuple(path for path in checkpoints if path is not None)
     return Compressed(encoded.files, order, report, remaining, kind)
+
+
+def _loaded(views: Views | AnyPath | None) -> Views | None:
+    """Return the views, loaded if they are the path of a capture."""
+    if views is None:
+        return None
+    from kissgs.cameras.captures.load import as_views
+
+    return as_views(views)
 
 
 def _fitting(splats: Splats, views: Views | None, context: Context, *, force: bool) -> tuple[Views | None, str]:
