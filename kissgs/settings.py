@@ -385,7 +385,7 @@ _PAPER_LOSS = {"ssim_weight": 0.2, "mse_weight": 0.0, "synthetic_view_share": 0.
 
 PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
     Preset.FAST: {
-        "compact": {"sparsify_steps": 0, "refine_steps": 0},
+        "compact": {"method": "merge", "sparsify_steps": 0, "refine_steps": 0},
         "encode": {
             "rate_distortion": False,
             "order": "hilbert",

@@ -30,7 +30,7 @@ class _Facts:
 
 _FACTS: dict[kissgs.Preset, _Facts] = {
     kissgs.Preset.FAST: _Facts(
-        "Fast", "Takes seconds; for previews and quick checks.", 13.02, -0.37, 13, (10, 120), (50, 300)
+        "Fast", "Takes seconds; for previews and quick checks.", 13.02, -0.37, 13, (1, 15), (50, 300)
     ),
     kissgs.Preset.BALANCED: _Facts(
         "Balanced", "The best quality for its size. The default.", 11.90, -0.28, 205, (300, 600), (50, 1300)

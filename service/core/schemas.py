@@ -213,8 +213,8 @@ class Limits(ApiModel):
     max_wait_seconds: float
     keys_required: bool
     training: bool = Field(
-        description="Whether the server has torch. Without it, it cannot fine-tune, and compacts only with the preset "
-        "fast or the method merge."
+        description="Whether the server has torch. Without it, it cannot fine-tune, and compacts only with the method "
+        "merge, that of the preset fast."
     )
 
 

@@ -255,7 +255,14 @@ def test_reload_and_cancel(visit, start):
 def test_training_notes_are_shown(visit, start):
     service = start()
     page = visit(service)
-    changes = {"count": 100, "sparsify_steps": 1000, "refine_steps": 1000, "views": 24, "view_size": 48}
+    changes = {
+        "method": "prune",
+        "count": 100,
+        "sparsify_steps": 1000,
+        "refine_steps": 1000,
+        "views": 24,
+        "view_size": 48,
+    }
     job = service.submit(options=json.dumps({"preset": "fast", "compact": changes, "for_research": True}))
     page.goto(f"{service.url}/#{job['id']}")
     page.locator("#job .note", has_text="Gaussians, loss").wait_for()
