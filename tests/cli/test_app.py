@@ -1,8 +1,6 @@
 """The command line as a user runs it. Oracle: the library's own functions, and the promises of the README."""
 
-import errno
 import json
-import os
 import signal
 import subprocess
 import time
@@ -220,18 +218,6 @@ def test_standard_output_escapes_what_its_encoding_lacks(scene, tmp_path, encodi
     assert b"\\u2026" in run("compress", "--help", encoding="ascii").stdout
     done = run("convert", name, "ü.ply", "--json", cwd=tmp_path, encoding=encoding)
     assert json.loads(done.stdout)["input"] == name
-
-
-@pytest.mark.parametrize("option", ["--unpacked", "--quiet"])
-def test_a_disk_that_fills_up_leaves_no_file(scene, tmp_path, monkeypatch, option):
-
-    def full(descriptor):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    words = ["compress", scene, "-p", "fast", "-o", f"{tmp_path}/new/", option]
-    assert "no space left on device" in failure(*words)
-    assert sorted(tmp_path.rglob("*")) == [tmp_path / "new"]  # which another command may be about to write into
 
 
 def test_interrupt_leaves_nothing(tmp_path):

@@ -80,18 +80,6 @@ def test_bytes_are_the_same_again_and_the_scene_is_unchanged(ending):
         assert struct.unpack_from("<I", data, 4) == (0,), "gzip's time"
 
 
-@pytest.mark.parametrize("ending", CLEANED)
-def test_a_scene_without_gaussians(ending):
-    if ending in (".compressed.ply", ".splat"):
-        assert len(read(written(made_scene(0, 1), ending)[0], ending)) == 0
-        return
-    message = (
-        rf"^a scene without Gaussians cannot be written as \{ending.replace('.spz.glb', '.glb')}; write it as \.ply$"
-    )
-    with pytest.raises(UnsupportedError, match=message):
-        written(made_scene(0, 1), ending)
-
-
 # The compressed .ply.
 
 

@@ -2,7 +2,6 @@
 
 import math
 import re
-from dataclasses import replace
 
 import pytest
 
@@ -70,19 +69,6 @@ def test_a_quality_that_cannot_be_met_is_named_with_all_that_is_missed():
         "quality same cannot be met: the finest container found loses 0.12 dB and 0.2 of SSIM in the worst patch; "
         "choose a lower quality, or give max_psnr_drop"
     )
-
-
-def test_what_the_user_has_named_is_named_in_errors():
-    lost = Attempt(1, 1e-9, 10, **{**SAME, "drop": 0.2, "psnr": 53.36})
-    message = goal_of(quality="same", max_psnr_drop=0.01).failure_message([lost], suggest_compaction=False)
-    assert message == (
-        "max_psnr_drop 0.01 dB cannot be met: the finest container found loses 0.201 dB; allow at least that"
-    )
-    message = goal_of(quality="good", psnr=55).failure_message([lost], suggest_compaction=False)
-    assert message == "psnr 55 dB cannot be met: the finest container found has 53.36 dB; ask for at most that"
-    both = replace(lost, ssim_drop=0.01)
-    message = goal_of(quality="same", max_psnr_drop=0.01).failure_message([both], suggest_compaction=False)
-    assert message.startswith("max_psnr_drop 0.01 dB and quality same cannot be met: ")
 
 
 @pytest.mark.parametrize("drops", [(math.nan, 0.001), (0.05, math.nan), (math.nan, math.nan)])

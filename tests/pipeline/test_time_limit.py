@@ -1,7 +1,6 @@
 """Limited time. Oracle: the limit itself, and what the container shows of the work that was done."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -256,14 +255,6 @@ def test_the_note_says_what_torch_would_have_bought(tmp_path, monkeypatch):
         plenty, little = (Settings.research("balanced", time_limit=t, **FEW_VIEWS) for t in (LONG, 1e-3))
         assert "torch is missing" in kissgs.compress(scene, settings=plenty, views=capture).report.note
         assert "torch is missing" not in kissgs.compress(scene, settings=little, views=capture).report.note
-
-
-def test_captures_without_held_out_photographs_are_not_trained_on(tmp_path):
-    scene = cloud(60)
-    views = replace(photographs(scene, tmp_path), test=())
-    found = kissgs.compress(scene, settings=with_photographs().model_copy(update={"time_limit": LONG}), views=views)
-    assert found.report.finetuning is None
-    assert found.report.compaction is None
 
 
 @pytest.mark.quick(1)

@@ -12,7 +12,6 @@ from helpers.render_scenes import blobs, camera, one, together
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.core.context import load_kernels
 from kissgs.core.errors import InvalidSceneError, InvalidViewsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
@@ -273,12 +272,6 @@ def test_invalid_arguments_are_refused(change, error, message):
 def test_rendering_on_cuda_without_a_device_is_refused():
     with pytest.raises(UnsupportedError, match="no CUDA device"):
         render(blobs(1), camera(), device="cuda")
-
-
-def test_loading_the_kernels_reports_progress():
-    events = []
-    load_kernels(lambda stage, fraction: events.append((stage, fraction)))
-    assert events == [("kernels", 0.0), ("kernels", 1.0)]
 
 
 def test_cameras_may_have_any_dtype_and_layout():
