@@ -194,6 +194,22 @@ def test_a_checkpoint_belongs_to_one_sog_container_and_its_tables(tmp_path, monk
             tuning(start, start, scene, files, path)
 
 
+def test_training_continues_if_a_checkpoint_cannot_be_saved(tmp_path, monkeypatch):
+    monkeypatch.setattr(Checkpoint, "due", True)
+    saves, whole, expected = [], Checkpoint.save, tuned(cloud(60))[0].files
+
+    def save(self, state):
+        saves.append(1)
+        if len(saves) > 3:
+            raise OutputError("no space left")
+        whole(self, state)
+
+    monkeypatch.setattr(Checkpoint, "save", save)
+    found, report = tuned(cloud(60), checkpoint=tmp_path / "c.npz")
+    assert "went on without a checkpoint: no space left" in report.note
+    assert found.files == expected
+
+
 def test_compress_fine_tunes_and_reports_it(tmp_path):
     settings = Settings.research("fast", finetune=SHORT)
     result = kissgs.compress(cloud(200), tmp_path / "a.zip", settings=settings, checkpoint=tmp_path / "c.npz")
