@@ -360,13 +360,6 @@ def with_entries(count):
     return local + count * entry + struct.pack("<4s4xHHIIH", b"PK\5\6", count, count, count * len(entry), len(local), 0)
 
 
-def sog(meta):
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("meta.json", meta)
-    return buffer.getvalue()
-
-
 def behind_its_end(data):
     """Put bytes like those of another end, 6 bytes before the last, into the end of a zip: where its list begins."""
     return data[:-6] + b"PK\5\6" + data[-2:]
@@ -378,7 +371,9 @@ HEADERS = {
     "texts.glb": lambda: glb(b'{"nodes": [' + b'"a",' * 1_000_000 + b"0]}"),
     "lists.glb": lambda: glb(b'{"nodes": ' + b"[[]," * 1_000_000 + b"0" + b"]" * 1_000_000 + b"}"),
     "objects.glb": lambda: glb(b'{"nodes": [' + b'{"a":0},' * 120_000 + b"{}]}"),
-    "meta.sog": lambda: sog(b'{"version": 2, "means": [' + b'{"a":0},' * 125_000 + b"0]}"),
+    "meta.sog": lambda: zip_of(
+        {"meta.json": b'{"version": 2, "means": [' + b'{"a":0},' * 125_000 + b"0]}"}, zipfile.ZIP_DEFLATED
+    ),
     "entries.sog": lambda: with_entries(40_000),
     "hidden.sog": lambda: behind_its_end(with_entries(40_000)),
     "sections.ksplat": lambda: KSPLAT,

@@ -1,7 +1,6 @@
 """Containers under any name and in any kind of zip, and scenes written by the ending of their name. Oracles: all
 commands agree on what is a container; the readers of each format."""
 
-import io
 import re
 import zipfile
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.format_scenes import made_scene
+from helpers.reference_sog import zip_of
 
 import kissgs
 from kissgs import InvalidContainerError, KissgsError, OutputError, Settings, UnsupportedError, decompress, sample_scene
@@ -21,14 +21,6 @@ def zips():
     """Return one container as zips in many forms, by file name."""
     packed = kissgs.compress(sample_scene(50), settings=Settings.from_preset("fast"))
 
-    def again(method=zipfile.ZIP_STORED, folder="", comment=b""):
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w", method) as archive:
-            for name, data in packed.files.items():
-                archive.writestr(folder + name, data)
-            archive.comment = comment
-        return buffer.getvalue()
-
     plain = packed.to_zip()
     return {
         "plain.zip": plain,
@@ -36,9 +28,9 @@ def zips():
         "other.ending": plain,
         "no_ending": plain,
         "named.ply": plain,
-        "deflated.zip": again(zipfile.ZIP_DEFLATED),
-        "folder.zip": again(folder="a/b c/"),
-        "comment.zip": again(comment=b"x" * 65535),
+        "deflated.zip": zip_of(packed.files, zipfile.ZIP_DEFLATED),
+        "folder.zip": zip_of(packed.files, folder="a/b c/"),
+        "comment.zip": zip_of(packed.files, comment=b"x" * 65535),
         "program.exe": b"MZ" + bytes(5000) + plain,
         "script.zip": b"#!/bin/sh\nexec unzip $0\n" + plain,
         "empty line.zip": b"\n" + plain,

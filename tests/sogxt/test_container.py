@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers.codec_scenes import random_scene
 from helpers.memory import takes_less_than
+from helpers.reference_sog import zip_of
 
 import kissgs
 from kissgs.core.errors import InvalidContainerError, OutputError, UnsupportedError
@@ -24,15 +25,6 @@ from kissgs.sogxt.container import PLANES, check_destination, write_container, z
 from kissgs.sogxt.encode import encode
 
 FILES = {"container_meta.yaml": b"meta", "meta.json": b"{}", "a.webp": bytes(range(256)) * 4, "empty.webp": b""}
-
-
-def archive(entries, compression=zipfile.ZIP_STORED):
-    """A zip of (name, bytes) pairs, as anybody might make it."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", compression) as file:
-        for name, data in entries:
-            file.writestr(name, data)
-    return buffer.getvalue()
 
 
 def contents(source):
@@ -67,14 +59,14 @@ def test_zip_has_the_same_bytes_at_any_time_and_place(monkeypatch):
 def test_zips_of_other_tools_are_read(folder):
     """Deflated, or packed with their folder, its entry, and notes; a path is only ever a name, so it leads nowhere."""
     entries = [(f"{folder}{name}", content) for name, content in FILES.items()]
-    assert contents(archive(entries, zipfile.ZIP_DEFLATED)) == FILES
-    found = contents(archive([("scene/", b""), *entries, ("__MACOSX/._a.webp", b"x"), ("scene/README.txt", b"hello")]))
+    assert contents(zip_of(entries, zipfile.ZIP_DEFLATED)) == FILES
+    found = contents(zip_of([("scene/", b""), *entries, ("__MACOSX/._a.webp", b"x"), ("scene/README.txt", b"hello")]))
     assert found == {**FILES, "._a.webp": b"x", "README.txt": b"hello"}
 
 
 def test_names_do_not_end_at_a_nul():
     """zipfile ends them there, so that it would read this as a second a.webp; browsers do not."""
-    data = archive([*FILES.items(), ("a.webp:abc", b"who?")]).replace(b"a.webp:abc", b"a.webp\0abc")
+    data = zip_of([*FILES.items(), ("a.webp:abc", b"who?")]).replace(b"a.webp:abc", b"a.webp\0abc")
     assert contents(data) == {**FILES, "a.webp\0abc": b"who?"}
 
 
@@ -121,16 +113,16 @@ def test_missing_files_and_paths_that_no_file_system_has(tmp_path):
 def test_two_files_of_one_name_and_thousands_of_files_are_refused():
     """Readers differ in which of them they use, so a checked file could differ from the one that is used."""
     for second in ("a.webp", "other/a.webp"):
-        data = archive([("a.webp", b"one"), (second, b"two")])
+        data = zip_of([("a.webp", b"one"), (second, b"two")])
         assert refusal(data) == "the input holds two files named 'a.webp'"
-    data = archive([(f"{i}.txt", b"") for i in range(MAX_ZIP_ENTRIES + 1)])
+    data = zip_of([(f"{i}.txt", b"") for i in range(MAX_ZIP_ENTRIES + 1)])
     assert refusal(data) == f"the input has {MAX_ZIP_ENTRIES + 1} entries; a container has 12 files"
 
 
 @pytest.mark.parametrize("honest", [True, False])
 def test_a_zip_bomb_takes_no_memory(honest):
     """64 MB of zeros in 64 kB; the declared size may be the true one, or a lie."""
-    data = archive([("a.webp", bytes(64 << 20))], zipfile.ZIP_DEFLATED)
+    data = zip_of([("a.webp", bytes(64 << 20))], zipfile.ZIP_DEFLATED)
     if not honest:
         size = (64 << 20).to_bytes(4, "little")
         assert data.count(size) == 2
@@ -147,7 +139,7 @@ def damaged(data, old, new, times):
 
 def test_damaged_encrypted_and_exotic_entries_are_refused():
     sentence = "a.webp cannot be read from the zip: it is damaged or encrypted"
-    good = archive([("a.webp", b"hello world")])
+    good = zip_of([("a.webp", b"hello world")])
     assert refusal(damaged(good, b"hello world", b"hellO world", 1)) == sentence  # its CRC is wrong
     encrypted = bytearray(good)
     encrypted[6] |= 1  # the flags of the local header,
@@ -292,7 +284,7 @@ def test_paths_outside_a_folder(name, tmp_path):
 
 
 def test_files_by_name_or_by_path_from_a_root():
-    data = archive([(name, b"x") for name in ("top/index", "top/a/one", "top/b/two", "elsewhere/three")])
+    data = zip_of([(name, b"x") for name in ("top/index", "top/a/one", "top/b/two", "elsewhere/three")])
     with open_source(data) as files:
         assert files.names() == {"index", "one", "two", "three"}
         assert files.read("any/one", 10) == b"x"
@@ -303,16 +295,16 @@ def test_files_by_name_or_by_path_from_a_root():
             files.read("one", 10)
     for names, count in ((["a/index", "b/index"], 2), (["a"], 0)):
         with pytest.raises(InvalidContainerError, match=f"holds {count} files named 'index'; one is needed"):
-            open_source(archive([(name, b"x") for name in names]), "index").__enter__()
+            open_source(zip_of([(name, b"x") for name in names]), "index").__enter__()
 
 
 def test_lists_of_entries_that_are_too_large_or_of_zip64(monkeypatch):
-    data = archive([(f"{i:04}", b"x") for i in range(200)])
+    data = zip_of([(f"{i:04}", b"x") for i in range(200)])
     assert len(zip_names(io.BytesIO(data))) == 200
     monkeypatch.setattr(containers, "MAX_DIRECTORY_BYTES", 5000)
     assert zip_names(io.BytesIO(data)) == []
     assert refusal(data) == "the input has a list of entries above 5000 bytes; pack it again"
-    data = archive([("a", b"x")])
+    data = zip_of([("a", b"x")])
     end = data.rindex(b"PK\5\6")
     zip64 = data[:end] + b"PK\6\7".ljust(20, b"\0") + data[end:]
     assert refusal(zip64) == "the input is a zip64 file; pack it as an ordinary zip"
