@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import kissgs
-from kissgs import Cancelled, InvalidSceneError, OutputError, Settings
+from kissgs import Cancelled, InvalidContainerError, InvalidSceneError, OutputError, Settings
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.io.ply import write_ply
 
@@ -173,6 +173,15 @@ def count_of_events():
     events = Recorder()
     compress(SCENE, progress=events)
     return len(events.events)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("none.ply", InvalidSceneError), ("none.zip", InvalidContainerError), ("none", InvalidSceneError)],
+)
+def test_missing_files(tmp_path, name, kind):
+    with pytest.raises(kind, match=f"cannot read {tmp_path / name}: "):
+        kissgs.load(tmp_path / name)
 
 
 @pytest.mark.parametrize("part", [0, 0.5, 1])
