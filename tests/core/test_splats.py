@@ -83,11 +83,6 @@ def test_selecting_takes_rows_in_the_order_asked_for():
     assert len(splats.select(np.zeros(0, dtype=int))) == 0
 
 
-def test_scenes_cannot_be_changed_by_assignment():
-    with pytest.raises(AttributeError):
-        Splats(**tidy()).means = np.zeros((6, 3), np.float32)
-
-
 def test_cleaning_a_clean_scene_changes_nothing_and_copies_nothing():
     splats = Splats(**tidy())
     cleaned, report = clean(splats)
