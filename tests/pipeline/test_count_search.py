@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from PIL import Image
 import kissgs
 from kissgs import Settings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
+from kissgs.compaction.result import CountTrial
 from kissgs.evaluation.results import drop_of
 from kissgs.rendering.rasterizer import render
 
@@ -202,3 +204,9 @@ main()
     trials = json.loads(done.stdout)["trials"]
     assert len(trials) == 1
     assert trials[0]["bytes"] == target.stat().st_size
+
+
+def test_a_count_is_reported_by_the_loss_that_decides():
+    psnr = CountTrial(50_000, 0.123)
+    assert psnr.summary() == "50,000 Gaussians lose 0.123 dB"
+    assert replace(psnr, decisive="0.00291 of SSIM").summary() == "50,000 Gaussians lose 0.00291 of SSIM"
