@@ -1,6 +1,8 @@
 """The command line as a user runs it. Oracle: the library's own functions, and the promises of the README."""
 
+import errno
 import json
+import os
 import signal
 import subprocess
 import time
@@ -230,3 +232,15 @@ def test_interrupt_leaves_nothing(tmp_path):
     assert process.returncode == 130
     assert message.decode().splitlines()[-1].startswith("kissgs: interrupted")
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
+
+
+@pytest.mark.parametrize("option", ["--unpacked", "--quiet"])
+def test_a_disk_that_fills_up_leaves_no_file(scene, tmp_path, monkeypatch, option):
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    words = ["compress", scene, "-p", "fast", "-o", f"{tmp_path}/new/", option]
+    assert "no space left on device" in failure(*words)
+    assert sorted(tmp_path.rglob("*")) == [tmp_path / "new"]  # which another command may be about to write into

@@ -179,3 +179,15 @@ def test_a_capture_that_cannot_be_read_is_refused_by_every_preset(folder, tmp_pa
     words = "compress", folder / "a.ply", "-p", "fast", "-o", tmp_path / "a.zip"
     assert "there is no folder" in failure(*words, "--views", tmp_path / "none")
     assert run(*words, "--views", folder / "capture", "--quiet").stderr == b""
+
+
+def test_cancelling_the_evaluation_writes_nothing(tmp_path):
+    def stop(stage, fraction):
+        if stage == "evaluate" and fraction > 0:
+            raise kissgs.Cancelled("enough")
+
+    with pytest.raises(kissgs.Cancelled, match="enough"):
+        kissgs.compress(
+            SCENE, tmp_path / "a.zip", settings=kissgs.Settings.from_preset("fast"), evaluate=True, progress=stop
+        )
+    assert list(tmp_path.iterdir()) == []

@@ -8,7 +8,7 @@ from helpers.evaluations import evaluation_of
 from helpers.training_scenes import around, cloud, same
 
 import kissgs
-from kissgs import CompactSettings
+from kissgs import CompactSettings, UnsupportedError
 from kissgs.cameras.views import Views, black
 from kissgs.compaction.budget import compact_scene
 from kissgs.evaluation.evaluate import compare_images
@@ -95,3 +95,15 @@ def test_without_photographs_the_drop_assumes_errors_of_a_usual_capture():
         evaluation = evaluation_of([psnr[2]])
         assert drop_of(evaluation) == pytest.approx(psnr[0] - psnr[1], abs=0.1)
     assert drop_of(evaluation_of([math.inf])) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_missing_budget_is_rejected():
+    with pytest.raises(
+        UnsupportedError, match="missing the number of Gaussians to keep: give count, ratio or max_psnr_drop"
+    ):
+        compacted(cloud(9))
+
+
+def test_a_search_with_a_checkpoint_is_rejected(tmp_path):
+    with pytest.raises(UnsupportedError, match="keeps no checkpoint"):
+        compact_scene(cloud(9), CompactSettings(max_psnr_drop=1), views(), checkpoint=tmp_path / "c.npz")
