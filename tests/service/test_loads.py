@@ -205,6 +205,26 @@ def test_refused_methods_list_the_allowed_ones(service):
         assert (answer.headers["allow"], allowed in answer.json()["detail"]) == (allowed, True)
 
 
+@pytest.mark.quick(0)
+def test_events_continue_after_a_restart(start):
+    service = start(processes=True)
+    job = service.submit(scene_bytes(6_000, 2))
+    service.running(job)
+    seen = []
+    with service.http.stream("GET", job["links"]["events"]) as answer:
+        for line in answer.iter_lines():
+            if line.startswith("id: "):
+                seen.append(int(line[4:]))
+            if len(seen) == 3:
+                break
+    service.stop()
+    service.restart()
+    rest = service.http.get(job["links"]["events"], headers={"Last-Event-ID": str(seen[-1])}).text
+    seen += [int(line[4:]) for line in rest.splitlines() if line.startswith("id: ")]
+    assert seen == list(range(1, len(seen) + 1))
+    assert '"succeeded"' in rest
+
+
 def test_nobody_holds_all_upload_slots(start):
     """One key once held all of them, with uploads of 9 kB/s."""
     entries = [f"{owner}:{hashlib.sha256(owner.encode()).hexdigest()}" for owner in ("alice", "bob")]
