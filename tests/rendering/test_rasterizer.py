@@ -13,6 +13,7 @@ from helpers.render_scenes import blobs, camera, one, together
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kissgs.core.context import load_kernels
 from kissgs.core.errors import InvalidSceneError, InvalidViewsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
@@ -345,3 +346,9 @@ def test_gaussians_outside_the_image_and_hidden_ones_have_none():
     splats = together(one(mean=(0, 0, -50)), *wall, one(mean=(0, 0, 3)))
     found, _ = received(splats, [camera()])
     assert found[0].gaussians.tolist() == [1, 2]  # which leave less than TRANSMITTANCE_MIN
+
+
+def test_loading_the_kernels_reports_progress():
+    events = []
+    load_kernels(lambda stage, fraction: events.append((stage, fraction)))
+    assert events == [("kernels", 0.0), ("kernels", 1.0)]
