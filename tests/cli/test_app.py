@@ -222,18 +222,6 @@ def test_standard_output_escapes_what_its_encoding_lacks(scene, tmp_path, encodi
     assert json.loads(done.stdout)["input"] == name
 
 
-@pytest.mark.parametrize("option", ["--unpacked", "--quiet"])
-def test_a_disk_that_fills_up_leaves_no_file(scene, tmp_path, monkeypatch, option):
-
-    def full(descriptor):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    words = ["compress", scene, "-p", "fast", "-o", f"{tmp_path}/new/", option]
-    assert "no space left on device" in failure(*words)
-    assert sorted(tmp_path.rglob("*")) == [tmp_path / "new"]  # which another command may be about to write into
-
-
 def test_interrupt_leaves_nothing(tmp_path):
     scene, target = tmp_path / "scene.ply", tmp_path / "a.zip"
     kissgs.save(kissgs.sample_scene(60_000), scene)
@@ -259,3 +247,15 @@ def test_the_settings_that_are_listed_are_those_that_may_be_set(scene, tmp_path)
 def test_a_result_ends_with_the_command_that_shows_it(scene, tmp_path):
     last = run("compress", scene, "-o", tmp_path / "a b.zip", "-p", "fast").stdout.decode().splitlines()[-1]
     assert last == f"see it: kissgs view '{tmp_path / 'a b.zip'}'"
+
+
+@pytest.mark.parametrize("option", ["--unpacked", "--quiet"])
+def test_a_disk_that_fills_up_leaves_no_file(scene, tmp_path, monkeypatch, option):
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    words = ["compress", scene, "-p", "fast", "-o", f"{tmp_path}/new/", option]
+    assert "no space left on device" in failure(*words)
+    assert sorted(tmp_path.rglob("*")) == [tmp_path / "new"]  # which another command may be about to write into

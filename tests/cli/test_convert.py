@@ -1,7 +1,6 @@
 """``kissgs convert`` as a user runs it. Oracle: the library's own functions."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,16 +70,6 @@ def test_pipes(scene, tmp_path):
     kissgs.save(kissgs.load(scene), tmp_path / "b.spz")
     assert piped.stdout == (tmp_path / "b.spz").read_bytes()
     np.testing.assert_allclose(kissgs.load(tmp_path / "a.glb").means, kissgs.load(tmp_path / "b.spz").means)
-
-
-def test_several_files_into_a_folder(scene, tmp_path):
-    for name in ("one.ply", "two.ply"):
-        (tmp_path / name).write_bytes(scene.read_bytes())
-    done = run("convert", tmp_path / "*.ply", f"{tmp_path}/out/", "--to", "compressed.ply", "--json")
-    assert [Path(report["output"]).name for report in json.loads(done.stdout)] == [
-        "one.compressed.ply",
-        "two.compressed.ply",
-    ]
 
 
 def test_compressed_ply_is_an_ending(scene, tmp_path):

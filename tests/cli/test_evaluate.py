@@ -158,18 +158,6 @@ def test_compressing_can_evaluate(folder, tmp_path):
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
 
 
-def test_cancelling_the_evaluation_writes_nothing(tmp_path):
-    def stop(stage, fraction):
-        if stage == "evaluate" and fraction > 0:
-            raise kissgs.Cancelled("enough")
-
-    with pytest.raises(kissgs.Cancelled, match="enough"):
-        kissgs.compress(
-            SCENE, tmp_path / "a.zip", settings=kissgs.Settings.from_preset("fast"), evaluate=True, progress=stop
-        )
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("preset", ["fast", "balanced", "paper"])
 @pytest.mark.quick(1)
 def test_every_preset_accepts_views(folder, tmp_path, preset):
@@ -187,6 +175,24 @@ def test_every_preset_accepts_views(folder, tmp_path, preset):
     assert evaluation["mean"]["reference"] is not None, "no photographs were compared"
 
 
+def test_a_capture_that_cannot_be_read_is_refused_by_every_preset(folder, tmp_path):
+    words = "compress", folder / "a.ply", "-p", "fast", "-o", tmp_path / "a.zip"
+    assert "there is no folder" in failure(*words, "--views", tmp_path / "none")
+    assert run(*words, "--views", folder / "capture", "--quiet").stderr == b""
+
+
+def test_cancelling_the_evaluation_writes_nothing(tmp_path):
+    def stop(stage, fraction):
+        if stage == "evaluate" and fraction > 0:
+            raise kissgs.Cancelled("enough")
+
+    with pytest.raises(kissgs.Cancelled, match="enough"):
+        kissgs.compress(
+            SCENE, tmp_path / "a.zip", settings=kissgs.Settings.from_preset("fast"), evaluate=True, progress=stop
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("preset", ["fast", "paper"])
 @pytest.mark.quick(1)
 def test_views_do_not_change_the_bytes_of_presets_that_render_no_images(folder, preset):
@@ -194,9 +200,3 @@ def test_views_do_not_change_the_bytes_of_presets_that_render_no_images(folder, 
     views = kissgs.load_views(folder / "capture")
     with_views, without_views = (kissgs.compress(SCENE, settings=settings, views=some) for some in (views, None))
     assert with_views.files == without_views.files
-
-
-def test_a_capture_that_cannot_be_read_is_refused_by_every_preset(folder, tmp_path):
-    words = "compress", folder / "a.ply", "-p", "fast", "-o", tmp_path / "a.zip"
-    assert "there is no folder" in failure(*words, "--views", tmp_path / "none")
-    assert run(*words, "--views", folder / "capture", "--quiet").stderr == b""

@@ -128,7 +128,7 @@ def test_a_name_that_is_too_long_with_another_ending(folder, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a\0b", "loop", "\0.zip", "a" * 300])
-@pytest.mark.quick(1)
+@pytest.mark.quick(2)
 def test_the_library_raises_its_own_errors(name, folder, monkeypatch):
     monkeypatch.chdir(folder)
     kept = "loop/x" if name == "loop" else name  # a link is replaced, wherever it leads

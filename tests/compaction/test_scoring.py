@@ -1,4 +1,5 @@
-"""Pruning by score (see tests/rendering). Oracle: sorted scores, and pairs of copies of which one is superfluous."""
+"""Pruning by score (see tests/rendering), and comparisons of a search. Oracles: sorted scores, pairs of copies of
+which one is superfluous, ``compare_images``."""
 
 from dataclasses import replace
 
@@ -9,10 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import kissgs
-from kissgs.cameras.views import black
+from kissgs.cameras.views import Views, black
+from kissgs.cameras.virtual.samples import random_poses
 from kissgs.compaction.scoring import highest_indices, prune_by_score
+from kissgs.compaction.search_evaluation import COUNT, SearchEvaluation
 from kissgs.core.context import Context
 from kissgs.core.splats import ATTRIBUTES, SH_C0
+from kissgs.evaluation.cameras import evaluation_views
+from kissgs.evaluation.evaluate import compare_images
+from kissgs.evaluation.results import SEARCH_SEED
 from kissgs.rendering.rasterizer import removal_scores
 from kissgs.rendering.sensitivity import Coverage
 
@@ -110,3 +116,50 @@ def test_the_number_of_scorings_is_the_smallest_possible(min_keep, scorings):
     assert found == scorings if scorings < 5 else 55 < found <= scorings, "60 removals, one or more per scoring"
     assert events == sorted(events)
     assert events[-1] == 1.0
+
+
+SCENE = kissgs.sample_scene(400, sh_degree=1, seed=3)
+WORSE = replace(SCENE, opacities=SCENE.opacities - 0.5)
+
+
+@pytest.mark.quick(0)
+def test_without_a_capture_poses_of_photographs_and_cameras_over_the_whole_scene_compare():
+    compare = SearchEvaluation(SCENE, None)
+    assert compare.seconds == 0
+    found = compare(WORSE)
+    assert compare.seconds > 0
+    assert COUNT <= len(found.views) <= 4 * COUNT  # more for a scene of several objects
+    assert found.against == "renderings"
+    poses = {view.view.camera.viewmat.tobytes() for view in found.views}
+    trained = random_poses(SCENE, side=64, count=COUNT)
+    assert not poses & {view.camera.viewmat.tobytes() for view in (*trained.train, *trained.test)}
+    drawn = evaluation_views(SCENE, seed=SEARCH_SEED)
+    expected = compare_images(SCENE, WORSE, drawn)
+    assert found.surroundings.as_dict() == expected.as_dict()
+    assert {view.view.background[0] for view in found.views} == {0.0, 0.5, 1.0}
+    again = compare_images(SCENE, WORSE, Views((), tuple(view.view for view in found.views), found.background, ""))
+    assert again.mean == found.mean
+
+
+def test_held_out_views_may_have_equal_names():
+    scene = cloud(50)
+    views = Views(around(3), tuple(replace(view, name="x") for view in around(3)), black(), "")
+    compare = SearchEvaluation(scene, views)
+    for candidate in (scene, scene):
+        assert compare(candidate).mean.candidate_vs_reference.psnr == float("inf")
+
+
+def test_a_capture_compares_in_its_held_out_views():
+    scene = cloud(50)
+    views = Views(around(3), around(2), black(), "")
+    found = SearchEvaluation(scene, views)(scene)
+    assert [view.view.name for view in found.views] == [view.name for view in views.test]
+    assert found.surroundings is None
+
+
+@pytest.mark.parametrize("count", [1, 7])
+def test_few_gaussians_are_compared(count):
+    few = SCENE.select(range(count))
+    found = SearchEvaluation(few, None)(few)
+    assert found.views
+    assert found.surroundings.views

@@ -1,13 +1,16 @@
-"""Oracle: the bounds and promises of the docstrings, checked number by number in float64."""
+"""Scenes, and spherical harmonics. Oracles: the promises of the docstrings in float64; SciPy's complex harmonics."""
 
 import numpy as np
 import pytest
 from helpers.examples import examples
+from helpers.reference_harmonics import real_harmonics
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as stnp
 
 from kissgs import InvalidSceneError, Splats, clean
+from kissgs.core.harmonics_kernel import write_harmonics
+from kissgs.core.spherical_harmonics import sh_basis
 from kissgs.core.splats import (
     ATTRIBUTES,
     LOG_SCALE_LIMIT,
@@ -78,11 +81,6 @@ def test_selecting_takes_rows_in_the_order_asked_for():
         for name in ATTRIBUTES:
             assert (getattr(part, name) == getattr(splats, name)[index]).all()
     assert len(splats.select(np.zeros(0, dtype=int))) == 0
-
-
-def test_scenes_cannot_be_changed_by_assignment():
-    with pytest.raises(AttributeError):
-        Splats(**tidy()).means = np.zeros((6, 3), np.float32)
 
 
 def test_cleaning_a_clean_scene_changes_nothing_and_copies_nothing():
@@ -180,3 +178,21 @@ def test_whatever_the_numbers_cleaning_gives_a_canonical_scene(data, count, coef
     again, nothing = clean(cleaned)
     assert nothing == Cleaned()
     assert all((getattr(again, name) == getattr(cleaned, name)).all() for name in ATTRIBUTES)
+
+
+def directions(count=200, seed=0):
+    found = np.random.default_rng(seed).normal(size=(count, 3))
+    found[:6] = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def test_arrays_agree_with_scipy_to_degree_3_and_the_kernel_to_degree_6():
+    points = directions()
+    for degree in range(7):
+        wanted = real_harmonics(points, degree)
+        if degree <= 3:
+            np.testing.assert_allclose(sh_basis(points, degree), wanted, atol=1e-13)
+        found = np.zeros((len(points), wanted.shape[1] - 1))
+        for (x, y, z), row in zip(points, found, strict=True):
+            write_harmonics(x, y, z, degree, row)
+        np.testing.assert_allclose(found, wanted[:, 1:], atol=1e-13)

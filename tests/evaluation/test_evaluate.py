@@ -281,18 +281,6 @@ def test_any_metrics_are_averaged_and_valid_json(psnrs):
     assert all(each.comparison.change == 0 for each, (a, b, _) in zip(found.views, psnrs, strict=True) if a == b)
 
 
-@pytest.mark.parametrize(
-    ("psnrs", "mean"),
-    [((10, math.inf), 35), ((10, 120), 35), ((70, 120), 60), ((20, 40), 30), ((math.inf,) * 2, math.inf)],
-)
-def test_an_unchanged_view_does_not_hide_the_others(psnrs, mean):
-    """Without a limit, 120 dB and 10 dB would have a mean of 65, and an infinite PSNR an infinite one."""
-    found = evaluation_of(psnrs)
-    assert found.mean.candidate_vs_reference.psnr == mean
-    assert found.worst.comparison.candidate_vs_reference.psnr == min(psnrs)
-    assert [each.comparison.candidate_vs_reference.psnr for each in found.views] == list(psnrs)
-
-
 @given(st.lists(PSNRS, min_size=1, max_size=45))
 def test_the_worst_view_and_the_fifth_percentile(psnrs):
     """Oracle: sorting, and NumPy's percentile where all is finite."""

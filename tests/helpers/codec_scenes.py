@@ -112,8 +112,8 @@ def assert_within(found, wanted, max_quantization_error):
     assert excess.max(initial=0) <= rounding(wanted)
 
 
-def assert_round_trip(splats, result):
-    """Assert that each Gaussian decodes within the half steps of the report, in one of its equivalent forms."""
+def assert_round_trip(splats, result, forms=stored_forms):
+    """Assert that each Gaussian decodes within the half steps of the report, in one of its forms."""
     found, wanted, half = (
         kissgs.decompress(result.files),
         splats.select(result.order),
@@ -122,7 +122,7 @@ def assert_round_trip(splats, result):
     assert_within(signed_log(found.means), signed_log(wanted.means), half["means"])
     assert_within(found.opacities, wanted.opacities, half["opacities"][0])
     assert_within(found.sh0, wanted.sh0, half["f_dc"])
-    quats, scales = stored_forms(wanted.quats, wanted.scales)
+    quats, scales = forms(wanted.quats, wanted.scales)
     fits = (np.abs(quats - found.quats) <= np.array(half["quaternions"]) + rounding(quats)).all(axis=2)
     fits &= (np.abs(scales - found.scales) <= np.array(half["scales"]) + rounding(scales)).all(axis=2)
     assert fits.any(axis=0).all()

@@ -112,11 +112,15 @@ def _rest(splats, codebook, files, plane, names, version):
     return {"shape": [count, 3 * k], "mins": codebook[0], "maxs": codebook[255], "files": both}
 
 
-def zip_of(files, *, folder="", method=zipfile.ZIP_STORED):
+def zip_of(files, method=zipfile.ZIP_STORED, *, folder="", comment=b"", streamed=False):
+    """Return a zip of files by name, or of (name, bytes) pairs; ``streamed``: with the sizes after the data."""
     buffer = io.BytesIO()
+    if streamed:
+        buffer.seekable = lambda: False
     with zipfile.ZipFile(buffer, "w", method) as archive:
-        for name, data in files.items():
+        for name, data in files.items() if isinstance(files, dict) else files:
             archive.writestr(folder + name, data)
+        archive.comment = comment
     return buffer.getvalue()
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import base64
 import functools
-import io
 import json
-import zipfile
 
 import numpy as np
 
 import kissgs
+from helpers.codec_scenes import random_scene
+from helpers.reference_sog import zip_of
 from helpers.web_tools import pillow, run_node
 from kissgs.sogxt.container import CHECKSUM
 from kissgs.sogxt.decode import decode as decode_in_python
@@ -23,22 +23,6 @@ TYPES = {"labels": np.uint16, "cells": np.uint32}
 COEFFICIENTS = (0, 3, 8, 15)
 
 
-def scene_of(count, degree=0, seed=0, **replaced):
-    """Return a scene of random, incompressible values."""
-    rng = np.random.default_rng([seed, count, degree])
-    quats = rng.normal(size=(count, 4))
-    arrays = {
-        "means": rng.standard_t(3, (count, 3)) * 3,
-        "quats": quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-9),
-        "scales": rng.normal(-4, 1.2, (count, 3)),
-        "opacities": np.clip(rng.normal(2, 3, count), -5, 13),
-        "sh0": rng.normal(0, 1, (count, 3)),
-        "shN": rng.normal(0, 0.1, (count, COEFFICIENTS[degree], 3)),
-        **replaced,
-    }
-    return kissgs.Splats(**{name: np.asarray(array, dtype=np.float32) for name, array in arrays.items()})
-
-
 @functools.cache
 def levels_of(data):
     """Return the pixels of an image, which many tests compare with."""
@@ -49,16 +33,7 @@ def levels_of(data):
 def container(preset="fast", degree=3, count=65):
     """Return a container as files by name."""
     settings = kissgs.Settings.research(preset, sensitivity_views=4, sensitivity_view_size=48)
-    return dict(kissgs.compress(scene_of(count, degree), settings=settings).files)
-
-
-def zipped(files, method=zipfile.ZIP_STORED, folder="", comment=b""):
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", method) as archive:
-        for name, data in files.items():
-            archive.writestr(folder + name, data)
-        archive.comment = comment
-    return buffer.getvalue()
+    return dict(kissgs.compress(random_scene(count, degree), settings=settings).files)
 
 
 def with_meta(files, change):
@@ -77,7 +52,7 @@ def job(source, **more):
     """Return a decoding job for the bytes of a zip, files by name, or an address."""
     if isinstance(source, str):
         return {"source": {"url": source}, **more}
-    data = zipped(source) if isinstance(source, dict) else source
+    data = zip_of(source) if isinstance(source, dict) else source
     return {"source": {"base64": base64.b64encode(data).decode(), "as": more.pop("as_", "bytes")}, **more}
 
 
@@ -85,6 +60,17 @@ def in_node(*jobs):
     lines = run_node("decode_scenes.mjs", json.dumps(jobs)).splitlines()
     assert len(lines) == len(jobs)
     return [json.loads(line) for line in lines]
+
+
+def refusals(*jobs):
+    """Return the errors of jobs that must fail."""
+    found = in_node(*jobs)
+    for report, each in zip(found, jobs, strict=True):
+        name = "SogError" if each.get("format") == "sog" else "SogxtError"
+        assert report.get("error", {}).get("name") == name, report.get("error", "was decoded")
+        assert "\n" not in report["error"]["message"]
+        assert report["later"] == 0
+    return [report["error"]["message"] for report in found]
 
 
 def array_of(text, field):

@@ -1,4 +1,5 @@
-"""Oracle: whatever the bytes, reading gives a scene or one sentence, within time and memory."""
+"""Oracle: whatever the bytes, reading gives a scene or one sentence, within time and memory; as little for headers
+that describe far more than they hold."""
 
 import gzip
 import io
@@ -6,6 +7,7 @@ import json
 import random
 import struct
 import time
+import zipfile
 import zlib
 
 import numpy as np
@@ -26,6 +28,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+import kissgs
 from kissgs import Settings, compress, decompress
 from kissgs.core.context import silent
 from kissgs.core.errors import KissgsError
@@ -340,3 +343,51 @@ def test_a_webp_that_announces_more_than_the_metadata_takes_no_memory():
 def test_the_undamaged_sources_are_read():
     assert is_read(ZIP)
     assert is_read(SOGXT)
+
+
+MOST_BYTES = 32 << 20
+
+
+def glb(text):
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text
+
+
+def with_entries(count):
+    """Return a zip of so many empty files."""
+    local = struct.pack("<4s22xHH5s", b"PK\3\4", 5, 0, b"empty")
+    entry = struct.pack("<4s24xHHH8xI5s", b"PK\1\2", 5, 0, 0, 0, b"empty")
+    return local + count * entry + struct.pack("<4s4xHHIIH", b"PK\5\6", count, count, count * len(entry), len(local), 0)
+
+
+def behind_its_end(data):
+    """Put bytes like those of another end, 6 bytes before the last, into the end of a zip: where its list begins."""
+    return data[:-6] + b"PK\5\6" + data[-2:]
+
+
+KSPLAT = struct.pack("<BBxxIIIIH", 0, 1, 100_000, 100_000, 0, 0, 0).ljust(4096, b"\0") + bytes(1024 * 100_000)
+HEADERS = {
+    "children.glb": lambda: glb(b'{"nodes": [{"children": [' + b"1," * 2_000_000 + b"1]}]}"),
+    "texts.glb": lambda: glb(b'{"nodes": [' + b'"a",' * 1_000_000 + b"0]}"),
+    "lists.glb": lambda: glb(b'{"nodes": ' + b"[[]," * 1_000_000 + b"0" + b"]" * 1_000_000 + b"}"),
+    "objects.glb": lambda: glb(b'{"nodes": [' + b'{"a":0},' * 120_000 + b"{}]}"),
+    "meta.sog": lambda: zip_of(
+        {"meta.json": b'{"version": 2, "means": [' + b'{"a":0},' * 125_000 + b"0]}"}, zipfile.ZIP_DEFLATED
+    ),
+    "entries.sog": lambda: with_entries(40_000),
+    "hidden.sog": lambda: behind_its_end(with_entries(40_000)),
+    "sections.ksplat": lambda: KSPLAT,
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+@pytest.mark.quick(5)
+def test_a_hostile_header_takes_little_memory(name, tmp_path):
+    """Sixteen GLBs of two million child indices once took a server from 76 to 2,443 MiB."""
+    (tmp_path / name).write_bytes(HEADERS[name]())
+
+    def refused():
+        with pytest.raises(kissgs.KissgsError):
+            kissgs.read_scene_info(tmp_path / name)
+
+    assert takes_less_than(MOST_BYTES, refused)

@@ -246,13 +246,6 @@ def test_fox(shared_data):
     assert tuple(splats.quats[row]) == values[58:]
 
 
-def test_fox_written_again_is_the_same_file(shared_data, tmp_path):
-    path = shared_data / "fox" / "point_cloud.ply"
-    with (tmp_path / "again.ply").open("wb") as file:
-        write_ply(file, read_ply(path))
-    assert (tmp_path / "again.ply").read_bytes() == path.read_bytes()
-
-
 def test_written_layout():
     columns = random_columns(1, 1)
     stream = io.BytesIO()

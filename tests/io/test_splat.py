@@ -11,7 +11,7 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.splats import Splats, clean
 from kissgs.io import conventions, splat
 from kissgs.io.ksplat import FORMAT, read_ksplat
-from kissgs.io.scene_format import Match, ReadOptions
+from kissgs.io.scene_format import Match
 from kissgs.io.splat import read_splat
 
 
@@ -56,13 +56,6 @@ def test_splat_of_a_wrong_size(size):
     message = rf"^the data is no \.splat file or is cut short: its {size} bytes are no multiple of 32; "
     with pytest.raises(InvalidSceneError, match=message):
         read_splat(bytes(size))
-
-
-def test_limits():
-    with pytest.raises(UnsupportedError, match=r"has 3 Gaussians; the limit is 2"):
-        read_splat(bytes(96), ReadOptions(max_gaussians=2))
-    with pytest.raises(UnsupportedError, match=r"has 3 Gaussians; the limit is 2"):
-        read_ksplat(ksplat_bytes([made_scene(3, 0)], 0), ReadOptions(max_gaussians=2))
 
 
 def test_a_position_of_level_1_by_hand():

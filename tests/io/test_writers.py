@@ -1,9 +1,11 @@
-"""Writers of scene formats. Oracles: naive writers and parsers (helpers/reference_*.py), and bytes encoded by hand."""
+"""Writers of scene formats, and the table of formats. Oracles: naive writers and parsers (helpers/reference_*.py),
+bytes encoded by hand, codecs and pages."""
 
 import gzip
 import io
 import json
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from helpers.reference_spz import streams
 from kissgs.core.context import silent
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
-from kissgs.formats import FORMATS
+from kissgs.formats import ENDINGS, FORMATS, MANIFESTS, SCENE_ENDINGS, WRITTEN, named_container
 from kissgs.io import conventions, gltf
 from kissgs.io.conventions import morton_order
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS
@@ -78,18 +80,6 @@ def test_bytes_are_the_same_again_and_the_scene_is_unchanged(ending):
     if ending == ".spz":
         assert data[:4] == b"\x1f\x8b\x08\0"
         assert struct.unpack_from("<I", data, 4) == (0,), "gzip's time"
-
-
-@pytest.mark.parametrize("ending", CLEANED)
-def test_a_scene_without_gaussians(ending):
-    if ending in (".compressed.ply", ".splat"):
-        assert len(read(written(made_scene(0, 1), ending)[0], ending)) == 0
-        return
-    message = (
-        rf"^a scene without Gaussians cannot be written as \{ending.replace('.spz.glb', '.glb')}; write it as \.ply$"
-    )
-    with pytest.raises(UnsupportedError, match=message):
-        written(made_scene(0, 1), ending)
 
 
 # The compressed .ply.
@@ -328,3 +318,26 @@ def test_spz_inside_glb(count, degree):
     assert root["accessors"][0]["min"] == means.min(axis=0).tolist()
     assert root["accessors"][0]["max"] == means.max(axis=0).tolist()
     assert all("bufferView" not in accessor for accessor in root["accessors"])
+
+
+PAGES = [Path(__file__).parents[2] / page for page in ("docs/reference/formats.md", "web_decoder/preview.html")]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_line_says_what_its_module_can_do(name):
+    line = FORMATS[name]
+    assert [*line.codec.write] == ([] if line.is_container else [*line.written])
+    assert line.manifest is None or MANIFESTS[line.manifest] == name.removeprefix("streamed-")
+
+
+def test_pages_name_the_endings():
+    reference, preview = (page.read_text() for page in PAGES)
+    assert all(f"`{ending}`" in reference for ending in (*SCENE_ENDINGS, *WRITTEN, *ENDINGS))
+    (offered,) = (line for line in preview.splitlines() if "accept=" in line)
+    assert {*offered.split('"')[1].split(",")} <= {*SCENE_ENDINGS, *ENDINGS}
+
+
+def test_the_refusal_of_an_unknown_ending_names_all_that_are_written():
+    with pytest.raises(Exception, match="is not the name of a container") as caught:
+        named_container(None, "out.xyz")
+    assert all(ending in str(caught.value) for ending in (*ENDINGS, *MANIFESTS, ".sogxt"))

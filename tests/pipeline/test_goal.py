@@ -72,19 +72,6 @@ def test_a_quality_that_cannot_be_met_is_named_with_all_that_is_missed():
     )
 
 
-def test_what_the_user_has_named_is_named_in_errors():
-    lost = Attempt(1, 1e-9, 10, **{**SAME, "drop": 0.2, "psnr": 53.36})
-    message = goal_of(quality="same", max_psnr_drop=0.01).failure_message([lost], suggest_compaction=False)
-    assert message == (
-        "max_psnr_drop 0.01 dB cannot be met: the finest container found loses 0.201 dB; allow at least that"
-    )
-    message = goal_of(quality="good", psnr=55).failure_message([lost], suggest_compaction=False)
-    assert message == "psnr 55 dB cannot be met: the finest container found has 53.36 dB; ask for at most that"
-    both = replace(lost, ssim_drop=0.01)
-    message = goal_of(quality="same", max_psnr_drop=0.01).failure_message([both], suggest_compaction=False)
-    assert message.startswith("max_psnr_drop 0.01 dB and quality same cannot be met: ")
-
-
 @pytest.mark.parametrize("drops", [(math.nan, 0.001), (0.05, math.nan), (math.nan, math.nan)])
 def test_a_failed_rendering_meets_no_drop(drops):
     goal = goal_of(max_psnr_drop=0.1, max_ssim_drop=0.003)
@@ -190,3 +177,16 @@ def test_containers_that_take_a_training_need_not_come_as_near(goal, plain, trai
     (value,) = goal.values()
     assert value * 2 ** -limit.near_enough(trained=False) == pytest.approx(plain)
     assert value * 2 ** -limit.near_enough(trained=True) == pytest.approx(trained, rel=0.01)
+
+
+def test_what_the_user_has_named_is_named_in_errors():
+    lost = Attempt(1, 1e-9, 10, **{**SAME, "drop": 0.2, "psnr": 53.36})
+    message = goal_of(quality="same", max_psnr_drop=0.01).failure_message([lost], suggest_compaction=False)
+    assert message == (
+        "max_psnr_drop 0.01 dB cannot be met: the finest container found loses 0.201 dB; allow at least that"
+    )
+    message = goal_of(quality="good", psnr=55).failure_message([lost], suggest_compaction=False)
+    assert message == "psnr 55 dB cannot be met: the finest container found has 53.36 dB; ask for at most that"
+    both = replace(lost, ssim_drop=0.01)
+    message = goal_of(quality="same", max_psnr_drop=0.01).failure_message([both], suggest_compaction=False)
+    assert message.startswith("max_psnr_drop 0.01 dB and quality same cannot be met: ")

@@ -258,14 +258,6 @@ def test_the_note_says_what_torch_would_have_bought(tmp_path, monkeypatch):
         assert "torch is missing" not in kissgs.compress(scene, settings=little, views=capture).report.note
 
 
-def test_captures_without_held_out_photographs_are_not_trained_on(tmp_path):
-    scene = cloud(60)
-    views = replace(photographs(scene, tmp_path), test=())
-    found = kissgs.compress(scene, settings=with_photographs().model_copy(update={"time_limit": LONG}), views=views)
-    assert found.report.finetuning is None
-    assert found.report.compaction is None
-
-
 @pytest.mark.quick(1)
 def test_a_goal_comes_before_the_time():
     scene = cloud(400)
@@ -317,3 +309,11 @@ def test_size_and_quality_must_both_hold_and_come_before_the_time():
         UnsupportedError, match=f"target_size and psnr cannot be met together.*{len(alone.to_zip()):,} bytes"
     ):
         kissgs.compress(scene, settings=Settings.research("balanced", psnr=36, target_size=900, **views))
+
+
+def test_captures_without_held_out_photographs_are_not_trained_on(tmp_path):
+    scene = cloud(60)
+    views = replace(photographs(scene, tmp_path), test=())
+    found = kissgs.compress(scene, settings=with_photographs().model_copy(update={"time_limit": LONG}), views=views)
+    assert found.report.finetuning is None
+    assert found.report.compaction is None

@@ -1,4 +1,5 @@
-"""Reference: a float64 renderer that shares no code with the tested one, and its derivatives. On all devices."""
+"""Reference: a float64 renderer that shares no code with the tested one, and its derivatives; autograd. On all
+devices."""
 
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from kissgs.core.errors import InvalidSceneError, InvalidViewsError, Unsupported
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import frame, tiles
+from kissgs.rendering.cpu.frame import Gradients
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.rasterizer import BLACK, render, tensors_of
 
@@ -275,12 +277,6 @@ def test_rendering_on_cuda_without_a_device_is_refused():
         render(blobs(1), camera(), device="cuda")
 
 
-def test_loading_the_kernels_reports_progress():
-    events = []
-    load_kernels(lambda stage, fraction: events.append((stage, fraction)))
-    assert events == [("kernels", 0.0), ("kernels", 1.0)]
-
-
 def test_cameras_may_have_any_dtype_and_layout():
     splats, view = blobs(20), camera()
     expected, _, _ = render_tensors(splats, [view, view])
@@ -316,3 +312,43 @@ def test_more_gaussians_in_a_tile_or_pairs_than_kernels_can_number_are_refused(m
     monkeypatch.setattr(tiles, limit, 10)
     with pytest.raises(UnsupportedError, match=message):
         render(blobs(50), camera(100, 100))
+
+
+def received(splats, views):
+    """Return the gradients of each view of a loss without symmetry, by receiver and by autograd."""
+    found = []
+    for receive in (found.append, None):
+        images, alphas, tensors = render_tensors(splats, views, receive=receive)
+        weights = torch.rand(images.shape, generator=torch.Generator().manual_seed(3))
+        ((images * weights).sum() + (alphas * weights[..., 0]).sum()).backward()
+        if receive is not None:
+            assert all(tensor.grad is None for tensor in tensors.values())
+    return found, {name: tensor.grad.numpy() for name, tensor in tensors.items()}
+
+
+@pytest.mark.parametrize("count", [0, 1, 60])
+def test_received_gradients_are_those_of_autograd(count):
+    views = [camera(seed=1), camera(20, 40, seed=2)] if count else [camera()]
+    splats = blobs(count, 2)
+    found, wanted = received(splats, views if count == 60 else views[:1])
+    total = Gradients.sum(found)
+    assert (np.diff(total.gaussians) > 0).all()
+    for name in ATTRIBUTES:
+        dense = np.zeros_like(wanted[name])
+        total.add_to(name, dense)
+        np.testing.assert_array_equal(dense, wanted[name])
+        if count:
+            assert dense.any()
+
+
+def test_gaussians_outside_the_image_and_hidden_ones_have_none():
+    wall = [one(mean=(0, 0, 0.2 * i), scale=(2, 2, 2), opacity=9.0) for i in range(4)]
+    splats = together(one(mean=(0, 0, -50)), *wall, one(mean=(0, 0, 3)))
+    found, _ = received(splats, [camera()])
+    assert found[0].gaussians.tolist() == [1, 2]  # which leave less than TRANSMITTANCE_MIN
+
+
+def test_loading_the_kernels_reports_progress():
+    events = []
+    load_kernels(lambda stage, fraction: events.append((stage, fraction)))
+    assert events == [("kernels", 0.0), ("kernels", 1.0)]

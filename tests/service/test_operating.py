@@ -1,16 +1,20 @@
-"""Settings, health, metrics and commands for operators; oracles: the Prometheus parser and the settings model."""
+"""Settings, health, metrics, commands and names of the service; oracles: the Prometheus parser and the settings
+model."""
 
 import asyncio
 import hashlib
+import io
 import re
+import subprocess
 import sys
 
 import pytest
 from helpers.data_folders import service as opened_service
-from helpers.service import SMALL
+from helpers.service import ROOT, SMALL
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from service import cli
+from service.__main__ import main
 from service.core.settings import ServiceSettings, SettingsError
 
 
@@ -157,3 +161,21 @@ def test_the_page(service):
         if path != "/docs":
             assert service.http.get(path).status_code == 200, path
     assert not re.search(r'(?:src|href)="(?:https?:)?//', page.text)  # nothing from other hosts
+
+
+def test_the_installed_name(tmp_path):
+    """An absolute import of the service works in a checkout, and fails in a wheel, where it has another name."""
+    sources = (path.relative_to(ROOT).with_suffix("") for path in (ROOT / "service").rglob("*.py"))
+    imported = ", ".join(f"kissgs_{'.'.join(path.parts).removesuffix('.__init__')}" for path in sources)
+    code = f"import sys, {imported}; sys.exit('service' in sys.modules)"
+    subprocess.run([sys.executable, "-P", "-c", code], cwd=tmp_path, check=True)
+
+
+def test_the_command_escapes_what_standard_output_cannot_encode(monkeypatch):
+    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "argv", ["kissgs-serve", "--help"])
+    with pytest.raises(SystemExit):
+        main()
+    out.flush()
+    assert b"KISSGS_KEYS=\\u2026" in out.buffer.getvalue()

@@ -8,13 +8,11 @@ from pathlib import Path
 
 import httpx
 import pytest
-from helpers.service import ROOT, problem, read_response
+from helpers.service import problem, read_response
 
 from service.core.settings import ServiceSettings
 from service.http.app import create_app
 from service.http.routes import page
-
-VENDOR = ROOT / "web_decoder" / "vendor"
 
 IMPORTS = '\n{"imports": {"three": "./vendor/three/build/three.module.min.js"}}\n'
 FILES = {

@@ -10,13 +10,11 @@ import pytest
 from helpers.codec_scenes import (
     GLANCE,
     PRESETS,
-    assert_within,
+    assert_round_trip,
     constant_scene,
     equivalents,
     random_scene,
     replaced,
-    rounding,
-    signed_log,
 )
 from helpers.command_line import run
 from helpers.format_scenes import assert_alike, made_scene
@@ -39,24 +37,11 @@ def pixels(result, name):
     return np.asarray(Image.open(BytesIO(result.files[name])))
 
 
-def assert_round_trip(splats, result):
-    """Assert that each Gaussian decodes within the reported errors, in one of its equivalent forms."""
-    found, wanted = kissgs.decompress(result.files), splats.select(result.order)
-    errors = result.report.max_quantization_error
-    assert_within(signed_log(found.means), signed_log(wanted.means), errors["means"])
-    assert_within(found.opacities, wanted.opacities, errors["opacities"][0])
-    assert_within(found.sh0, wanted.sh0, errors["f_dc"])
-    quats, scales = equivalents(wanted.quats, wanted.scales)
-    fits = (np.abs(quats - found.quats) <= np.array(errors["quaternions"]) + rounding(quats)).all(axis=2)
-    fits &= (np.abs(scales - found.scales) <= np.array(errors["scales"]) + rounding(scales)).all(axis=2)
-    assert fits.any(axis=0).all()
-
-
 @pytest.mark.parametrize(("count", "preset"), [(65, "balanced"), (1, "fast"), (65, "paper")])
 def test_round_trip_is_within_the_reported_errors(count, preset):
     scene = random_scene(count, count % 4, seed=count)
     result = encoded(scene, preset)
-    assert_round_trip(scene, result)
+    assert_round_trip(scene, result, equivalents)
     assert kissgs.decompress(result.files).sh_degree == count % 4
 
 
@@ -160,14 +145,14 @@ def test_extremes_survive(preset):
     opacities[:3] = [13.8, -5.5, 0]
     sh0[:3] = [[900, -900, 0], [4, 4, 4], [0, 0, 0]]
     extreme = replaced(scene, means=means, scales=scales, opacities=opacities, sh0=sh0)
-    assert_round_trip(extreme, encoded(extreme, preset))
+    assert_round_trip(extreme, encoded(extreme, preset), equivalents)
 
 
 @pytest.mark.parametrize("preset", ["balanced", "paper"])
 def test_constant_scenes(preset):
     scene = constant_scene(40, 1)
     result = encoded(scene, preset)
-    assert_round_trip(scene, result)
+    assert_round_trip(scene, result, equivalents)
     assert result.report.container_bytes < 3000
 
 
@@ -193,8 +178,6 @@ def test_a_folder_holds_the_same_files(tmp_path):
     result = compress(random_scene(20), tmp_path / "folder", settings=Settings(preset="fast"), container="sog")
     assert {path.name: path.read_bytes() for path in (tmp_path / "folder").iterdir()} == dict(result.files)
     assert len(kissgs.load(tmp_path / "folder" / "meta.json")) == 20
-    compress(random_scene(9), tmp_path / "folder", settings=Settings(preset="fast"), container="sog", overwrite=True)
-    assert len(kissgs.load(tmp_path / "folder")) == 9
 
 
 @pytest.mark.parametrize("first", [{"container": "sog"}, {"container": "sogxt"}])

@@ -1,5 +1,6 @@
-"""Oracle: the zipfile module, which writes friendly and hostile archives, and the file system."""
+"""Oracles: the zipfile module, which writes friendly and hostile archives, the file system, and memory."""
 
+import dataclasses
 import errno
 import io
 import os
@@ -8,24 +9,22 @@ import tempfile
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers.codec_scenes import random_scene
 from helpers.memory import takes_less_than
+from helpers.reference_sog import zip_of
 
-from kissgs.core.errors import InvalidContainerError, OutputError
+import kissgs
+from kissgs.core.errors import InvalidContainerError, OutputError, UnsupportedError
 from kissgs.io import containers
 from kissgs.io.containers import MAX_ZIP_ENTRIES, DirectorySource, is_below, open_source, zip_names
-from kissgs.sogxt.container import check_destination, write_container, zip_bytes
+from kissgs.io.images import encode_plane
+from kissgs.settings import EncodeSettings
+from kissgs.sogxt.container import PLANES, check_destination, write_container, zip_bytes
+from kissgs.sogxt.encode import encode
 
 FILES = {"container_meta.yaml": b"meta", "meta.json": b"{}", "a.webp": bytes(range(256)) * 4, "empty.webp": b""}
-
-
-def archive(entries, compression=zipfile.ZIP_STORED):
-    """A zip of (name, bytes) pairs, as anybody might make it."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", compression) as file:
-        for name, data in entries:
-            file.writestr(name, data)
-    return buffer.getvalue()
 
 
 def contents(source):
@@ -60,14 +59,14 @@ def test_zip_has_the_same_bytes_at_any_time_and_place(monkeypatch):
 def test_zips_of_other_tools_are_read(folder):
     """Deflated, or packed with their folder, its entry, and notes; a path is only ever a name, so it leads nowhere."""
     entries = [(f"{folder}{name}", content) for name, content in FILES.items()]
-    assert contents(archive(entries, zipfile.ZIP_DEFLATED)) == FILES
-    found = contents(archive([("scene/", b""), *entries, ("__MACOSX/._a.webp", b"x"), ("scene/README.txt", b"hello")]))
+    assert contents(zip_of(entries, zipfile.ZIP_DEFLATED)) == FILES
+    found = contents(zip_of([("scene/", b""), *entries, ("__MACOSX/._a.webp", b"x"), ("scene/README.txt", b"hello")]))
     assert found == {**FILES, "._a.webp": b"x", "README.txt": b"hello"}
 
 
 def test_names_do_not_end_at_a_nul():
     """zipfile ends them there, so that it would read this as a second a.webp; browsers do not."""
-    data = archive([*FILES.items(), ("a.webp:abc", b"who?")]).replace(b"a.webp:abc", b"a.webp\0abc")
+    data = zip_of([*FILES.items(), ("a.webp:abc", b"who?")]).replace(b"a.webp:abc", b"a.webp\0abc")
     assert contents(data) == {**FILES, "a.webp\0abc": b"who?"}
 
 
@@ -114,16 +113,16 @@ def test_missing_files_and_paths_that_no_file_system_has(tmp_path):
 def test_two_files_of_one_name_and_thousands_of_files_are_refused():
     """Readers differ in which of them they use, so a checked file could differ from the one that is used."""
     for second in ("a.webp", "other/a.webp"):
-        data = archive([("a.webp", b"one"), (second, b"two")])
+        data = zip_of([("a.webp", b"one"), (second, b"two")])
         assert refusal(data) == "the input holds two files named 'a.webp'"
-    data = archive([(f"{i}.txt", b"") for i in range(MAX_ZIP_ENTRIES + 1)])
+    data = zip_of([(f"{i}.txt", b"") for i in range(MAX_ZIP_ENTRIES + 1)])
     assert refusal(data) == f"the input has {MAX_ZIP_ENTRIES + 1} entries; a container has 12 files"
 
 
 @pytest.mark.parametrize("honest", [True, False])
 def test_a_zip_bomb_takes_no_memory(honest):
     """64 MB of zeros in 64 kB; the declared size may be the true one, or a lie."""
-    data = archive([("a.webp", bytes(64 << 20))], zipfile.ZIP_DEFLATED)
+    data = zip_of([("a.webp", bytes(64 << 20))], zipfile.ZIP_DEFLATED)
     if not honest:
         size = (64 << 20).to_bytes(4, "little")
         assert data.count(size) == 2
@@ -140,7 +139,7 @@ def damaged(data, old, new, times):
 
 def test_damaged_encrypted_and_exotic_entries_are_refused():
     sentence = "a.webp cannot be read from the zip: it is damaged or encrypted"
-    good = archive([("a.webp", b"hello world")])
+    good = zip_of([("a.webp", b"hello world")])
     assert refusal(damaged(good, b"hello world", b"hellO world", 1)) == sentence  # its CRC is wrong
     encrypted = bytearray(good)
     encrypted[6] |= 1  # the flags of the local header,
@@ -285,7 +284,7 @@ def test_paths_outside_a_folder(name, tmp_path):
 
 
 def test_files_by_name_or_by_path_from_a_root():
-    data = archive([(name, b"x") for name in ("top/index", "top/a/one", "top/b/two", "elsewhere/three")])
+    data = zip_of([(name, b"x") for name in ("top/index", "top/a/one", "top/b/two", "elsewhere/three")])
     with open_source(data) as files:
         assert files.names() == {"index", "one", "two", "three"}
         assert files.read("any/one", 10) == b"x"
@@ -296,16 +295,73 @@ def test_files_by_name_or_by_path_from_a_root():
             files.read("one", 10)
     for names, count in ((["a/index", "b/index"], 2), (["a"], 0)):
         with pytest.raises(InvalidContainerError, match=f"holds {count} files named 'index'; one is needed"):
-            open_source(archive([(name, b"x") for name in names]), "index").__enter__()
+            open_source(zip_of([(name, b"x") for name in names]), "index").__enter__()
 
 
 def test_lists_of_entries_that_are_too_large_or_of_zip64(monkeypatch):
-    data = archive([(f"{i:04}", b"x") for i in range(200)])
+    data = zip_of([(f"{i:04}", b"x") for i in range(200)])
     assert len(zip_names(io.BytesIO(data))) == 200
     monkeypatch.setattr(containers, "MAX_DIRECTORY_BYTES", 5000)
     assert zip_names(io.BytesIO(data)) == []
     assert refusal(data) == "the input has a list of entries above 5000 bytes; pack it again"
-    data = archive([("a", b"x")])
+    data = zip_of([("a", b"x")])
     end = data.rindex(b"PK\5\6")
     zip64 = data[:end] + b"PK\6\7".ljust(20, b"\0") + data[end:]
     assert refusal(zip64) == "the input is a zip64 file; pack it as an ordinary zip"
+
+
+def bomb(side):
+    """A small container of a large scene: all planes constant."""
+    scene = random_scene(1, 3)
+    files = dict(encode(scene, EncodeSettings(prune_invisible=False)).files)
+    for name in PLANES:
+        if "centroids" not in name:
+            channels = {"quaternions.webp": 4, "active_mask.webp": 1, "opacities.webp": 1}.get(name, 3)
+            files[name] = encode_plane(np.ones((side, side, channels), np.uint8), quality=0, method=0)
+    del files["meta.json"]
+    text = files["container_meta.yaml"].decode().split("kissgs:")[0]
+    files["container_meta.yaml"] = text.replace("grid_side: 8", f"grid_side: {side}").encode()
+    return files
+
+
+def test_more_gaussians_than_the_limit_are_refused_before_memory_is_taken():
+    files = bomb(512)
+    assert sum(map(len, files.values())) < 20_000
+
+    def refused():
+        with pytest.raises(UnsupportedError, match=r"262,144 Gaussians; the limit is 200,000: raise it"):
+            kissgs.decompress(files, max_gaussians=200_000)
+
+    assert takes_less_than(30e6, refused)
+    assert len(kissgs.decompress(files, max_gaussians=262_144)) == 262_144
+
+
+def test_a_grid_far_beyond_the_limit_is_refused_before_its_images_are_read():
+    files = bomb(512)
+    with pytest.raises(UnsupportedError, match="262,144 cells"):
+        kissgs.decompress({**files, "active_mask.webp": b"not even an image"}, max_gaussians=1000)
+
+
+def test_one_outlier_does_not_spoil_the_colours_of_all_others():
+    """One colour of 1000 among thousands once made the step of all others a hundred times coarser."""
+    scene, fast = kissgs.sample_scene(12_000), kissgs.Settings(preset="fast")
+
+    def error(result, field):
+        others = result.order != 7
+        found = getattr(kissgs.decompress(result.files), field)[others]
+        return np.sqrt(np.mean((found - getattr(scene, field)[result.order[others]]) ** 2))
+
+    clean = kissgs.compress(scene, settings=fast)
+    for field, value in (("sh0", 1000), ("shN", 1000), ("shN", 30)):
+        spoilt = getattr(scene, field).copy()
+        spoilt[7].flat[0] = value
+        dirty = kissgs.compress(dataclasses.replace(scene, **{field: spoilt}), settings=fast)
+        assert error(dirty, field) < 1.05 * error(clean, field)
+        assert dirty.report.clipped_colors == (1 if field == "sh0" else 0)
+
+
+@pytest.mark.parametrize("count", [1, 5, 64, 65, 100, 256, 257])
+def test_a_limit_of_as_many_gaussians_as_there_are_is_enough(count):
+    """The grids of few Gaussians have more padding than Gaussians."""
+    files = encode(random_scene(count, 0), EncodeSettings(prune_invisible=False)).files
+    assert len(kissgs.decompress(files, max_gaussians=count)) == count

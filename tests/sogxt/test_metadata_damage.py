@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 from helpers.codec_scenes import random_scene, replaced
-from helpers.metadata_files import FILES, assert_same, document
+from helpers.metadata_files import FILES, document
 
-from kissgs import InvalidContainerError, KissgsError, Settings, UnsupportedError, compress, decompress
+from kissgs import InvalidContainerError, Settings, UnsupportedError, compress, decompress
 from kissgs.io.containers import MemorySource
 from kissgs.sogxt.container import CHECKSUM, JSON_NAME, YAML_NAME
 from kissgs.sogxt.metadata import CHANNELS, read_layout
@@ -55,21 +55,6 @@ def test_no_changed_byte_makes_another_scene(name, step, way):
     found = [meaning(name, some) for some in texts]
     assert {None, right} >= set(found), texts[next(i for i, some in enumerate(found) if some not in (None, right))]
     assert found.count(None) > len(found) / 4
-
-
-@pytest.mark.parametrize("name", [YAML_NAME, JSON_NAME])
-def test_whole_decoding_of_damaged_metadata(name):
-    """Only what :func:`meaning` reads must be unchanged: checksums of images may be lost, or wrong."""
-    files = dict(FILES) if name == YAML_NAME else {key: data for key, data in FILES.items() if key != YAML_NAME}
-    refused = 0
-    for at in np.random.default_rng(3).integers(0, 8 * len(FILES[name]), 60):
-        text = bytearray(FILES[name])
-        text[at // 8] ^= 1 << at % 8
-        try:
-            assert_same(decompress({**files, name: bytes(text)}))
-        except KissgsError:
-            refused += 1
-    assert refused > 20
 
 
 def test_the_checksum_is_the_one_that_the_format_describes():

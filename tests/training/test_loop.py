@@ -1,4 +1,5 @@
-"""The training loop. Oracle: the scene that was rendered; for regularizers, the calls they received."""
+"""The training loop and its checkpoints. Oracle: the scene that was rendered, calls of regularizers, the saved
+state."""
 
 from dataclasses import replace
 
@@ -8,9 +9,12 @@ import torch
 from helpers.training_scenes import around, cloud, same, targets_of
 
 import kissgs
+from kissgs import OutputError
 from kissgs.core.context import Context, Pace
 from kissgs.rendering.differentiable import plain_photometric_loss, rasterize
 from kissgs.rendering.rasterizer import render, tensors_of
+from kissgs.training import checkpoint
+from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import TrainingPlan, exponential_lr, image_loss, train
 from kissgs.training.model import GaussianModel
 
@@ -200,3 +204,60 @@ def test_antialiased_scenes_are_trained_with_the_opacities_that_their_images_sho
     train(model, targets, plan(40))
     assert model.splats().antialiased
     assert error(model.splats(), targets) < 0.2 * before
+
+
+STATE = {"a": np.arange(6.0).reshape(2, 3), "json": np.asarray('{"x": 1}'), "none": np.empty(0, np.float32)}
+
+
+def test_a_saved_state_is_loaded(tmp_path):
+    path = tmp_path / "c.npz"
+    saved = Checkpoint(path, "key")
+    assert saved.load() is None
+    saved.save(STATE)
+    found = Checkpoint(path, "key").load()
+    assert found.keys() == STATE.keys()
+    assert all((found[name] == STATE[name]).all() and found[name].dtype == STATE[name].dtype for name in STATE)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["c.npz"]
+
+
+def test_checkpoints_of_other_work_are_neither_loaded_nor_overwritten(tmp_path):
+    Checkpoint(tmp_path / "c.npz", "one").save(STATE)
+    with pytest.raises(OutputError, match=r"checkpoint of other work.*delete it to start again"):
+        Checkpoint(tmp_path / "c.npz", "other").load()
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"some text", "npz", "npy"])
+def test_files_that_are_no_checkpoints_are_rejected(tmp_path, content):
+    path = tmp_path / "c.npz"
+    if content == "npz":
+        np.savez(path, x=np.zeros(3))
+    elif content == "npy":
+        with path.open("wb") as file:
+            np.save(file, np.zeros(3))
+    else:
+        path.write_bytes(content)
+    with pytest.raises(OutputError, match=r"c\.npz is no checkpoint of kissgs; move or delete it"):
+        Checkpoint(path, "key").load()
+
+
+def test_damaged_checkpoints_are_rejected(tmp_path):
+    path = tmp_path / "c.npz"
+    Checkpoint(path, "key").save(STATE)
+    data = bytearray(path.read_bytes())
+    for signature, offset in ((b"PK\x03\x04", 8), (b"PK\x01\x02", 10)):
+        data[data.index(signature) + offset] = 99  # an unknown compression method
+    path.write_bytes(data)
+    with pytest.raises(OutputError, match=r"c\.npz is no checkpoint of kissgs"):
+        Checkpoint(path, "key")
+    with pytest.raises(OutputError, match="is a folder; name a file"):
+        Checkpoint(tmp_path, "key")
+
+
+@pytest.mark.parametrize(("seconds", "due"), [(0.0, True), (1000.0, False)])
+def test_a_save_is_due_after_the_interval(tmp_path, monkeypatch, seconds, due):
+    monkeypatch.setattr(checkpoint, "SAVE_INTERVAL", seconds)
+    assert Checkpoint(tmp_path / "c.npz", "key").due == due
+    nowhere = Checkpoint(None, "key")
+    nowhere.save(STATE)
+    assert nowhere.load() is None
+    assert not nowhere.due

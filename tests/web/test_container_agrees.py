@@ -1,12 +1,13 @@
 """Damaged and odd zips: JavaScript and Python read or refuse the same ones, with equal values; oracle: each other."""
 
-import io
 import zipfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.web_scenes import array_of, container, in_node, job, scene_of, ulps, zipped
+from helpers.codec_scenes import random_scene
+from helpers.reference_sog import zip_of
+from helpers.web_scenes import array_of, container, in_node, job, ulps
 
 from kissgs import KissgsError, Settings, compress, decompress
 from kissgs.sogxt.container import zip_bytes
@@ -15,21 +16,11 @@ FILES = container("fast", 1, 20)
 YAML, JSON = "container_meta.yaml", "meta.json"
 MARKED = dict(
     compress(
-        replace(scene_of(20, 1), antialiased=True, origin=(5000000.0, -2.5, 0.0)), settings=Settings.from_preset("fast")
+        replace(random_scene(20, 1), antialiased=True, origin=(5000000.0, -2.5, 0.0)),
+        settings=Settings.from_preset("fast"),
     ).files
 )
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
-
-def packed(entries, method=zipfile.ZIP_DEFLATED, *, streamed=False):
-    """Return a zip of (name, bytes) pairs; ``streamed``: with the sizes after the data."""
-    file = io.BytesIO()
-    if streamed:
-        file.seekable = lambda: False
-    with zipfile.ZipFile(file, "w", method) as archive:
-        for name, data in entries:
-            archive.writestr(name, data)
-    return file.getvalue()
 
 
 def in_python(data):
@@ -83,12 +74,12 @@ def nested(depth):
 
 ACCEPTED = {
     "as written": ZIP,
-    "streamed": packed(ENTRIES, streamed=True),
-    "in a folder, with a note": packed([("a/note", b""), *((f"a/{name}", data) for name, data in ENTRIES)]),
+    "streamed": zip_of(ENTRIES, zipfile.ZIP_DEFLATED, streamed=True),
+    "in a folder, with a note": zip_of([("a/note", b""), *((f"a/{name}", data) for name, data in ENTRIES)]),
     "data before": b"#!/bin/sh\n" * 9 + ZIP,
-    "a comment": zipped(FILES, comment=b"hello"),
+    "a comment": zip_of(FILES, comment=b"hello"),
     "bytes after the end": ZIP + b"\r\n",
-    "no YAML": packed(pair for pair in ENTRIES if pair[0] != YAML),
+    "no YAML": zip_of(pair for pair in ENTRIES if pair[0] != YAML),
     "another style of YAML": with_text(YAML, b"input_fields: [means]", b"input_fields:\n  - 'means'"),
     "with an origin, antialiased": zip_bytes(MARKED),
     "the origin of the world written out": with_text(YAML, b"kissgs:", b"kissgs:\n  origin: [0, 0.0, -0.0]"),
@@ -99,10 +90,10 @@ ACCEPTED = {
 REFUSED = {
     "nested deeper": nested(201),
     "nested deeper than Python's parser": nested(50_000),
-    "bzip2": packed(ENTRIES, zipfile.ZIP_BZIP2),
-    "lzma": packed(ENTRIES, zipfile.ZIP_LZMA),
+    "bzip2": zip_of(ENTRIES, zipfile.ZIP_BZIP2),
+    "lzma": zip_of(ENTRIES, zipfile.ZIP_LZMA),
     "encrypted": flagged(ZIP, 8, 1),
-    "a file twice": packed([*ENTRIES, ("other/meta.json", FILES[JSON])]),
+    "a file twice": zip_of([*ENTRIES, ("other/meta.json", FILES[JSON])]),
     "a local header of another name": ZIP.replace(b"meta.json", b"metA.json", 1),
     "zip64": ZIP[:END] + b"PK\6\7".ljust(20, b"\0") + ZIP[END:],
     "fewer entries than the directory holds": ZIP[: END + 10] + bytes([11, 0]) + ZIP[END + 12 :],

@@ -3,7 +3,8 @@
 import json
 
 import pytest
-from helpers.web_scenes import IMAGES, assert_progress, assert_scene, container, job, without_checksums, zipped
+from helpers.reference_sog import zip_of
+from helpers.web_scenes import IMAGES, assert_progress, assert_scene, container, job, without_checksums
 from helpers.web_tools import Site
 
 MAX_ULPS = 1
@@ -198,6 +199,6 @@ def test_an_image_of_another_size_is_refused(do, large):
 def test_relative_addresses(do, site):
     files = container()
     site.put("beside", files)
-    site.files["/beside.zip"] = zipped(files)
+    site.files["/beside.zip"] = zip_of(files)
     for address in ("beside/", "/beside/meta.json", "beside.zip"):
         assert assert_scene(do(job(address)), files) <= MAX_ULPS

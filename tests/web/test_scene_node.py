@@ -5,7 +5,8 @@ import zipfile
 
 import numpy as np
 import pytest
-from helpers.web_scenes import IMAGES, array_of, assert_progress, assert_scene, container, in_node, job, ulps, zipped
+from helpers.reference_sog import zip_of
+from helpers.web_scenes import IMAGES, array_of, assert_progress, assert_scene, container, in_node, job, ulps
 from helpers.web_tools import pillow
 
 import kissgs
@@ -31,14 +32,14 @@ def test_every_kind_of_source(site):
     """Zips stored and deflated, in folders, with comments; bytes in every shape; addresses of folder, metadata, zip."""
     files = container()
     address = site.put("scene", files)
-    site.files["/x/a zip?.zip"] = site.files["/x/scene.zip"] = zipped(files)
+    site.files["/x/a zip?.zip"] = site.files["/x/scene.zip"] = zip_of(files)
     found = in_node(
         *(job(files, as_=kind) for kind in ("bytes", "buffer", "blob", "within")),
-        job(zipped(files, zipfile.ZIP_DEFLATED)),
-        job(zipped(files, zipfile.ZIP_DEFLATED, folder="my scene/"), as_="within"),
-        job(zipped(files, folder="a\\b\\")),
-        job(zipped(files, comment=b"made by hand, PK\5\6 or so")),
-        job(zipped({"notes.txt": b"hello", "preview/index.html": b"", **files})),
+        job(zip_of(files, zipfile.ZIP_DEFLATED)),
+        job(zip_of(files, zipfile.ZIP_DEFLATED, folder="my scene/"), as_="within"),
+        job(zip_of(files, folder="a\\b\\")),
+        job(zip_of(files, comment=b"made by hand, PK\5\6 or so")),
+        job(zip_of({"notes.txt": b"hello", "preview/index.html": b"", **files})),
         job(address),
         job(f"{address}?token=1#here"),
         job(f"{address}meta.json"),
@@ -50,7 +51,7 @@ def test_every_kind_of_source(site):
         assert assert_scene(report, files) <= MAX_ULPS
         assert_progress(report)
     assert found[9]["progress"][-1]["received"] == sum(len(files[name]) for name in (*IMAGES, "meta.json"))
-    assert found[12]["progress"][-1]["received"] == len(zipped(files))
+    assert found[12]["progress"][-1]["received"] == len(zip_of(files))
 
 
 def test_requests_are_made_as_asked(site):

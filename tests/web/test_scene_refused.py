@@ -6,20 +6,12 @@ import struct
 import zipfile
 
 import numpy as np
-from helpers.web_scenes import assert_scene, container, in_node, job, with_meta, without_checksums, zipped
+from helpers.reference_sog import zip_of
+from helpers.web_scenes import assert_scene, container, in_node, job, refusals, with_meta, without_checksums
 from helpers.web_tools import pillow, put_value, webp
 from PIL import Image
 
 FILES = container("fast", 3, 65)
-
-
-def refusals(*jobs):
-    found = in_node(*jobs)
-    for report in found:
-        assert report.get("error", {}).get("name") == "SogxtError", report.get("error", "was decoded")
-        assert "\n" not in report["error"]["message"]
-        assert report["later"] == 0
-    return [report["error"]["message"] for report in found]
 
 
 def without(name):
@@ -59,16 +51,6 @@ def test_a_damaged_image_is_named():
         if pixels is None or (pixels != pillow(FILES[name])).any():
             assert report["error"]["name"] == "SogxtError"
             assert report["error"]["message"].startswith(f"{name}: ")
-
-
-def test_changed_pixels_are_detected_by_the_checksum():
-    pixels = pillow(FILES["f_dc.webp"]).copy()
-    pixels[0, 0, 0] ^= 1
-    files = {**FILES, "f_dc.webp": webp(pixels[:, :, :3])}
-    (error,) = refusals(job(files))
-    assert error == "f_dc.webp: damaged: its pixels do not match their checksum"
-    (report,) = in_node(job(without_checksums(files)))
-    assert "error" not in report
 
 
 def test_images_of_another_size_or_kind():
@@ -123,8 +105,8 @@ def test_more_gaussians_than_allowed():
     assert assert_scene(report, FILES) <= 1
 
 
-ZIP = zipped(FILES)
-DEFLATED = zipped(FILES, zipfile.ZIP_DEFLATED)
+ZIP = zip_of(FILES)
+DEFLATED = zip_of(FILES, zipfile.ZIP_DEFLATED)
 
 
 def record(data, name, signature, at_name):
@@ -156,7 +138,7 @@ INVALID_ZIPS = [
     (b"PK\5\6", "not a zip"),
     (ZIP[:-1], "not a zip"),
     (ZIP[: len(ZIP) // 2], "not a zip"),
-    (zipped({}), "has no meta.json"),
+    (zip_of({}), "has no meta.json"),
     (patched(ZIP, central(ZIP) + 16, "<I", 1), "f_dc.webp is damaged: it does not match its checksum"),
     (patched(ZIP, central(ZIP) + 8, "<H", 1), "f_dc.webp is encrypted"),
     (patched(ZIP, central(ZIP) + 10, "<H", 12), "compression method 12"),
@@ -175,8 +157,8 @@ INVALID_ZIPS = [
     (patched(DEFLATED, central(DEFLATED) + 16, "<I", 1), "checksum"),
     (patched(DEFLATED, central(DEFLATED) + 20, "<I", 20), "damaged"),
     (patched(DEFLATED, local(DEFLATED) + 39, "<I", 0xFFFFFFFF), "damaged"),
-    (zipped({**FILES, "sub/f_dc.webp": b""}), "the zip has f_dc.webp twice"),
-    (zipped({f"{i}.txt": b"" for i in range(1001)}), "a zip of more than 1000 files"),
+    (zip_of({**FILES, "sub/f_dc.webp": b""}), "the zip has f_dc.webp twice"),
+    (zip_of({f"{i}.txt": b"" for i in range(1001)}), "a zip of more than 1000 files"),
 ]
 
 
@@ -187,7 +169,7 @@ def test_invalid_zips_are_refused():
 
 def test_a_zip_bomb_is_not_unpacked():
     """The file has 64 MiB of zeros and declares them, or declares 5000 bytes; streams may be a few blocks ahead."""
-    bomb = zipped({**FILES, "f_dc.webp": bytes(1 << 26)}, zipfile.ZIP_DEFLATED)
+    bomb = zip_of({**FILES, "f_dc.webp": bytes(1 << 26)}, zipfile.ZIP_DEFLATED)
     at = central(bomb)
     found = in_node(job(bomb), job(patched(bomb, at + 24, "<I", 5000)))
     assert "more than the" in found[0]["error"]["message"]
@@ -197,6 +179,6 @@ def test_a_zip_bomb_is_not_unpacked():
 
 def test_the_most_entries_and_the_longest_comment():
     more = {f"{i}.txt": b"" for i in range(1000 - len(FILES))}
-    zips = [zipped({**FILES, **more}), zipped(FILES, comment=b"x" * 65535), zipped(FILES, comment=b"")]
+    zips = [zip_of({**FILES, **more}), zip_of(FILES, comment=b"x" * 65535), zip_of(FILES, comment=b"")]
     for report in in_node(*map(job, zips)):
         assert assert_scene(report, FILES) <= 1

@@ -9,10 +9,11 @@ import zlib
 
 import numpy as np
 import pytest
+from helpers.codec_scenes import random_scene
 from helpers.format_scenes import made_scene
 from helpers.reference_sog import sog_files, webp, zip_of
 from helpers.splat_transform import convert, needs_splat_transform
-from helpers.web_scenes import array_of, in_node, job, scene_of, ulps
+from helpers.web_scenes import array_of, in_node, job, refusals, ulps
 from helpers.web_tools import put_value
 from PIL import Image
 
@@ -50,7 +51,7 @@ def assert_equal(report, source):
 @functools.cache
 def ours(preset, degree, count):
     settings = kissgs.Settings.research(preset, sensitivity_views=4, sensitivity_view_size=48)
-    return dict(kissgs.compress(scene_of(count, degree), settings=settings, container="sog").files)
+    return dict(kissgs.compress(random_scene(count, degree), settings=settings, container="sog").files)
 
 
 @pytest.mark.parametrize(("preset", "degree"), [("fast", 0), ("fast", 1), ("balanced", 3), ("fast", 2), ("fast", 3)])
@@ -165,14 +166,6 @@ def edited(change):
 def put(path, value):
     """Return a container with a changed value at a dotted path of its metadata; the value ``del`` deletes it."""
     return edited(put_value(path, value))
-
-
-def refusals(*jobs):
-    found = in_node(*jobs)
-    for report in found:
-        assert report.get("error", {}).get("name") == "SogError", report.get("error", "was decoded")
-        assert "\n" not in report["error"]["message"]
-    return [report["error"]["message"] for report in found]
 
 
 def without(name):

@@ -35,22 +35,9 @@ def photograph(w, h, rng):
     return np.clip(image, 0, 255)
 
 
-def tinted(w, h, rng):
-    """Return red and blue proportional to green, for the cross-colour transform."""
-    green = rng.integers(0, 256, (h, w))
-    return np.stack([green * 0.7 + rng.integers(0, 3, (h, w)), green, 255 - green * 0.4], axis=2)
-
-
 def single(w, h, rng):
     """Return an image of one channel."""
     return rng.integers(0, 40, (h, w, 1))
-
-
-def pattern(w, h, rng):
-    """Return a repeated piece of noise with small shifts, for copies."""
-    piece = rng.integers(0, 256, (11, 23, 3))
-    y, x = grid(w, h)
-    return piece[(y + x // 50) % 11, x % 23]
 
 
 def few_colours(w, h, rng):
@@ -77,11 +64,6 @@ def quarters(w, h, rng):
     return image
 
 
-def steep(w, h, rng):
-    """Return levels of very different frequency, for long codes."""
-    return np.minimum(rng.geometric(0.5, (h, w, 3)) ** 2, 255)
-
-
 def palette(colours):
     def content(w, h, rng):
         table = rng.integers(0, 256, (colours, 3))
@@ -98,7 +80,7 @@ def palette_alpha(w, h, rng):
 
 
 CONTENTS = [
-    *(noise, gradient, photograph, tinted, single, pattern, few_colours, transparent, alpha_noise, quarters, steep),
+    *(noise, gradient, photograph, single, few_colours, transparent, alpha_noise, quarters),
     *(palette_alpha, *map(palette, (1, 2, 3, 5, 16, 17, 256, 257))),
 ]
 

@@ -1,12 +1,13 @@
-"""Oracle: scenes whose inside and outside are known by construction, and the cameras of a real capture."""
+"""Oracle: scenes whose inside, outside and objects are known by construction, and the cameras of a real capture."""
 
 import numpy as np
 import pytest
 from helpers.fewer_cameras import try_fewer
 from helpers.hollow_scenes import box
+from helpers.whole_scenes import SCENES, two
 
 from kissgs.cameras.captures.load import load_views
-from kissgs.cameras.virtual.samples import FIELDS_OF_VIEW, random_poses
+from kissgs.cameras.virtual.samples import FIELDS_OF_VIEW, random_poses, scene_views
 from kissgs.core.splats import clean
 from kissgs.io.ply import read_ply
 from kissgs.rendering.rasterizer import render
@@ -78,3 +79,41 @@ def test_poses_of_photographs_are_among_them(shared_data):
     for view in load_views(shared_data / "fox").test:
         near = np.linalg.norm(positions - view.camera.position, axis=1) < 2.0  # the scene is about 6 across
         assert (directions[near] @ view.camera.viewmat[2, :3]).max() > np.cos(np.radians(20)), view.name
+
+
+def count_near(cameras, position, radius):
+    return sum(float(np.linalg.norm(camera.position - position)) < radius for camera in cameras)
+
+
+def cameras_of(splats, count=24):
+    views = scene_views(clean(splats)[0], width=48, height=48, count=count)
+    assert len(views.all) == count
+    return [view.camera for view in views.all]
+
+
+@pytest.mark.parametrize("distance", [100, 10_000])
+@pytest.mark.quick(1)
+def test_two_distant_objects_both_have_cameras(distance):
+    cameras = cameras_of(two(distance, count=2000))
+    assert count_near(cameras, (0, 0, 0), 30) >= 6
+    assert count_near(cameras, (distance, 0, 0), 30) >= 6
+
+
+def test_a_small_object_has_cameras_at_its_own_scale():
+    cameras = cameras_of(two(12, 1 / 50, count=2000))
+    assert count_near(cameras, (12, 0, 0), 0.6) >= 4
+    assert count_near(cameras, (0, 0, 0), 8) >= 4
+
+
+@pytest.mark.quick(0)
+def test_each_of_five_objects_has_cameras():
+    cameras = cameras_of(SCENES["five of different density"](), count=48)
+    for position in ((0, 0, 0), (150, 0, 0), (0, 0, 150), (-150, 20, 0), (300, 0, 300)):
+        assert count_near(cameras, position, 60) >= 2
+
+
+def test_random_poses_are_divided_among_both_objects():
+    views = random_poses(clean(two(1000, count=2000))[0], side=24, count=40)
+    cameras = [view.camera for view in views.all]
+    assert count_near(cameras, (0, 0, 0), 40) >= 12
+    assert count_near(cameras, (1000, 0, 0), 40) >= 12
