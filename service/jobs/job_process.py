@@ -30,9 +30,9 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     result.save(container)
     result.save(folder / "files")
     for path in (folder / "files", folder):
-        _sync(path)
+        sync_folder(path)
     report = result.report.as_dict()
-    _write(folder / "report.json", json.dumps(report, indent=2).encode())
+    write(folder / "report.json", json.dumps(report, indent=2).encode())
     stored = result.report.file_bytes
     files = {
         path.name: {**_size_and_hash(path), "stored": stored[path.name]}
@@ -48,11 +48,14 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     }
     if report["evaluation"] is not None:
         evaluation = report["evaluation"]
+        mean = evaluation["mean"]
+        of_photographs = {} if mean["reference"] is None else {name: mean[name] for name in ("reference", "candidate")}
         summary["evaluation"] = {
-            **evaluation["mean"]["candidate_vs_reference"],
+            **mean["candidate_vs_reference"],
+            **of_photographs,
             **{name: evaluation[name] for name in ("worst", "fifth_percentile", "detail", "shown")},
         }
-    _write(folder / "summary.json", json.dumps(summary).encode())
+    write(folder / "summary.json", json.dumps(summary).encode())
     return summary
 
 
@@ -62,6 +65,7 @@ def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed
     job runs without."""
     import kissgs
 
+    views = None if task.get("views") is None else kissgs.load_views(Path(task["views"]), unpacked=True)
     checkpoint = None if task["checkpoint"] is None else Path(task["checkpoint"])
     while True:
         kept = [] if checkpoint is None else sorted(checkpoint.parent.glob(f"{checkpoint.stem}*{checkpoint.suffix}"))
@@ -72,6 +76,8 @@ def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed
                 reading=kissgs.ReadOptions(origin=task.get("origin")),
                 container=task["format"],
                 evaluate=task["evaluate"],
+                views=views,
+                force_views=task.get("force_views", False),
                 checkpoint=checkpoint,
                 threads=task["threads"],
                 device=task["device"],
@@ -93,13 +99,15 @@ def decode(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     target = Path(task["work"]) / "decoded.ply"
     kissgs.decompress(Path(task["source"]), target, threads=task["threads"], progress=progress)
     described = _size_and_hash(target)
-    _write(target.with_suffix(".json"), json.dumps(described).encode())
+    write(target.with_suffix(".json"), json.dumps(described).encode())
     return described
 
 
 def without_paths(message: str, task: Task) -> str:
     """Return a message for clients, which does not say where the files of a task lie."""
-    return message.replace(task["source"], "the scene").replace(f"{task['work']}/", "")
+    for path in (f"{task['work']}/", f"{task['folder']}/"):
+        message = message.replace(path, "")
+    return message.replace(task["source"], "the scene")
 
 
 def _size_and_hash(path: Path) -> dict[str, Any]:
@@ -107,14 +115,16 @@ def _size_and_hash(path: Path) -> dict[str, Any]:
         return {"bytes": path.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 
-def _write(path: Path, data: bytes) -> None:
+def write(path: Path, data: bytes) -> None:
+    """Write a file, and flush it to the disk."""
     with path.open("wb") as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
 
 
-def _sync(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's entries to the disk."""
     descriptor = os.open(folder, os.O_RDONLY)
     os.fsync(descriptor)
     os.close(descriptor)

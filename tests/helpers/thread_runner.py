@@ -67,7 +67,7 @@ class _ItemThread:
         if arguments.get("settings", {}).get("encode", {}).get("seed") == HELD_SEED:
             progress("order", 0.0)
             self._killed.wait()
-        for name in ("source", "work", "checkpoint"):
+        for name in ("source", "work", "checkpoint", "views"):
             if arguments.get(name) is not None:
                 arguments[name] = self._folder + arguments[name]
         module, _, name = self._item.function.partition(":")

@@ -17,9 +17,10 @@ from typing import Literal
 import numpy as np
 from pydantic import ValidationError
 
-from kissgs.cameras.photographs import EXTENSIONS, NO_DISTORTION, Distortion, Lens
+from kissgs.cameras.photographs import NO_DISTORTION, Distortion, Lens
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
+from kissgs.formats import PHOTOGRAPHS
 from kissgs.io.files import open_scene_file, reason_of
 
 MAX_JSON_BYTES = 1 << 28  # maximum bytes of a JSON file; ten thousand cameras take about 10 MB
@@ -109,6 +110,7 @@ class Capture:
     images: tuple[PosedImage, ...]  # one or more
     root: Path  # folder that paths of photographs are relative to
     source: str  # description of the files that were read, for messages
+    files: dict[str, Path]  # these files by their names relative to ``root``, under which any capture may have them
     white: bool = False  # whether transparent pixels are composited over white
     applied: Float64[np.ndarray, "4 4"] | None = None  # rotation and translation from a former model to the poses
 
@@ -148,19 +150,24 @@ class _SearchFolder:
 
 
 def find_photos(
-    names: Sequence[str], root: Path, *, scale: int | None = None, images: Path | None = None
+    names: Sequence[str],
+    root: Path,
+    *,
+    scale: int | None = None,
+    images: Path | None = None,
+    within: Path | None = None,
 ) -> tuple[FoundPhoto, ...] | None:
     """Find the file of each photograph, in order; None if there is no folder of photographs. The default is the
     full-size folder, else that of scale 4, at which the protocol of 3DGS trains outdoor scenes, else the largest;
     ``input`` if there is no ``images`` of any scale. If no file has the exact name, one with another Unicode form,
     extension or case is accepted; a folder may have another Unicode form, too. An absolute path that does not exist is
-    searched for in the capture's folder."""
+    searched for in the capture's folder. No file outside the folder ``within``, if there is one, is looked at."""
     if images is not None and scale is not None:
         raise InvalidViewsError("--images and --scale exclude each other; give only one of them")
-    listing = _FolderListing()
+    listing = _FolderListing(within)
     if images is None:
         searched = [
-            [_search_folder(folder, tried, root, scale, listing) for folder, tried in _candidates(name, root)]
+            [_search_folder(folder, tried, root, scale, listing) for folder, tried in _candidates(name, root, within)]
             for name in names
         ]
     else:
@@ -203,9 +210,10 @@ def is_absolute(name: str) -> bool:
 
 
 class _FolderListing:
-    """Files of folders; each folder is read once."""
+    """Files of folders; each folder is read once, and none outside the folder ``within``."""
 
-    def __init__(self) -> None:
+    def __init__(self, within: Path | None) -> None:
+        self._within = within
         self._listings: dict[Path, tuple[dict[str, str], dict[str, list[str]]]] = {}
         self._variants: dict[Path, dict[int, Path]] = {}
         self._folders: dict[Path, Path] = {}
@@ -215,6 +223,8 @@ class _FolderListing:
         for entry in folders:
             for name in entry.names:
                 path = PurePosixPath(name)
+                if not _is_within(entry.folder / name, self._within):
+                    continue
                 folder = self.spelled(entry.folder / path.parent)
                 file = self._match(folder, path.name)
                 if file is not None:
@@ -275,7 +285,7 @@ def _list(folder: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
         raise InvalidViewsError(f"cannot read {folder}: {reason_of(error)}") from error
     stems: dict[str, list[str]] = {}
     for file in names:
-        if Path(file).suffix.lower() in EXTENSIONS:
+        if Path(file).suffix.lower() in PHOTOGRAPHS:
             stems.setdefault(_stem(composed(file)).lower(), []).append(file)
     return {**{composed(file): file for file in names}, **{file: file for file in names}}, stems
 
@@ -283,7 +293,7 @@ def _list(folder: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
 def _stem(name: str) -> str:
     # A name without extension may have a dot, as in frame.0001, so only image extensions count.
     path = PurePosixPath(name)
-    return path.stem if path.suffix.lower() in EXTENSIONS else path.name
+    return path.stem if path.suffix.lower() in PHOTOGRAPHS else path.name
 
 
 def _search_folder(
@@ -306,8 +316,14 @@ def _search_folder(
     return _SearchFolder(variants[factor], factor, names, has_photos)
 
 
-def _candidates(name: str, root: Path) -> list[tuple[Path, tuple[str, ...]]]:
-    """Return the folders of photographs that ``name`` may refer to, in order, each with the names to try in it."""
+def _candidates(name: str, root: Path, within: Path | None = None) -> list[tuple[Path, tuple[str, ...]]]:
+    """Return the folders of photographs that ``name`` may refer to, in order, each with the names to try in it. If all
+    are outside ``within``, the photograph is searched by its file's name alone."""
+    found = [(folder, names) for folder, names in _everywhere(name, root) if _is_within(folder, within)]
+    return found or [(root, (PurePosixPath(name.replace("\\", "/")).name,))]
+
+
+def _everywhere(name: str, root: Path) -> list[tuple[Path, tuple[str, ...]]]:
     path = PurePosixPath(name.replace("\\", "/"))
     if is_absolute(name):  # the capture may have been moved
         names = (path.name,)
@@ -334,6 +350,13 @@ def _within(folder: Path, name: str) -> _SearchFolder:
     suffix = re.search(r"_([0-9]{1,2})$", folder.name)
     factor = int(suffix[1]) if suffix and 2 <= int(suffix[1]) <= MAX_FACTOR else 1
     return _SearchFolder(folder, factor, _suffixes(parts) or ("",), has_photos=True)
+
+
+def _is_within(path: Path, folder: Path | None) -> bool:
+    try:
+        return folder is None or path.resolve().is_relative_to(folder)
+    except (OSError, ValueError):  # too long, or invalid in any file system
+        return False
 
 
 def _is_folder(path: Path) -> bool:
