@@ -17,6 +17,7 @@ from ..core.problems import PROBLEM_TYPES, ProblemError, disk_full, invalid
 from ..jobs.archive import FACTS
 from ..jobs.container import ServiceContainer
 from ..jobs.process import UNPACK, JobProcess
+from ..storage.job_files import tree_bytes
 from .uploads import Spool
 
 UNPACKED_RATIO, UNPACKED_BYTES = 4, 16 << 20
@@ -114,8 +115,10 @@ class CaptureUpload:
         for job_id in self._context.store.with_capture(self._owner, reference):
             with contextlib.suppress(FileNotFoundError):  # the job is being removed
                 self._context.storage.link_capture(job_id, self._folder)
-                facts = json.loads((self._folder / FACTS).read_bytes())
-                return Capture(reference, self._folder, facts["bytes"], facts["photographs"])
+                described = (self._folder / FACTS).read_bytes()
+                facts = json.loads(described)
+                if tree_bytes(self._folder) == facts["bytes"] + len(described):  # else files are missing
+                    return Capture(reference, self._folder, facts["bytes"], facts["photographs"])
             self._context.storage.discard(self._folder)
         raise _gone()
 
@@ -125,6 +128,5 @@ class CaptureUpload:
 
 
 def _gone() -> ProblemError:
-    return ProblemError(
-        "gone", "the service does not have this capture any more; send its archive in the field capture"
-    )
+    text = "the service does not have this capture, or not any more; send its archive in the field 'capture'"
+    return ProblemError("gone", text)

@@ -85,8 +85,8 @@ async def submit(
                 await capture.check(parsed.capture)  # before the body
                 async for chunk in _body(context, request):
                     await spool.write(chunk)
-            submission = await _checked(spool, capture, text, scene_name(name), key)
             try:
+                submission = await _checked(spool, capture, text, scene_name(name), key)
                 job, new = await run_sync(_queue, context, submission, owner)
             finally:
                 await run_sync(context.storage.discard, path)  # already moved to the job, or not needed
