@@ -11,7 +11,7 @@ from kissgs._version import __version__
 
 TYPE_CHECKING = False  # without typing, which takes longer to import than all of this
 if TYPE_CHECKING:
-    from kissgs.cameras.captures.load import load_views, pack_capture
+    from kissgs.cameras.captures.load import load_views
     from kissgs.cameras.views import View, Views
     from kissgs.cameras.virtual.select import virtual_views
     from kissgs.client import Remote
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from kissgs.synthetic import sample_scene
 
 _NAMES = {
-    "cameras.captures.load": "load_views pack_capture",
+    "cameras.captures.load": "load_views",
     "cameras.views": "View Views",
     "cameras.virtual.select": "virtual_views",
     "client": "Remote",
@@ -116,7 +116,6 @@ __all__ = [
     "load",
     "load_views",
     "measure_sensitivity",
-    "pack_capture",
     "read_ply_info",
     "read_scene_info",
     "recognise",

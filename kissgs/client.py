@@ -99,8 +99,8 @@ class Remote:
             container: ``"sogxt"`` or ``"sog"``; by default SOG if ``destination`` ends in ``.sog``, else SOG-XT.
             evaluate: whether the service also compares rendered images.
             origin: see :class:`kissgs.ReadOptions`.
-            capture: zip or tar with photographs of the scene and their cameras (:func:`kissgs.pack_capture`). It is
-                sent unless the service has kept it for an earlier job.
+            capture: zip or tar of photographs of the scene and their cameras, as :func:`kissgs.load_views` reads them;
+                it is sent unless the service has kept it for an earlier job.
             overwrite: whether to replace ``destination`` if it exists.
             progress: receives "upload", "queue", the stages of the service, "download", and "wait for server" with the
                 reason as a note. An exception that it raises cancels the job.

@@ -55,7 +55,6 @@ PUBLIC = [
     "load",
     "load_views",
     "measure_sensitivity",
-    "pack_capture",
     "read_ply_info",
     "read_scene_info",
     "recognise",

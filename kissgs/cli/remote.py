@@ -145,7 +145,7 @@ def _packed(views: Path | None, quiet: bool) -> Iterator[Path | None]:
     with tempfile.TemporaryDirectory() as folder:
         archive = Path(folder) / "capture.zip"
         with progress_bar(quiet) as progress:
-            pack_capture(views, archive, progress=progress)
+            pack_capture(views, archive, progress)
         yield archive
 
 

@@ -1,23 +1,18 @@
-"""The capture of a submission: an archive in the form, which is unpacked, or the hash of an earlier one."""
+"""The capture of a submission: an archive in the form, which is unpacked, or the hash of an earlier job's."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from anyio.to_thread import run_sync
 
 from kissgs.runners import MEMORY_LIMIT, TIME_LIMIT
 
 from ..core.problems import PROBLEM_TYPES, ProblemError, disk_full, invalid
-from ..jobs.archive import FACTS
 from ..jobs.container import ServiceContainer
 from ..jobs.process import UNPACK, JobProcess
-from ..storage.job_files import tree_bytes
 from .uploads import Spool
 
 UNPACKED_RATIO, UNPACKED_BYTES = 4, 16 << 20
@@ -25,10 +20,9 @@ UNPACKED_RATIO, UNPACKED_BYTES = 4, 16 << 20
 camera files as text shrink to a third. This much disk space is reserved."""
 
 
-@dataclass(frozen=True, slots=True)
-class Capture:
-    """A capture in a folder of incoming files: its ``reference``, the SHA-256 of its archive, its size in bytes, and
-    whether it has ``photographs`` to train on and others to evaluate with."""
+class Capture(NamedTuple):
+    """A capture in a folder of incoming files: the SHA-256 of its archive, its size in bytes, and whether it has
+    photographs to train on and others to evaluate with."""
 
     reference: str
     folder: Path
@@ -44,23 +38,23 @@ class CaptureUpload:
         self._archive, self._folder = context.storage.new_upload(), context.storage.new_upload()
         self._spool = Spool(context.settings, context.admission, self._archive, capture=True)
         self._reserved = 0
+        self.write = self._spool.write
 
     async def __aenter__(self) -> Self:
-        await self._spool.__aenter__()
         return self
 
     async def __aexit__(self, *error: object) -> None:
         await self._spool.__aexit__(*error)
         await asyncio.shield(asyncio.ensure_future(run_sync(self._leave)))
 
+    def _leave(self) -> None:
+        self._context.storage.discard(self._folder)  # moved to the job, or not needed
+        self._context.admission.release(self._reserved, 0)
+
     @property
     def size(self) -> int:
         """Number of bytes of the archive so far."""
         return self._spool.size
-
-    async def write(self, data: bytes) -> None:
-        """Process the next bytes of the archive."""
-        await self._spool.write(data)
 
     async def check(self, reference: str | None) -> None:
         """Refuse the reference of a capture that no job of the owner has kept."""
@@ -69,34 +63,40 @@ class CaptureUpload:
 
     async def finish(self, reference: str | None) -> Capture | None:
         """Return the capture, that of the archive or the one of this ``reference``; None if there is neither."""
+        if not self.size and reference is None:
+            return None
+        most = min(int(self._context.settings.max_capture_bytes), UNPACKED_RATIO * self.size + UNPACKED_BYTES)
         if self.size:
             found = f"sha256:{await self._spool.close()}"
             if reference not in (None, found):
                 raise invalid(f"the option capture is not that of the archive, {found}; leave it out, or the archive")
-            return await self._unpack(found)
-        if reference is None:
-            return None
-        try:
-            return await run_sync(self._link, reference)
-        except OSError as error:
-            reason = (error.strerror or str(error)).lower()
-            raise disk_full(f"the capture cannot be stored: {reason}; try again later") from error
+            reference = found
+            await run_sync(self._context.admission.reserve, most)
+            self._reserved = most
+            self._folder.mkdir()
+        elif reference is not None:
+            await run_sync(self._link, reference)
+        facts = await self._unpack(most)
+        return Capture(str(reference), self._folder, facts["bytes"], facts["photographs"])
 
-    async def _unpack(self, reference: str) -> Capture:
-        settings, storage = self._context.settings, self._context.storage
-        most = min(int(settings.max_capture_bytes), UNPACKED_RATIO * self.size + UNPACKED_BYTES)
-        await run_sync(self._context.admission.reserve, most)
-        self._reserved = most
-        self._folder.mkdir()
-        task: dict[str, Any] = {"function": UNPACK, "folder": str(storage.incoming), "files": []}
-        task |= {"source": self._archive.name, "work": self._folder.name}
+    def _link(self, reference: str) -> None:
+        for job_id in self._context.store.with_capture(self._owner, reference):
+            try:
+                return self._context.storage.link_capture(job_id, self._folder)
+            except OSError:  # the job is being removed, or this file system has no links
+                self._context.storage.discard(self._folder)
+        raise _gone()
+
+    async def _unpack(self, most: int) -> dict[str, Any]:
+        """Unpack the archive, if there is one, and check the capture, in a process; return its facts."""
+        settings = self._context.settings
+        task: dict[str, Any] = {"function": UNPACK, "folder": str(self._archive.parent), "files": []}
+        task |= {"source": self._archive.name if self.size else "", "work": self._folder.name}
         task |= {"most_bytes": most, "most_files": settings.max_capture_files}
-
-        async def ignore(stage: str, fraction: float, note: str) -> None:
-            pass
-
         async with self._context.admission.unpacking:
-            outcome = await JobProcess(self._context.worker.runners).run(task, ignore)
+            outcome = await JobProcess(self._context.worker.runners).run(task)
+        if outcome.kind == "done":
+            return outcome.result
         if outcome.code in (TIME_LIMIT, MEMORY_LIMIT):
             takes = f"more than {settings.capture_seconds:g} s or {settings.job_memory:,} bytes of memory"
             text = f"the capture takes {takes} to unpack and check, which is the limit; send fewer photographs"
@@ -105,26 +105,8 @@ class CaptureUpload:
             raise disk_full(outcome.message)
         if outcome.kind == "cancelled":
             raise ProblemError("stopping", "the service is stopping; send the upload again in a minute", retry_after=60)
-        if outcome.kind != "done":
-            code = outcome.code if outcome.code in PROBLEM_TYPES else "internal"
-            raise ProblemError(code, outcome.message or "the capture could not be unpacked; send it again")
-        return Capture(reference, self._folder, outcome.result["bytes"], outcome.result["photographs"])
-
-    def _link(self, reference: str) -> Capture:
-        """Return the capture of an earlier job, whose files are linked."""
-        for job_id in self._context.store.with_capture(self._owner, reference):
-            with contextlib.suppress(FileNotFoundError):  # the job is being removed
-                self._context.storage.link_capture(job_id, self._folder)
-                described = (self._folder / FACTS).read_bytes()
-                facts = json.loads(described)
-                if tree_bytes(self._folder) == facts["bytes"] + len(described):  # else files are missing
-                    return Capture(reference, self._folder, facts["bytes"], facts["photographs"])
-            self._context.storage.discard(self._folder)
-        raise _gone()
-
-    def _leave(self) -> None:
-        self._context.storage.discard(self._folder)  # moved to the job, or not needed
-        self._context.admission.release(self._reserved, 0)
+        code = outcome.code if outcome.code in PROBLEM_TYPES else "internal"
+        raise ProblemError(code, outcome.message or "the capture could not be unpacked; send it again")
 
 
 def _gone() -> ProblemError:

@@ -315,8 +315,8 @@ class Spool:
 
     def _refuse_size(self, size: int) -> None:
         if self._capture and size > self._settings.max_capture_bytes:
-            text = f"the capture exceeds {self._settings.max_capture_bytes:,} bytes, which is the limit"
-            raise ProblemError("too-large", f"{text}; send fewer or smaller photographs")
+            most = f"{self._settings.max_capture_bytes:,} bytes, which is the limit"
+            raise ProblemError("too-large", f"the capture exceeds {most}; send fewer or smaller photographs")
         if not self._capture and size > self._settings.max_upload_bytes:
             raise ProblemError(
                 "too-large",

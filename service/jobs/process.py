@@ -112,7 +112,7 @@ class JobProcess:
         if self._handle is not None:
             self._used.cancel(self._handle.id)
 
-    async def run(self, task: dict[str, Any], on_progress: OnProgress) -> Outcome:
+    async def run(self, task: dict[str, Any], on_progress: OnProgress | None = None) -> Outcome:
         """Run a task (see :mod:`service.jobs.job_process`); if the caller is cancelled, the process is killed."""
         if self.killed:
             return Outcome("cancelled")
@@ -129,7 +129,8 @@ class JobProcess:
         outcome.add_done_callback(lambda _: events.put_nowait(None))
         try:
             while (event := await events.get()) is not None:
-                await on_progress(*event)
+                if on_progress is not None:
+                    await on_progress(*event)
         finally:
             self._end()
             await asyncio.wait([outcome])

@@ -136,16 +136,8 @@ class JobStorage:
             self.discard(path)
 
     def link_capture(self, job_id: str, folder: Path) -> None:
-        """Make a folder with links to all files of a job's capture, or with copies where the file system has no links.
-        Raises FileNotFoundError if a file is missing, because the job is being removed."""
-        source = self.jobs / job_id / CAPTURE
-        folder.mkdir()
-        for path in sorted(source.rglob("*")):
-            target = folder / path.relative_to(source)
-            if path.is_dir():
-                target.mkdir()
-            else:
-                _link(path, target)
+        """Make a folder with links to all files of a job's capture."""
+        shutil.copytree(self.jobs / job_id / CAPTURE, folder, copy_function=os.link)
 
     def capture_files(self, job_id: str) -> list[str]:
         """Return the names of all files of a job's capture, relative to the job's folder; none if it has none."""
@@ -367,15 +359,6 @@ def _complete_summary(text: bytes, sizes: dict[str, int], container: str) -> dic
 def tree_bytes(path: Path) -> int:
     """Return the size of a file, or of all files below a folder, bytes."""
     return sum(each.stat().st_size for each in (path, *path.rglob("*")) if each.is_file())
-
-
-def _link(source: Path, target: Path) -> None:
-    try:
-        target.hardlink_to(source)
-    except FileNotFoundError:
-        raise
-    except OSError:  # the file system has no links, or this file too many
-        shutil.copyfile(source, target)
 
 
 def sync_folder(folder: Path) -> None:

@@ -68,7 +68,7 @@ class _ItemThread:
             progress("order", 0.0)
             self._killed.wait()
         for name in ("source", "work", "checkpoint", "views"):
-            if arguments.get(name) is not None:
+            if arguments.get(name):
                 arguments[name] = self._folder + arguments[name]
         module, _, name = self._item.function.partition(":")
         return getattr(importlib.import_module(module), name)(arguments, progress)

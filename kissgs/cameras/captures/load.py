@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import io
-import os
 import zipfile
 from collections.abc import Sequence
-from os import PathLike
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
@@ -22,6 +20,7 @@ from kissgs.cameras.captures.photos import (
     is_absolute,
     open_file,
     searched_folders,
+    without_parents,
 )
 from kissgs.cameras.captures.transforms_json import (
     DATAPARSER_TRANSFORMS,
@@ -83,7 +82,7 @@ def load_views(
         hold_out: every ``hold_out``-th view in order of names, starting with the first, is held out; 0 for none. A
             split that the capture defines takes precedence.
         unpacked: ``path`` is the folder of an archive from elsewhere. The capture is its uppermost folder with cameras,
-            and photographs are looked for in ``path`` only, wherever a camera file says they are.
+            and photographs are looked for in it only, wherever a camera file says they are.
 
     Raises:
         InvalidViewsError: there is no capture, its files are damaged, photographs are missing or of another aspect
@@ -97,14 +96,13 @@ def load_views(
         raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
     path = Path(path)
     try:
-        within = path.resolve() if unpacked else None
         path = _uppermost_with_cameras(path) if unpacked else path
         capture, folder = _read_capture(path), path if path.is_dir() else path.parent
         moves = similarities(dataparser_file((folder, capture.root)), capture.applied)
     except OSError as error:  # even testing for a path fails without permission or if a name is too long
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
     names = [posed.photo for posed in capture.images]
-    photos = find_photos(names, capture.root, scale=scale, images=images, within=within)
+    photos = find_photos(names, capture.root, scale=scale, images=images, inside=unpacked)
     white = capture.white and (photos is None or read_photo_header(photos[0].path).transparent)
     background = np.full(3, float(white), dtype=np.float32)
     limit = DEFAULT_RESOLUTION if resolution is None else resolution
@@ -234,54 +232,36 @@ def _split(views: Sequence[tuple[View, str | None]], hold_out: int) -> tuple[tup
 # Packing for a service.
 
 
-def pack_capture(
-    path: str | PathLike[str],
-    destination: str | PathLike[str],
-    *,
-    overwrite: bool = False,
-    progress: Progress = silent,
-) -> None:
-    """Pack what :func:`load_views` uses of a capture into a zip, for a service: it reads the same views from it.
-
-    These are its camera files, and the photographs of its views. Photographs that are used reduced are packed reduced,
-    without further loss. Equal captures make equal files.
-
-    Args:
-        path: folder of the capture, or its camera file.
-        destination: zip file to write, atomically.
-        overwrite: whether to replace ``destination`` if it exists.
-        progress: receives "pack".
-
-    Raises:
-        InvalidViewsError, UnsupportedError: as :func:`load_views`.
-        OutputError: ``destination`` cannot be written.
-    """
-    path = Path(path)
+def pack_capture(path: Path, destination: Path, progress: Progress = silent) -> None:
+    """Pack what :func:`load_views` uses of a capture into a zip, from which a service reads the same views: its camera
+    files, and the photographs of its views, those that are used reduced without further loss. Equal captures make equal
+    files."""
     load_views(path)  # refuses what a service would refuse
     capture = _read_capture(path)
     photos = find_photos([posed.photo for posed in capture.images], capture.root) or ()
-    found = zip(capture.images, photos, strict=False)
-    packed = {_packed_name(posed.photo, photo, capture.root): (posed, photo) for posed, photo in found}
-    cameras = dict(capture.files)
-    if (dataparser := dataparser_file((path if path.is_dir() else path.parent, capture.root))) is not None:
+    packed = {_packed_name(posed, photo): (posed, photo) for posed, photo in zip(capture.images, photos, strict=False)}
+    if len(packed) < len({photo.path for photo in photos}):
+        raise InvalidViewsError(f"two photographs of {path} have the same name in different folders; rename one")
+    cameras, folder = dict(capture.files), path if path.is_dir() else path.parent
+    if (dataparser := dataparser_file((folder, capture.root))) is not None:
         cameras[DATAPARSER_TRANSFORMS] = dataparser
-    above = max(PurePosixPath(name).parts.count("..") for name in (*cameras, *packed))
-    prefix = "_/" * above  # stands for the folders above the capture's, where photographs may be
-    with atomic_file(Path(destination), overwrite=overwrite) as file, zipfile.ZipFile(file, "w") as archive:
+    with atomic_file(destination) as file, zipfile.ZipFile(file, "w") as archive:
         for name, camera_file in sorted(cameras.items()):
-            archive.writestr(_entry(prefix + name), _content(camera_file), zipfile.ZIP_DEFLATED)
+            archive.writestr(_entry(name), _content(camera_file), zipfile.ZIP_DEFLATED)
         for done, (name, (posed, photo)) in enumerate(sorted(packed.items())):
             progress("pack", done / len(packed))
-            archive.writestr(_entry(os.path.normpath(prefix + name)), _packed_photo(posed, photo))
+            archive.writestr(_entry(name), _packed_photo(posed, photo))
     progress("pack", 1.0)
 
 
-def _packed_name(name: str, photo: FoundPhoto, root: Path) -> str:
-    """Return the name of a photograph, relative to the root, under which :func:`find_photos` finds it there."""
-    if not is_absolute(name):
-        return os.path.relpath(photo.path, root)
-    folder = IMAGES if photo.factor == 1 else f"{IMAGES}_{photo.factor}"
-    return str(PurePosixPath(folder, *PurePosixPath(name.replace("\\", "/")).parts[1:]))
+def _packed_name(posed: PosedImage, photo: FoundPhoto) -> str:
+    """Return the name under which :func:`find_photos` finds a photograph inside the root of an unpacked capture."""
+    parts = without_parents(posed.photo).parts
+    if is_absolute(posed.photo):
+        parts = (IMAGES if photo.factor == 1 else f"{IMAGES}_{photo.factor}", *parts[1:])
+    elif len(parts) > 1:
+        parts = (photo.folder.name, *parts[1:])  # perhaps that of a scaled copy
+    return "/".join(parts)
 
 
 def _packed_photo(posed: PosedImage, photo: FoundPhoto) -> bytes:

@@ -150,24 +150,19 @@ class _SearchFolder:
 
 
 def find_photos(
-    names: Sequence[str],
-    root: Path,
-    *,
-    scale: int | None = None,
-    images: Path | None = None,
-    within: Path | None = None,
+    names: Sequence[str], root: Path, *, scale: int | None = None, images: Path | None = None, inside: bool = False
 ) -> tuple[FoundPhoto, ...] | None:
     """Find the file of each photograph, in order; None if there is no folder of photographs. The default is the
     full-size folder, else that of scale 4, at which the protocol of 3DGS trains outdoor scenes, else the largest;
     ``input`` if there is no ``images`` of any scale. If no file has the exact name, one with another Unicode form,
     extension or case is accepted; a folder may have another Unicode form, too. An absolute path that does not exist is
-    searched for in the capture's folder. No file outside the folder ``within``, if there is one, is looked at."""
+    searched for in the capture's folder. With ``inside``, no file outside ``root`` is looked at."""
     if images is not None and scale is not None:
         raise InvalidViewsError("--images and --scale exclude each other; give only one of them")
-    listing = _FolderListing(within)
+    listing = _FolderListing()
     if images is None:
         searched = [
-            [_search_folder(folder, tried, root, scale, listing) for folder, tried in _candidates(name, root, within)]
+            [_search_folder(folder, tried, root, scale, listing) for folder, tried in _candidates(name, root, inside)]
             for name in names
         ]
     else:
@@ -193,7 +188,7 @@ def find_photos(
 
 def searched_folders(names: Sequence[str], root: Path) -> str:
     """Describe the folders in which :func:`find_photos` searches for these names, without scaled ones."""
-    folders = dict.fromkeys(folder for name in names for folder, _ in _candidates(name, root))
+    folders = dict.fromkeys(folder for name in names for folder, _ in _candidates(name, root, inside=False))
     searched = []
     for folder in folders:
         if folder != root:
@@ -209,11 +204,15 @@ def is_absolute(name: str) -> bool:
     return re.match(r"[A-Za-z]:[/\\]|[/\\]", name) is not None
 
 
-class _FolderListing:
-    """Files of folders; each folder is read once, and none outside the folder ``within``."""
+def without_parents(name: str) -> PurePosixPath:
+    """Return a path without its parts "..", with forward slashes."""
+    return PurePosixPath(*(part for part in PurePosixPath(name.replace("\\", "/")).parts if part != ".."))
 
-    def __init__(self, within: Path | None) -> None:
-        self._within = within
+
+class _FolderListing:
+    """Files of folders; each folder is read once."""
+
+    def __init__(self) -> None:
         self._listings: dict[Path, tuple[dict[str, str], dict[str, list[str]]]] = {}
         self._variants: dict[Path, dict[int, Path]] = {}
         self._folders: dict[Path, Path] = {}
@@ -223,8 +222,6 @@ class _FolderListing:
         for entry in folders:
             for name in entry.names:
                 path = PurePosixPath(name)
-                if not _is_within(entry.folder / name, self._within):
-                    continue
                 folder = self.spelled(entry.folder / path.parent)
                 file = self._match(folder, path.name)
                 if file is not None:
@@ -316,22 +313,13 @@ def _search_folder(
     return _SearchFolder(variants[factor], factor, names, has_photos)
 
 
-def _candidates(name: str, root: Path, within: Path | None = None) -> list[tuple[Path, tuple[str, ...]]]:
-    """Return the folders of photographs that ``name`` may refer to, in order, each with the names to try in it. If all
-    are outside ``within``, the photograph is searched by its file's name alone."""
-    found = [(folder, names) for folder, names in _everywhere(name, root) if _is_within(folder, within)]
-    return found or [(root, (PurePosixPath(name.replace("\\", "/")).name,))]
-
-
-def _everywhere(name: str, root: Path) -> list[tuple[Path, tuple[str, ...]]]:
-    path = PurePosixPath(name.replace("\\", "/"))
+def _candidates(name: str, root: Path, inside: bool) -> list[tuple[Path, tuple[str, ...]]]:
+    """Return the folders of photographs that ``name`` may refer to, in order, each with the names to try in it."""
+    path = without_parents(name) if inside else PurePosixPath(name.replace("\\", "/"))
     if is_absolute(name):  # the capture may have been moved
         names = (path.name,)
-        return [
-            (Path(path.parent), names),
-            (root / path.parent.name, names),
-            (root / IMAGES, _suffixes(path.parts[1:])),
-        ]
+        moved = [(root / path.parent.name, names), (root / IMAGES, _suffixes(path.parts[1:]))]
+        return moved if inside else [(Path(path.parent), names), *moved]
     parts = path.parts
     ups = next((i for i, part in enumerate(parts) if part != ".."), len(parts))
     folder = root.joinpath(*parts[:ups])
@@ -350,13 +338,6 @@ def _within(folder: Path, name: str) -> _SearchFolder:
     suffix = re.search(r"_([0-9]{1,2})$", folder.name)
     factor = int(suffix[1]) if suffix and 2 <= int(suffix[1]) <= MAX_FACTOR else 1
     return _SearchFolder(folder, factor, _suffixes(parts) or ("",), has_photos=True)
-
-
-def _is_within(path: Path, folder: Path | None) -> bool:
-    try:
-        return folder is None or path.resolve().is_relative_to(folder)
-    except (OSError, ValueError):  # too long, or invalid in any file system
-        return False
 
 
 def _is_folder(path: Path) -> bool:
