@@ -321,7 +321,7 @@ class EncodeSettings(StageSettings):
         if len(goals) > 1 and goals[0] == "rd_lambda":
             raise ValueError(f"{goals[0]} and {goals[1]} cannot both be met; give one")
         if goals and not self.rate_distortion:
-            raise ValueError(f"{goals[0]} needs rate_distortion: choose preset balanced or small")
+            raise ValueError(f"{goals[0]} needs rate_distortion: choose preset balanced")
         return self
 
 
@@ -378,7 +378,6 @@ class Preset(StrEnum):
 
     FAST = "fast"
     BALANCED = "balanced"
-    SMALL = "small"
     PAPER = "paper"
 
 
@@ -386,7 +385,7 @@ _PAPER_LOSS = {"ssim_weight": 0.2, "mse_weight": 0.0, "synthetic_view_share": 0.
 
 PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
     Preset.FAST: {
-        "compact": {"sparsify_steps": 0, "refine_steps": 0},
+        "compact": {"method": "merge", "sparsify_steps": 0, "refine_steps": 0},
         "encode": {
             "rate_distortion": False,
             "order": "hilbert",
@@ -401,19 +400,6 @@ PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
         "finetune": {"steps": 200},
     },
     Preset.BALANCED: {"compact": {}, "encode": {}, "finetune": {}},
-    Preset.SMALL: {
-        "compact": {"sparsify_steps": 5000, "refine_steps": 5000},
-        "encode": {
-            "quality_offset_db": -0.4,
-            "color_refit_iterations": 4,
-            "sh_kmeans_iterations": 8,
-            "sh_neighbors": 128,
-            "plas_radius_decay": 0.9,
-            "webp_method": 6,
-            "high_effort_pixels": 100_000,
-        },
-        "finetune": {"steps": 2000},
-    },
     Preset.PAPER: {
         "compact": {
             "min_keep_per_scoring": 0.0,

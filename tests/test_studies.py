@@ -57,8 +57,8 @@ def test_the_saving_is_the_mean_difference_where_both_curves_are():
 
 
 def test_a_quality_offset_replaces_every_goal():
-    other = at_quality_offset(kissgs.Settings.from_preset("small", psnr=40.0), -3.5)
-    assert (other.encode.quality_offset_db, other.encode.psnr, other.preset) == (-3.5, None, "small")
+    other = at_quality_offset(kissgs.Settings.from_preset("balanced", psnr=40.0), -3.5)
+    assert (other.encode.quality_offset_db, other.encode.psnr, other.preset) == (-3.5, None, "balanced")
 
 
 @pytest.mark.quick(0)

@@ -15,7 +15,7 @@ from typer import Option
 from kissgs._version import __version__
 from kissgs.cli.bench import bench, warmup
 from kissgs.cli.compress import compact, compress
-from kissgs.cli.convert import convert, decompress, info, sample
+from kissgs.cli.convert import convert, decompress, info, sample, settings
 from kissgs.cli.evaluate import evaluate
 from kissgs.cli.files import discard_stdout, write_stdout
 from kissgs.cli.options import SCENE_OPTIONS, SEE_SCENE_OPTIONS, with_default_values
@@ -59,7 +59,7 @@ def _run() -> None:
 
 for command in (compress, decompress, convert, compact, render, view, evaluate, info):
     app.command(epilog=SEE_SCENE_OPTIONS)(command)
-for command in (sample, bench, warmup):
+for command in (settings, sample, bench, warmup):
     app.command()(command)
 app.add_typer(remote)
 

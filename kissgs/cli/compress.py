@@ -56,7 +56,7 @@ class CompactionOptions:
         Option(
             metavar="METHOD",
             help="prune: remove what images miss least, and train the rest. merge: replace neighbours by one Gaussian; "
-            "takes seconds, needs neither views nor torch. Default: prune.",
+            "takes seconds, needs neither views nor torch. Default: merge with the preset fast, else prune.",
         ),
     ] = None
     preset: PresetOption = "balanced"
@@ -91,7 +91,7 @@ def compact(
 ) -> None:
     """Reduce the number of Gaussians of scenes at nearly equal quality: score, prune and train (POPSpa), or merge.
 
-    The preset fast only prunes; balanced, small and paper also train.
+    The preset fast merges; balanced and paper prune and train.
     """
     from kissgs.cli.signals import stoppable
     from kissgs.cli.tables import compaction_table

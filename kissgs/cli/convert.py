@@ -1,4 +1,4 @@
-"""``kissgs info``, ``decompress``, ``convert`` and ``sample``: describe, decode, rewrite and make scenes."""
+"""``info``, ``settings``, ``decompress``, ``convert`` and ``sample``: describe, decode, rewrite and make scenes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from kissgs.cli.files import Result, for_each_input, gaussians, progress_bar, say_notes, source, stdout
+from kissgs.cli.files import Result, for_each_input, gaussians, progress_bar, say_notes, show, source, stdout
 from kissgs.cli.options import (
     FilesArgument,
     ForceOption,
@@ -22,7 +22,7 @@ from kissgs.cli.options import (
 from kissgs.core.errors import InvalidContainerError, OutputError
 from kissgs.formats import ENDINGS, OUTPUT_FORMATS, SCENE_ENDINGS, WRITTEN, alternatives, output_format
 
-# ``kissgs info``: describe the contents of scene files.
+# ``kissgs info`` and ``kissgs settings``: describe the contents of scene files, and settings.
 
 
 @with_option_groups
@@ -36,6 +36,13 @@ def info(files: FilesArgument, as_json: JsonOption = False, *, common: SceneOpti
         return Result(found.as_dict(), info_table(found))
 
     for_each_input(files, Path("-"), "", work, as_json=as_json, quiet=False, writes=False)
+
+
+def settings() -> None:
+    """List what --set takes: settings of the encoder, compact.NAME and finetune.NAME."""
+    from kissgs.cli.tables import settings_table
+
+    show(settings_table())
 
 
 # ``kissgs decompress``: decode containers and scenes of other formats into ``.ply`` files.
@@ -163,11 +170,10 @@ def _output_format(output: str, to: str | None) -> str:
 def sample(
     output: Annotated[Path, Argument(help="Output NAME.ply; other formats as for convert.")],
     gaussians: Annotated[int, Option(min=0, help="Number of Gaussians.")] = 60_000,
-    degree: Annotated[int, Option(min=0, max=3, help="Degree of the spherical harmonics.")] = 3,
     force: ForceOption = False,
 ) -> None:
     """Write a synthetic sample scene: shiny, textured objects on a table."""
     from kissgs.pipeline.scene_files import save
     from kissgs.synthetic import sample_scene
 
-    save(sample_scene(gaussians, sh_degree=degree), output, overwrite=force)
+    save(sample_scene(gaussians), output, overwrite=force)

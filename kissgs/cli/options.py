@@ -99,7 +99,7 @@ ScenesArgument = Annotated[
 ]
 FilesArgument = Annotated[list[str], Argument(metavar="FILE…", help="Files or glob patterns.")]
 PresetOption = Annotated[
-    str, Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced, small or paper.")
+    str, Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced or paper.")
 ]
 ForceOption = Annotated[bool, Option("--force", "-f", help="Overwrite existing output files.")]
 JsonOption = Annotated[bool, Option("--json", help="Print a JSON report: an object for one file, a list for several.")]
@@ -125,9 +125,22 @@ ViewsOption = Annotated[
 
 # Groups of options: dataclasses, whose fields become options of the commands that take one as an argument.
 
+PANELS = {
+    "Output": ("output", "container", "unpacked", "to", "html", "save_camera", "evaluate", "force", "as_json"),
+    "Goal": ("preset", "quality", "max_psnr_drop", "psnr", "target_size", "time", "count", "ratio"),
+    "Method": ("method", "compact", "finetune", "changes", "seed"),
+    "Photographs": ("views", "force_views", "scale", "images"),
+    "Input": ("origin",),
+    "Machine": ("server", "quiet", "checkpoint", "device", "cache", "ray"),
+}
+"""Titles under which the help of a command shows its options, by the names of their parameters."""
+
+PANEL_OF = {name: panel for panel, names in PANELS.items() for name in names}
+
 
 def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of each dataclass among its parameters, in the place of that parameter."""
+    """Give a command the options of each dataclass among its parameters, in the place of that parameter, and all of its
+    options a panel of the help."""
     hints = get_type_hints(command, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     options = dict[str, inspect.Parameter]()
@@ -144,6 +157,8 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
             given[name] = group(**{field: given.pop(field) for field in inspect.signature(group).parameters})
         command(**given)
 
+    for name in options.keys() & PANEL_OF.keys():
+        vars(hints[name].__metadata__[0])["rich_help_panel"] = PANEL_OF[name]
     annotated = [option.replace(annotation=hints[name]) for name, option in options.items()]
     with_options.__annotations__ = {name: hints[name] for name in options}
     vars(with_options)["__signature__"] = inspect.Signature(annotated)
@@ -211,20 +226,7 @@ class EncodingOptions:
     preset: PresetOption = "balanced"
     changes: Annotated[
         list[str] | None,
-        Option(
-            "--set", metavar="NAME=VALUE", help="Change another setting; repeatable. List: docs/reference/settings.md."
-        ),
-    ] = None
-    psnr: Annotated[
-        float | None,
-        Option(metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."),
-    ] = None
-    target_size: Annotated[
-        str | None, Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB.")
-    ] = None
-    max_psnr_drop: Annotated[
-        float | None,
-        Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
+        Option("--set", metavar="NAME=VALUE", help="Change another setting, see 'kissgs settings'; repeatable."),
     ] = None
     quality: Annotated[
         str | None,
@@ -234,6 +236,17 @@ class EncodingOptions:
             help="Find the smallest container that looks the same as the scene, or has high or good quality: limits on "
             "the losses of PSNR, SSIM and detail.",
         ),
+    ] = None
+    max_psnr_drop: Annotated[
+        float | None,
+        Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
+    ] = None
+    target_size: Annotated[
+        str | None, Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB.")
+    ] = None
+    psnr: Annotated[
+        float | None,
+        Option(metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."),
     ] = None
     compact: Annotated[
         Values | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from kissgs.core.positions import relative_to
 from kissgs.core.splats import CLEANED_TEXTS
 from kissgs.evaluation.results import Detail, Evaluation, ImageMetrics, detail_text, format_metric
 from kissgs.formats import FORMATS
+from kissgs.settings import Preset, Settings
 
 if TYPE_CHECKING:
     from kissgs.compaction.result import CompactionReport
@@ -60,6 +62,11 @@ def _changes(changed: Mapping[str, int]) -> list[Text]:
     return _noted(*(f"{gaussians(count)} {text}" for count, text in known))
 
 
+def _how_to_view(target: str) -> list[Text]:
+    """Return the command that shows a file in the browser; nothing for standard output."""
+    return [] if target == "-" else [Text(f"see it: kissgs view {shlex.quote(target)}", style="dim")]
+
+
 def report_table(report: Report, target: str) -> RenderableType:
     """Format the report of one compression."""
     sizes, counts = (report.source_bytes, report.container_bytes), (report.source_count, report.count)
@@ -77,7 +84,7 @@ def report_table(report: Report, target: str) -> RenderableType:
         details.append(_evaluation(report.evaluation))
     names = ("invisible", "pruned_by_rd", "clipped_colors")
     changed = {**{name: getattr(report, name) for name in names}, **report.cleaned.as_dict()}
-    return Group(head, *details, parts_table(dict(sorted(report.file_bytes.items())), report.count), *_changes(changed))
+    return Group(head, *details, *_changes(changed), *_how_to_view(target))
 
 
 def status_table(status: Mapping[str, Any], target: str) -> RenderableType:
@@ -96,7 +103,7 @@ def status_table(status: Mapping[str, Any], target: str) -> RenderableType:
         detail = "" if patches is None else f"; {detail_text(_detail(patches), 'renderings')}"
         details.append(Text(f"{mean.summary} to the scene's own renderings{detail}"))
     changed = {"invisible": status.get("invisible") or 0, **(status.get("cleaned") or {})}
-    return Group(head, *details, parts_table(dict(sorted(sizes["files"].items())), status["kept"]), *_changes(changed))
+    return Group(head, *details, *_changes(changed), *_how_to_view(target))
 
 
 def _detail(patches: Mapping[str, Any]) -> Detail:
@@ -131,7 +138,7 @@ def compaction_table(report: CompactionReport, target: str) -> RenderableType:
         (f"{report.count:,} Gaussians", "bold green"),
         f", {sum(step.seconds for step in report.steps):.1f} s",
     )
-    return Group(head, *_compaction(report), *_changes(report.cleaned.as_dict()))
+    return Group(head, *_compaction(report), *_changes(report.cleaned.as_dict()), *_how_to_view(target))
 
 
 def streamed_table(report: StreamedReport, target: str) -> RenderableType:
@@ -147,7 +154,7 @@ def streamed_table(report: StreamedReport, target: str) -> RenderableType:
         rows.append(("environment", report.environment_count, report.environment_bytes))
     cells = [(name, f"{count:,}", f"{taken:,}", f"{taken / max(count, 1):.2f}") for name, count, taken in rows]
     table = table_of(("level", "Gaussians", "bytes", "per Gaussian"), cells)
-    return Group(head, *_noted(report.note), table, *_changes(report.changed))
+    return Group(head, *_noted(report.note), table, *_changes(report.changed), *_how_to_view(target))
 
 
 def _compaction(report: CompactionReport, *, search: bool = True) -> list[RenderableType]:
@@ -241,6 +248,20 @@ def info_table(info: Info) -> RenderableType:
     if "origin" in info.details:
         blocks.append(Text(relative_to(tuple(info.details["origin"]))))
     return Group(*blocks, *map(Text, info.lines), *_noted(*info.notes), *_changes(info.changed))
+
+
+def settings_table() -> RenderableType:
+    """Return a table of the settings that users may change, with their values in the preset balanced."""
+    settings = Settings.from_preset(Preset.BALANCED)
+    table = table_of(("setting", "balanced", "meaning"), [])
+    table.columns[1].justify = table.columns[2].justify = "left"
+    for group in (settings.encode, settings.compact, settings.finetune):
+        prefix = "" if group is settings.encode else f"{'compact' if group is settings.compact else 'finetune'}."
+        for name in group.public():
+            value = getattr(group, name)
+            meaning = type(group).model_fields[name].description or ""
+            table.add_row(prefix + name, "" if value is None else str(value), meaning)
+    return table
 
 
 def evaluation_table(

@@ -90,7 +90,7 @@ def chosen_views(splats: Splats, settings: CompactSettings, views: Views | None,
     if settings.trains and not has_torch():
         raise UnsupportedError(
             "training needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough); the "
-            "preset fast, which only prunes, and the method merge do not need it"
+            "method merge, that of the preset fast, does not need it"
         )
     if settings.trains and context.device == "cuda":
         need_cuda()

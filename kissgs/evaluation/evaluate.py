@@ -6,10 +6,12 @@ import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from typing import cast
 
 import numpy as np
 
+from kissgs.cameras.captures.load import as_views
 from kissgs.cameras.photographs import orientation
 from kissgs.cameras.views import Similarity, View, Views
 from kissgs.core.array_types import Float32, Float64, Shaped
@@ -203,7 +205,7 @@ Measure = Callable[[np.ndarray, np.ndarray], tuple[ImageMetrics, Float64[np.ndar
 def evaluate(
     reference: Splats,
     candidate: Splats,
-    views: Views | None = None,
+    views: Views | str | PathLike[str] | None = None,
     *,
     split: Split = "test",
     seed: int = 0,
@@ -224,7 +226,7 @@ def evaluate(
     Args:
         reference: the original scene; cleaned first, like the candidate.
         candidate: the scene to evaluate, with any number of Gaussians in any order.
-        views: views of a capture, which are moved into the reference's coordinates if the capture's files say how
+        views: views of a capture, or its path; they are moved into the reference's coordinates if its files say how
             (:func:`kissgs.evaluation.evaluate.in_scene_frame`). Without photographs, the candidate is compared only
             with renderings of the reference.
         split: which of the views to use. If "test" is empty, "train" is used; see :attr:`Evaluation.split`.
@@ -244,6 +246,7 @@ def evaluate(
     """
     reference, candidate = clean(reference)[0], with_origin(clean(candidate)[0], reference.origin)
     measure = _measure(flip, lpips, device)
+    views = as_views(views)
     given = 0 if views is None else len(_select_split(views, split)[1])  # an empty split is refused before any work
     context = Context(threads, device, progress)
     if views is not None:

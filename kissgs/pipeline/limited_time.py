@@ -19,7 +19,6 @@ from kissgs.settings import Preset
 ENCODE_SECONDS = {
     Preset.FAST: (0.5, 0.0, 6e-6),
     Preset.BALANCED: (1.5, 5.0, 40e-6),
-    Preset.SMALL: (1.5, 5.0, 80e-6),
     Preset.PAPER: (1.0, 0.0, 140e-6),
 }
 """Seconds of an encoding by preset, measured on two processors: a fixed part; one that all scenes of more than

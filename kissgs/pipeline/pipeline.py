@@ -160,7 +160,7 @@ def compact(
     settings: Settings,
     reading: ReadOptions = DEFAULT_READ_OPTIONS,
     evaluate: bool = False,
-    views: Views | None = None,
+    views: Views | AnyPath | None = None,
     force_views: bool = False,
     checkpoint: AnyPath | None = None,
     overwrite: bool = False,
@@ -177,7 +177,7 @@ def compact(
             ``Settings.from_preset("balanced", compact={"ratio": 0.2})``.
         reading: options for a ``source`` that is a file.
         evaluate: measure PSNR, SSIM, MS-SSIM and bytes after every step, for the report.
-        views: capture whose training photographs are the targets, and whose held-out views are for evaluation; by
+        views: capture, or its path: its training photographs are the targets, its held-out views are for evaluation; by
             default renderings of the scene from virtual cameras.
         force_views: accept ``views`` whose photographs do not show the scene.
         checkpoint: file in which the state of the training is saved every half minute. An identical call resumes from
@@ -195,6 +195,7 @@ def compact(
     """
     from kissgs.compaction.budget import compact_scene
 
+    views = _loaded(views)
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_ply(target, overwrite=overwrite)
@@ -229,7 +230,7 @@ def compress(
     sensitivity: Sensitivity | None = None,
     cache: AnyPath | None = None,
     evaluate: bool = False,
-    views: Views | None = None,
+    views: Views | AnyPath | None = None,
     force_views: bool = False,
     checkpoint: AnyPath | None = None,
     overwrite: bool = False,
@@ -258,9 +259,9 @@ def compress(
             written, and replaced otherwise.
         evaluate: decode the result and compare its renderings with those of the cleaned scene, and with the photographs
             of ``views`` if they have any; see :func:`kissgs.evaluate`. The report then has an ``evaluation``.
-        views: capture of the scene: its training views give the sensitivity and the training targets, its held-out
-            views are for evaluation; by default virtual cameras. Presets without rate-distortion planning use the
-            held-out views only. Where they are used, some of their photographs are compared with the scene first.
+        views: capture of the scene, or its path: its training views give the sensitivity and the training targets, its
+            held-out views are for evaluation; by default virtual cameras. Presets that plan without rate and distortion
+            use the held-out views only. Some of the photographs in use are compared with the scene first.
         force_views: accept ``views`` whose photographs do not show the scene.
         checkpoint: checkpoint file of the compaction, see :func:`kissgs.compact`. Fine-tuning has another one beside
             it, with "-finetune" in its name, except in a search for a goal.
@@ -277,6 +278,7 @@ def compress(
     """
     from kissgs.pipeline.encoding import Work
 
+    views = _loaded(views)
     requested, keep_all = settings or Settings(), sensitivity is not None
     settings = resolved(requested, views, keep_all=keep_all)
     target, kind = None if destination is None else Path(destination), named_container(container, destination)
@@ -356,6 +358,15 @@ def compress(
     order = encoded.order if compacted is None else compacted.index[encoded.order]
     remaining = () if target is not None else tuple(path for path in checkpoints if path is not None)
     return Compressed(encoded.files, order, report, remaining, kind)
+
+
+def _loaded(views: Views | AnyPath | None) -> Views | None:
+    """Return the views, loaded if they are the path of a capture."""
+    if views is None:
+        return None
+    from kissgs.cameras.captures.load import as_views
+
+    return as_views(views)
 
 
 def _fitting(splats: Splats, views: Views | None, context: Context, *, force: bool) -> tuple[Views | None, str]:

@@ -45,6 +45,7 @@ RECOVERABLE_DB = 1.5
 # Expected of a trained container, before the first one is made: bytes per Gaussian, those of view-dependent colour in
 # addition, and those that are no images.
 BYTES_PER_GAUSSIAN, BYTES_OF_SH, OVERHEAD_BYTES = 8.6, 4.0, 3300
+SIZE_BY_LAMBDA = 0.09  # exponent of 1 / lambda to which the size of a scene's container grows at least
 SIZE_BY_COUNT = 0.6  # exponent of the number of Gaussians to which the size of a container grows at equal lambda
 HALF_LEFT = 1.0  # margin of a point before any encoding that leaves half of the allowed loss to the encoder
 # Margin that ends a search, as log2 of the number of Gaussians: 0.03 dB of PSNR; less in a time that is given.
@@ -200,10 +201,11 @@ class Search:
 
     # The searches: all Gaussians, fewer of them trained on photographs, and fewer without photographs.
 
-    def _search_all_gaussians(self, *, tunes: bool = True, most: int | None = None) -> None:
+    def _search_all_gaussians(self, *, tunes: bool = True) -> None:
         """Search for the lambda of all Gaussians, then for that of fine-tuned containers if the settings say so."""
         if not self._whole_searched:
-            self._along_lambda(self.whole, most=most or self.encode_settings.max_encodes)
+            most = self.encode_settings.max_encodes
+            self._along_lambda(self.whole, most=min(ENCODES, most) if self.tunes else most)
             self._whole_searched = True
         if tunes:
             self._fine_tune()
@@ -274,8 +276,8 @@ class Search:
         """Encode all Gaussians, then as few of them as pruning alone serves the goal with, trained if settings say so.
         For a size, pruning without training loses more than it saves, unless all Gaussians miss it. A scene whose
         Gaussians are all needed keeps them."""
-        trains, most = self.trains and self.plan.containers > 0, self.encode_settings.max_encodes
-        self._search_all_gaussians(tunes=False, most=min(ENCODES, most) if trains else most)
+        trains = self.trains and self.plan.containers > 0
+        self._search_all_gaussians(tunes=False)
         whole, fits = self.best, self.goal.by_size and self.attempts[0].bytes <= self.target_size
         if whole is None and self.target_size > self._overhead:
             self._along_path(path, self.number_for_size, last_number(len(path.whole)))
@@ -424,7 +426,7 @@ class Search:
 
         def encode_at(settings: EncodeSettings) -> Attempt:
             attempt = self._attempt(scene, settings, tuner)
-            if self.goal.margin(attempt) < 0 and attempt.bytes >= limit:
+            if self.goal.margin(attempt) < 0 and self._expected_bytes(attempt) >= limit:
                 raise NoFurtherError
             return attempt
 
@@ -470,6 +472,11 @@ class Search:
         self._finetuning = made.finetuning or self._finetuning
         self._keep(attempt, scene)
         return attempt
+
+    def _expected_bytes(self, attempt: Attempt) -> float:
+        """Return the size at which the scene of an attempt that misses the goal should meet it."""
+        missed = self.goal.decisive(attempt)
+        return attempt.bytes * 2 ** (SIZE_BY_LAMBDA * missed.margin(attempt) / missed.slope)
 
     def _check_time(self, *, trained: bool) -> None:
         """Refuse another attempt that would not be finished in time, if there is one that can be returned."""

@@ -30,12 +30,11 @@ class _Facts:
 
 _FACTS: dict[kissgs.Preset, _Facts] = {
     kissgs.Preset.FAST: _Facts(
-        "Fast", "Takes seconds; for previews and quick checks.", 13.02, -0.37, 13, (10, 120), (50, 300)
+        "Fast", "Takes seconds; for previews and quick checks.", 13.02, -0.37, 13, (1, 15), (50, 300)
     ),
     kissgs.Preset.BALANCED: _Facts(
         "Balanced", "The best quality for its size. The default.", 11.90, -0.28, 205, (300, 600), (50, 1300)
     ),
-    kissgs.Preset.SMALL: _Facts("Small", "Slightly smaller, and slower.", 11.71, -0.27, 380, (600, 1200), (100, 2600)),
     kissgs.Preset.PAPER: _Facts(
         "Paper", "KISS-GS as published, for comparison.", 17.20, -0.36, 260, (700, 2000), (1000, 40_000)
     ),

@@ -30,7 +30,7 @@ class JobOptions(kissgs.Settings):
         json_schema_extra={
             "examples": [
                 {"preset": "balanced"},
-                {"preset": "small", "encode": {"seed": 7}},
+                {"preset": "fast", "encode": {"seed": 7}},
                 {"compact": {"ratio": 0.2}},
                 {"finetune": {"enabled": True}},
                 {"encode": {"target_size": 3_000_000}, "time_limit": 120},
@@ -229,8 +229,8 @@ class Limits(ApiModel):
     max_wait_seconds: float
     keys_required: bool
     training: bool = Field(
-        description="Whether the server has torch. Without it, it cannot fine-tune, and compacts only with the preset "
-        "fast or the method merge."
+        description="Whether the server has torch. Without it, it cannot fine-tune, and compacts only with the method "
+        "merge, that of the preset fast."
     )
 
 

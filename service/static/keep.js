@@ -15,7 +15,7 @@ export function keepField(training) {
   const keep = /** @type {HTMLSelectElement} */ (byId("keep"));
   const usual = training
     ? "The remaining Gaussians are trained to preserve the images: a smaller file after a few minutes of training."
-    : "This server has no torch: choose Fast, which prunes without training, at a greater loss of quality.";
+    : "This server has no torch: choose Fast, which merges neighbours instead of training, at a greater loss of quality.";
   return {
     /** @returns {import("./api.js").Budget | null} */
     chosen: () => (keep.value ? JSON.parse(keep.value) : null),

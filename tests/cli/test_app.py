@@ -108,7 +108,7 @@ REFUSED = {
     "compress scene.ply -o b.zip --set bits=16": "there is no setting 'bits'",
     "compress scene.ply -o b.zip --set bits": "NAME=VALUE",
     "compress scene.ply -o b.zip --set preset=small": "write GROUP.NAME=VALUE",
-    "compress scene.ply -o b.zip -p huge": "fast, balanced, small, paper",
+    "compress scene.ply -o b.zip -p huge": "fast, balanced, paper",
     "compress scene.ply -f -p fast --psnr 40": "psnr needs rate_distortion",
     "compress scene.ply -f --time soon": "setting time_limit: write 30s, 2min, 1h",
     "compress - -o b.zip --cache": "standard input has no folder",
@@ -244,3 +244,18 @@ def test_interrupt_leaves_nothing(tmp_path):
     assert process.returncode == 130
     assert message.decode().splitlines()[-1].startswith("kissgs: interrupted")
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
+
+
+def test_the_settings_that_are_listed_are_those_that_may_be_set(scene, tmp_path):
+    names = [line.split()[0] for line in run("settings").stdout.decode().splitlines()[1:] if line[:1].strip()]
+    assert {"seed", "target_size", "max_psnr_drop", "compact.ratio", "finetune.steps"} <= set(names)
+    assert len(names) <= 20
+    groups = (kissgs.settings.EncodeSettings, kissgs.settings.CompactSettings, kissgs.settings.FinetuneSettings)
+    for name in names:
+        group, _, inner = name.rpartition(".")
+        assert inner in groups[("", "compact", "finetune").index(group)].public()
+
+
+def test_a_result_ends_with_the_command_that_shows_it(scene, tmp_path):
+    last = run("compress", scene, "-o", tmp_path / "a b.zip", "-p", "fast").stdout.decode().splitlines()[-1]
+    assert last == f"see it: kissgs view '{tmp_path / 'a b.zip'}'"

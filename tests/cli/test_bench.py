@@ -77,7 +77,7 @@ def test_all_presets_and_some_times_are_measured_by_default(scene, one, monkeypa
 
     monkeypatch.setattr(bench, "measured", measured)
     assert run("bench", scene).returncode == 0
-    presets = [("fast", None), ("balanced", None), ("small", None), ("paper", None)]
+    presets = [("fast", None), ("balanced", None), ("paper", None)]
     assert asked == [*presets, ("balanced", 5), ("balanced", 30), ("balanced", 120)]
 
 

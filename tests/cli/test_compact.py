@@ -13,7 +13,7 @@ from helpers.training_scenes import same
 import kissgs
 from kissgs.cli.options import budget_of, share_of
 
-SHORT = {"sparsify_steps": 4, "refine_steps": 2, "prune_rounds": 2, "views": 16, "view_size": 48}
+SHORT = {"method": "prune", "sparsify_steps": 4, "refine_steps": 2, "prune_rounds": 2, "views": 16, "view_size": 48}
 OPTIONS = [word for name, value in SHORT.items() for word in ("--set", f"{name}={value}")]
 
 
@@ -39,22 +39,23 @@ def test_photographs_are_training_targets(folder, tmp_path):
     assert len(kissgs.load(tmp_path / "b.ply")) == 300
 
 
-def test_the_preset_fast_only_prunes(folder, tmp_path):
-    run("compact", folder / "a.ply", "-n", "99", "-p", "fast", "-o", tmp_path / "b.ply", "--set", "views=24")
+def test_without_steps_the_scene_is_only_pruned(folder, tmp_path):
+    words = ["compact", folder / "a.ply", "-n", "99", "-p", "fast", "--method", "prune", "-o", tmp_path / "b.ply"]
+    run(*words, "--set", "views=24")
     found = kissgs.load(tmp_path / "b.ply")
     assert {row.tobytes() for row in found.means} < {row.tobytes() for row in SCENE.means}
     assert len(found) == 99
 
 
-def test_merging_takes_neither_views_nor_training(folder, tmp_path):
+def test_the_preset_fast_merges_without_views_and_training(folder, tmp_path):
     words = ["compact", folder / "a.ply", "--ratio", "0.2", "-p", "fast"]
-    done = run(*words, "--method", "merge", "-o", tmp_path / "b.ply")
+    done = run(*words, "-o", tmp_path / "b.ply")
     assert done.returncode == 0, done.stderr
-    settings = kissgs.Settings.from_preset("fast", compact={"ratio": 0.2, "method": "merge"})
+    settings = kissgs.Settings.from_preset("balanced", compact={"ratio": 0.2, "method": "merge"})
     assert same(kissgs.load(tmp_path / "b.ply"), kissgs.compact(SCENE, settings=settings).splats)
     rows = [row.split()[:2] for row in done.stdout.decode().splitlines() if row.startswith(("input", "merge"))]
     assert rows == [["input", "1,500"], ["merge", "300"]]
-    done = run(*words, "--set", "method=merge", "-o", tmp_path / "c.ply", "--evaluate", "--json")
+    done = run(*words, "--method", "merge", "-o", tmp_path / "c.ply", "--evaluate", "--json")
     assert (tmp_path / "c.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     steps = json.loads(done.stdout)["steps"]
     assert [step["name"] for step in steps] == ["input", "merge"]
@@ -114,7 +115,7 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path, tmp_path_factory):
     assert same(kissgs.load(target), kissgs.clean(whole.splats)[0])
 
 
-FAST = ["-n", "9", "-o", "b.ply", "-p", "fast"]
+UNTRAINED = ["-n", "9", "-o", "b.ply", "-p", "fast", "--method", "prune"]
 MERGE = ["-n", "9", "-o", "b.ply", "--method", "merge"]
 
 
@@ -136,9 +137,9 @@ MERGE = ["-n", "9", "-o", "b.ply", "--method", "merge"]
         (["--max-psnr-drop", "1", "-o", "b.ply", "--checkpoint"], "keeps no checkpoint"),
         (["-n", "9", "-o", "b.ply", "--device", "tpu"], "--device tpu: choose cpu or cuda"),
         ([*MERGE, "--checkpoint"], "only apply to training: leave them out, the method merge"),
-        ([*FAST, "--device", "cuda"], "only apply to training: leave them out, these settings take no training steps"),
-        ([*FAST, "--checkpoint"], "only apply to training: leave them out, these settings take no training steps"),
-        ([*FAST, "--method", "cluster"], "setting method: input should be 'prune' or 'merge', not 'cluster'"),
+        ([*UNTRAINED, "--device", "cuda"], "leave them out, these settings take no training steps"),
+        ([*UNTRAINED, "--checkpoint"], "leave them out, these settings take no training steps"),
+        ([*UNTRAINED, "--method", "cluster"], "setting method: input should be 'prune' or 'merge', not 'cluster'"),
         (["-n", "9", "-o", "there.ply"], "exists already"),
     ],
 )

@@ -170,7 +170,7 @@ def test_cancelling_the_evaluation_writes_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("preset", ["fast", "balanced", "small", "paper"])
+@pytest.mark.parametrize("preset", ["fast", "balanced", "paper"])
 @pytest.mark.quick(1)
 def test_every_preset_accepts_views(folder, tmp_path, preset):
     """A loop over presets needs no exception: presets that render no images use the views for evaluation only."""

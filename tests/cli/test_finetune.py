@@ -32,7 +32,7 @@ def test_output_and_report_are_those_of_the_library(folder, tmp_path, container)
 
 
 def test_the_default_number_of_steps_is_that_of_the_preset():
-    for preset, steps in (("fast", 200), ("balanced", 1000), ("small", 2000), ("paper", 4000)):
+    for preset, steps in (("fast", 200), ("balanced", 1000), ("paper", 4000)):
         assert chosen(preset, None, finetune=steps_of("auto")).finetune.steps == steps
     assert chosen("fast", None, finetune=steps_of("0")).finetune.enabled is False
 

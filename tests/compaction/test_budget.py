@@ -81,7 +81,9 @@ def test_the_note_says_that_a_drop_without_photographs_is_estimated():
 def test_counts_exclude_gaussians_removed_by_cleaning():
     scene = cloud(50)
     scene.means[0] = np.nan
-    result = kissgs.compact(scene, settings=kissgs.Settings.from_preset("fast", compact={"count": 20}), views=views())
+    result = kissgs.compact(
+        scene, settings=kissgs.Settings.from_preset("fast", compact={"count": 20, "method": "prune"}), views=views()
+    )
     assert result.report.source_count == 49
     assert result.report.cleaned.non_finite == 1
     assert result.report.as_dict()["cleaned"]["non_finite"] == 1

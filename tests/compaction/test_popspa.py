@@ -163,7 +163,7 @@ def test_a_file_that_is_no_checkpoint_is_not_overwritten(tmp_path):
         assert path.read_text() == "years of work"
 
 
-@pytest.mark.parametrize("compact", [{}, {"count": 1000}])
+@pytest.mark.parametrize("compact", [{"method": "prune"}, {"method": "prune", "count": 1000}])
 def test_without_training_the_checkpoint_file_is_not_touched(tmp_path, compact):
     path = tmp_path / "thesis.npz"
     path.write_text("years of work")

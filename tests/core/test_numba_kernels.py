@@ -36,7 +36,7 @@ with tempfile.TemporaryDirectory() as folder:
     views = photographs(scene, Path(folder))
     kissgs.compress(scene, settings=with_photographs(max_psnr_drop=1, max_ssim_drop=0.05), views=views, evaluate=True)
 few = {"sensitivity_views": 4, "sensitivity_view_size": 48}
-tuned = kissgs.Settings.research("small", finetune={"enabled": True, "steps": 2, "views": 4, "view_size": 48}, **few)
+tuned = kissgs.Settings.research("balanced", finetune={"enabled": True, "steps": 2, "views": 4, "view_size": 48}, **few)
 kissgs.compress(scene, settings=tuned, container="sog")
 merged = kissgs.Settings.research("balanced", compact={"ratio": 0.5, "method": "merge", "views": 4, "view_size": 48})
 kissgs.compact(scene, settings=merged)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import kissgs
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
 
-PRESETS = ("fast", "balanced", "small", "paper")
+PRESETS = ("fast", "balanced", "paper")
 
 GLANCE = {"sensitivity_views": 4, "sensitivity_view_size": 48}
 """Settings that measure the sensitivity of a small scene quickly."""

@@ -13,9 +13,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.captured_scene import SCENE as CAPTURED
+from helpers.captured_scene import write_capture
 
 import kissgs
-from kissgs import Cancelled, InvalidContainerError, InvalidSceneError, KissgsError, OutputError, Settings
+from kissgs import (
+    Cancelled,
+    InvalidContainerError,
+    InvalidSceneError,
+    InvalidViewsError,
+    KissgsError,
+    OutputError,
+    Settings,
+)
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.io.ply import write_ply
 from kissgs.pipeline.scene_files import is_container
@@ -358,3 +368,17 @@ def test_a_scene_from_a_file_is_dropped_before_its_images_are_compressed(tmp_pat
     kissgs.compress(tmp_path / "scene.ply", settings=settings, evaluate=needed, progress=progress)
     assert alive
     assert (min(alive) > 0) if needed else (max(alive) == 0)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_capture_may_be_given_by_its_path(tmp_path, kind):
+    folder = write_capture(tmp_path / "capture", size=(64, 48))
+    views = kissgs.load_views(folder)
+    scene = CAPTURED.select(slice(0, 60))
+    by_path = kissgs.compress(scene, settings=kissgs.Settings(preset="balanced"), views=kind(folder), force_views=True)
+    by_views = kissgs.compress(scene, settings=kissgs.Settings(preset="balanced"), views=views, force_views=True)
+    assert by_path.to_zip() == by_views.to_zip() != kissgs.compress(scene).to_zip()
+    found = kissgs.evaluate(scene, scene.select(slice(0, 30)), kind(folder))
+    assert found.source == views.source
+    with pytest.raises(InvalidViewsError, match="nowhere"):
+        kissgs.compress(scene, views=kind(tmp_path / "nowhere"))

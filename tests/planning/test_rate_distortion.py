@@ -126,7 +126,7 @@ def test_colours_are_asked_for_once_the_rest_is_known():
 def test_threads_do_not_change_a_byte():
     splats = random_scene(1000, 3, seed=7)
     sensitivity = random_sensitivity(splats)
-    settings = Settings.from_preset("small").encode
+    settings = Settings.from_preset("balanced").encode
     one, three = (encode(splats, settings, Context(threads), sensitivity=sensitivity).files for threads in (1, 3))
     assert one == three
 

@@ -46,7 +46,7 @@ def test_submitting_a_form(service, first):
 
 
 def test_fewer_gaussians(service):
-    changes = {"count": 100, "sparsify_steps": 4, "refine_steps": 4, "views": 24, "view_size": 48}
+    changes = {"method": "prune", "count": 100, "sparsify_steps": 4, "refine_steps": 4, "views": 24, "view_size": 48}
     options = {"preset": "fast", "compact": changes, "for_research": True}
     status = service.ended(service.submit(options=json.dumps(options)))
     expected = kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(options))

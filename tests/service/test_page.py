@@ -172,7 +172,7 @@ REPEATED = {
     "quality": {"encode": {"quality": "same"}},
     "loss and time": {"encode": {"max_psnr_drop": 0.25}, "time_limit": "1min"},
     "share": {"preset": "fast", "compact": {"ratio": 0.125}},
-    "count": {"preset": "small", "compact": {"count": 120}},
+    "count": {"preset": "paper", "compact": {"count": 120}},
     "loss by pruning": {"compact": {"max_psnr_drop": 0.3}},
     "time": {"time_limit": 45},
 }
@@ -256,7 +256,14 @@ def test_reload_and_cancel(visit, start):
 def test_training_notes_are_shown(visit, start):
     service = start()
     page = visit(service)
-    changes = {"count": 100, "sparsify_steps": 1000, "refine_steps": 1000, "views": 24, "view_size": 48}
+    changes = {
+        "method": "prune",
+        "count": 100,
+        "sparsify_steps": 1000,
+        "refine_steps": 1000,
+        "views": 24,
+        "view_size": 48,
+    }
     job = service.submit(options=json.dumps({"preset": "fast", "compact": changes, "for_research": True}))
     page.goto(f"{service.url}/#{job['id']}")
     page.locator("#job .note", has_text="Gaussians, loss").wait_for()

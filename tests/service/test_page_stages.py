@@ -21,7 +21,7 @@ LOSS = {"max_psnr_drop": 3, **FEW}
 JOBS = {
     "fast": {"preset": "fast"},
     "evaluated": {"preset": "fast", "evaluate": True},
-    "pruned": {"preset": "fast", "compact": {"ratio": 0.5, **VIEWS}},
+    "pruned": {"preset": "fast", "compact": {"ratio": 0.5, "method": "prune", **VIEWS}},
     "balanced": {"encode": FEW},
     "a share": {"encode": FEW, "compact": {"ratio": 0.5, **TRAINED}},
     "a loss by pruning": {"encode": FEW, "compact": {"max_psnr_drop": 3, **TRAINED}},

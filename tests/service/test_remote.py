@@ -302,7 +302,7 @@ def test_the_ending_chooses_the_container(service, scene, tmp_path):
 
 def test_values_of_the_preset_are_left_to_the_server():
     """A server of another version may have others, and would refuse those of the client."""
-    sent = client._given(kissgs.Settings(preset="small", encode={"target_size": "1MB"}))
-    assert (sent["preset"], sent["encode"]["target_size"]) == ("small", 1_000_000)
+    sent = client._given(kissgs.Settings(preset="balanced", encode={"target_size": "1MB"}))
+    assert (sent["preset"], sent["encode"]["target_size"]) == ("balanced", 1_000_000)
     assert "sh_step" not in sent["encode"]
-    assert client._given(kissgs.Settings.research("small", sh_step=1.0))["encode"]["sh_step"] == 1.0
+    assert client._given(kissgs.Settings.research("balanced", sh_step=1.0))["encode"]["sh_step"] == 1.0

@@ -21,7 +21,14 @@ pytest.importorskip("torch")
 
 
 STEPS = 8
-CHANGES = {"count": 100, "sparsify_steps": STEPS, "refine_steps": STEPS, "views": 24, "view_size": 48}
+CHANGES = {
+    "method": "prune",
+    "count": 100,
+    "sparsify_steps": STEPS,
+    "refine_steps": STEPS,
+    "views": 24,
+    "view_size": 48,
+}
 BRIEF = {"preset": "fast", "compact": CHANGES, "for_research": True}
 DONE = 3
 """Steps of its stage after which training waits."""

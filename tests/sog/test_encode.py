@@ -52,7 +52,7 @@ def assert_round_trip(splats, result):
     assert fits.any(axis=0).all()
 
 
-@pytest.mark.parametrize(("count", "preset"), [(65, "balanced"), (1, "fast"), (7, "small"), (65, "paper")])
+@pytest.mark.parametrize(("count", "preset"), [(65, "balanced"), (1, "fast"), (65, "paper")])
 def test_round_trip_is_within_the_reported_errors(count, preset):
     scene = random_scene(count, count % 4, seed=count)
     result = encoded(scene, preset)

@@ -38,7 +38,7 @@ def encoded(splats, preset="fast", **changes):
 
 
 @pytest.mark.parametrize(
-    ("count", "preset"), [(1, "balanced"), (9, "paper"), (65, "small"), (300, "fast"), (300, "paper")]
+    ("count", "preset"), [(1, "balanced"), (9, "paper"), (65, "balanced"), (300, "fast"), (300, "paper")]
 )
 def test_round_trip_levels_and_padding(count, preset):
     """Errors are within the half steps that are reported, levels span images, and padding repeats active cells."""

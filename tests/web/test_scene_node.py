@@ -10,7 +10,7 @@ from helpers.web_tools import pillow
 
 import kissgs
 
-KINDS = [*(("fast", degree) for degree in range(4)), ("balanced", 3), ("small", 1), ("paper", 2)]
+KINDS = [*(("fast", degree) for degree in range(4)), ("balanced", 3), ("balanced", 1), ("paper", 2)]
 COUNTS = (0, 1, 7, 8, 9, 63, 64, 65, 1000)
 MAX_ULPS = 1
 """Largest difference of values of JavaScript and Python, ulps: both compute in float64 and round once."""

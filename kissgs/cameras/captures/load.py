@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Sequence
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,11 @@ def load_views(
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
     return Views(train, test, background, f"{capture.source}, no photographs", note, moves)
+
+
+def as_views(views: Views | str | PathLike[str] | None) -> Views | None:
+    """Return the views, which are loaded if they are the path of a capture."""
+    return views if views is None or isinstance(views, Views) else load_views(Path(views))
 
 
 def _read_capture(path: Path) -> Capture:
