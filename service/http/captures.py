@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from anyio.to_thread import run_sync
 
@@ -20,25 +19,19 @@ UNPACKED_RATIO, UNPACKED_BYTES = 4, 16 << 20
 camera files as text shrink to a third. This much disk space is reserved."""
 
 
-class Capture(NamedTuple):
-    """A capture in a folder of incoming files: the SHA-256 of its archive, its size in bytes, and whether it has
-    photographs to train on and others to evaluate with."""
-
-    reference: str
-    folder: Path
-    size: int
-    photographs: bool
-
-
 class CaptureUpload:
-    """Receives the capture of one submission of an ``owner``. As a context manager, removes what no job has adopted."""
+    """Receives the capture of a submission of an ``owner``, if it has one. As a context manager, removes what no job has
+    adopted. Once it is finished, it has the ``reference``, the ``folder`` of the files, their ``bytes``, and whether
+    there are ``photographs`` to train on and others to evaluate with."""
 
     def __init__(self, context: ServiceContainer, owner: str) -> None:
         self._context, self._owner = context, owner
-        self._archive, self._folder = context.storage.new_upload(), context.storage.new_upload()
+        self._archive, self.folder = context.storage.new_upload(), context.storage.new_upload()
         self._spool = Spool(context.settings, context.admission, self._archive, capture=True)
         self._reserved = 0
         self.write = self._spool.write
+        self.reference: str | None = None
+        self.bytes, self.photographs = 0, None
 
     async def __aenter__(self) -> Self:
         return self
@@ -48,7 +41,7 @@ class CaptureUpload:
         await asyncio.shield(asyncio.ensure_future(run_sync(self._leave)))
 
     def _leave(self) -> None:
-        self._context.storage.discard(self._folder)  # moved to the job, or not needed
+        self._context.storage.discard(self.folder)  # moved to the job, or not needed
         self._context.admission.release(self._reserved, 0)
 
     @property
@@ -61,37 +54,38 @@ class CaptureUpload:
         if reference is not None and not await run_sync(self._context.store.with_capture, self._owner, reference):
             raise _gone()
 
-    async def finish(self, reference: str | None) -> Capture | None:
-        """Return the capture, that of the archive or the one of this ``reference``; None if there is neither."""
-        if not self.size and reference is None:
-            return None
+    async def finish(self, reference: str | None) -> None:
+        """Unpack the archive, or find the capture of this ``reference``, and check it."""
+        self.reference = reference
         most = min(int(self._context.settings.max_capture_bytes), UNPACKED_RATIO * self.size + UNPACKED_BYTES)
         if self.size:
             found = f"sha256:{await self._spool.close()}"
             if reference not in (None, found):
                 raise invalid(f"the option capture is not that of the archive, {found}; leave it out, or the archive")
-            reference = found
+            self.reference = found
             await run_sync(self._context.admission.reserve, most)
             self._reserved = most
-            self._folder.mkdir()
+            self.folder.mkdir()
         elif reference is not None:
             await run_sync(self._link, reference)
+        else:
+            return
         facts = await self._unpack(most)
-        return Capture(str(reference), self._folder, facts["bytes"], facts["photographs"])
+        self.bytes, self.photographs = facts["bytes"], facts["photographs"]
 
     def _link(self, reference: str) -> None:
         for job_id in self._context.store.with_capture(self._owner, reference):
             try:
-                return self._context.storage.link_capture(job_id, self._folder)
+                return self._context.storage.link_capture(job_id, self.folder)
             except OSError:  # the job is being removed, or this file system has no links
-                self._context.storage.discard(self._folder)
+                self._context.storage.discard(self.folder)
         raise _gone()
 
     async def _unpack(self, most: int) -> dict[str, Any]:
         """Unpack the archive, if there is one, and check the capture, in a process; return its facts."""
         settings = self._context.settings
         task: dict[str, Any] = {"function": UNPACK, "folder": str(self._archive.parent), "files": []}
-        task |= {"source": self._archive.name if self.size else "", "work": self._folder.name}
+        task |= {"source": self._archive.name if self.size else "", "work": self.folder.name}
         task |= {"most_bytes": most, "most_files": settings.max_capture_files}
         async with self._context.admission.unpacking:
             outcome = await JobProcess(self._context.worker.runners).run(task)

@@ -25,7 +25,7 @@ from ..core.settings import ServiceSettings
 from ..jobs.container import ServiceContainer
 from ..jobs.worker import QUEUE
 from ..storage.job_records import LimitExceeded
-from .captures import Capture, CaptureUpload
+from .captures import CaptureUpload
 from .uploads import PartBegin, Received, Spool, parts, scene_name, timed
 
 RAW_TYPES = ("", "application/octet-stream", "application/ply", "application/x-ply", "model/ply")
@@ -43,7 +43,7 @@ class Submission:
     """Content of a request: upload, capture, options, name and idempotency key."""
 
     received: Received
-    capture: Capture | None
+    capture: CaptureUpload
     options: JobOptions
     name: str
     key: str | None
@@ -99,14 +99,13 @@ async def submit(
     return job
 
 
-async def _checked(spool: Spool, upload: CaptureUpload, text: str | bytes, name: str, key: str | None) -> Submission:
-    """Check the complete scene, the options and the capture."""
+async def _checked(spool: Spool, capture: CaptureUpload, text: str | bytes, name: str, key: str | None) -> Submission:
+    """Check the options, the complete scene and the capture."""
     options = parse_options(text)
-    received, capture = await spool.finish(), await upload.finish(options.capture)
-    if capture is not None:
-        options = parse_options(text, photographs=capture.photographs)
-        options = options.model_copy(update={"capture": capture.reference})
-    return Submission(received, capture, options, name, key)
+    received = await spool.finish()
+    await capture.finish(options.capture)
+    options = parse_options(text, photographs=capture.photographs)
+    return Submission(received, capture, options.model_copy(update={"capture": capture.reference}), name, key)
 
 
 def parse_options(text: str | bytes, *, photographs: bool | None = None) -> JobOptions:
@@ -223,7 +222,6 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
     if known is not None:
         return known, False
     received, capture, options = submission.received, submission.capture, submission.options
-    capture_bytes = 0 if capture is None else capture.size
     job = Job(
         id=uuid.uuid4().hex,
         owner=owner,
@@ -234,8 +232,8 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
         gaussians=received.info.count,
         sh_degree=received.info.sh_degree,
         upload_bytes=received.size,
-        disk_bytes=received.size + capture_bytes,
-        work_bytes=capture_bytes
+        disk_bytes=received.size + capture.bytes,
+        work_bytes=capture.bytes
         + checkpoint_bytes(
             received.info.count,
             received.info.sh_degree,
@@ -247,8 +245,7 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
         idempotency_key=submission.key,
     )
     try:
-        name, folder = f"scene{UPLOADS[received.info.format]}", None if capture is None else capture.folder
-        context.storage.adopt(received.path, job.id, name, capture=folder)
+        context.storage.adopt(received.path, job.id, f"scene{UPLOADS[received.info.format]}", capture.folder)
         return context.admission.add(job), True
     except BaseException as error:
         context.storage.remove_job(job.id)

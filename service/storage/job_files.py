@@ -106,12 +106,12 @@ class JobStorage:
 
     # Files of a job ---------------------------------------------------------------------------------------------------
 
-    def adopt(self, upload: Path, job_id: str, name: str = UPLOAD_FILES[0], *, capture: Path | None = None) -> None:
-        """Move a complete upload to the folder of a job; ``name`` is one of :data:`UPLOAD_FILES`. The folder of a
-        capture comes with it."""
+    def adopt(self, upload: Path, job_id: str, name: str = UPLOAD_FILES[0], capture: Path | None = None) -> None:
+        """Move a complete upload to the folder of a job, and the folder ``capture`` if there is one; ``name`` is one of
+        :data:`UPLOAD_FILES`."""
         folder = self.jobs / job_id
         folder.mkdir()
-        if capture is not None:
+        if capture is not None and capture.exists():
             capture.rename(folder / CAPTURE)
         upload.rename(folder / name)
         sync_folder(folder)

@@ -93,7 +93,7 @@ def test_the_bytes_are_those_of_a_local_compression(service, folder, scene, expe
     assert status["options"]["capture"].startswith("sha256:")
     stored = service.folder / "jobs" / status["id"] / "capture"
     names = {path.name for path in stored.rglob("*") if path.is_file()}
-    assert names == {"capture.json", "transforms.json", *(f"{n}.png" for n in range(9))}
+    assert names == {"transforms.json", *(f"{n}.png" for n in range(9))}
 
 
 TRAINED = {

@@ -64,7 +64,7 @@ def test_photographs_make_the_container_of_the_command_line(page, service, folde
     page.locator("#capture-title", has_text=".zip").wait_for()
     page.get_by_label("Also measure quality").check()
     page.get_by_role("button", name="Compress").click()
-    page.get_by_text("smaller").first.wait_for()
+    page.locator("#job .ratio").wait_for()
     local = kissgs.compress(scene["buffer"], views=kissgs.load_views(folder), evaluate=True)
     with page.expect_download() as download:
         page.get_by_role("link", name="Download container").click()
@@ -133,7 +133,7 @@ def test_a_repeated_job_names_the_photographs(page, service, scene, archive):
     page.get_by_label("Fast").check()
     page.set_input_files("#capture", archive)
     page.get_by_role("button", name="Compress").click()
-    page.get_by_text("smaller").first.wait_for()
+    page.locator("#job .ratio").wait_for()
     reference = newest(service)["options"]["capture"]
     cancelled = service.submit(scene["buffer"], json.dumps({**json.loads(SLOW), "capture": reference}))
     service.cancel(cancelled)
