@@ -20,9 +20,9 @@ camera files as text shrink to a third. This much disk space is reserved."""
 
 
 class CaptureUpload:
-    """Receives the capture of a submission of an ``owner``, if it has one. As a context manager, removes what no job has
-    adopted. Once it is finished, it has the ``reference``, the ``folder`` of the files, their ``bytes``, and whether
-    there are ``photographs`` to train on and others to evaluate with."""
+    """Receives the capture of a submission, if it has one. As a context manager, removes what no job has adopted.
+    Finished, it has a ``reference``, the ``folder`` and ``bytes`` of its files, and whether there are ``photographs``
+    to train on and others to evaluate with."""
 
     def __init__(self, context: ServiceContainer, owner: str) -> None:
         self._context, self._owner = context, owner
@@ -31,14 +31,17 @@ class CaptureUpload:
         self._reserved = 0
         self.write = self._spool.write
         self.reference: str | None = None
-        self.bytes, self.photographs = 0, None
+        self.photographs: bool | None = None
+        self.bytes = 0
 
     async def __aenter__(self) -> Self:
         return self
 
     async def __aexit__(self, *error: object) -> None:
-        await self._spool.__aexit__(*error)
-        await asyncio.shield(asyncio.ensure_future(run_sync(self._leave)))
+        try:
+            await self._spool.__aexit__(*error)
+        finally:
+            await asyncio.shield(asyncio.ensure_future(run_sync(self._leave)))
 
     def _leave(self) -> None:
         self._context.storage.discard(self.folder)  # moved to the job, or not needed
