@@ -9,16 +9,23 @@ import json
 import re
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 from urllib.parse import urlsplit
 
 from kissgs.core.context import Progress, silent
-from kissgs.core.errors import Cancelled, InvalidSceneError, KissgsError, RemoteError, UnsupportedError
+from kissgs.core.errors import (
+    Cancelled,
+    InvalidSceneError,
+    InvalidViewsError,
+    KissgsError,
+    RemoteError,
+    UnsupportedError,
+)
 from kissgs.formats import ContainerName, named_container
-from kissgs.io.files import atomic_file, open_scene_file, reason_of, refuse_existing
+from kissgs.io.files import atomic_file, open_scene_file, refuse_existing
 from kissgs.settings import GROUPS, Settings
 
 if TYPE_CHECKING:
@@ -27,6 +34,7 @@ if TYPE_CHECKING:
 BLOCK_BYTES = 1 << 18  # size of the blocks in which files are uploaded and downloaded
 RETRY_SECONDS = 300.0  # time for which requests to an overloaded or restarting service are repeated
 FIRST_RETRY_SECONDS = 8.0  # the same for a service that has never answered: its address may be wrong
+ANSWER_SECONDS = 180.0  # for the answer to an upload: the service unpacks and checks a capture first
 WAIT = "wait for server"  # stage in which a request is repeated after a while
 
 T = TypeVar("T")
@@ -78,6 +86,7 @@ class Remote:
         container: ContainerName | None = None,
         evaluate: bool = False,
         origin: Literal["auto"] | None = None,
+        capture: str | PathLike[str] | None = None,
         overwrite: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
@@ -90,6 +99,8 @@ class Remote:
             container: ``"sogxt"`` or ``"sog"``; by default SOG if ``destination`` ends in ``.sog``, else SOG-XT.
             evaluate: whether the service also compares rendered images.
             origin: see :class:`kissgs.ReadOptions`.
+            capture: zip or tar of photographs of the scene and their cameras, as :func:`kissgs.load_views` reads them;
+                it is sent unless the service has kept it for an earlier job.
             overwrite: whether to replace ``destination`` if it exists.
             progress: receives "upload", "queue", the stages of the service, "download", and "wait for server" with the
                 reason as a note. An exception that it raises cancels the job.
@@ -99,6 +110,7 @@ class Remote:
 
         Raises:
             InvalidSceneError: the file cannot be read, or is not a scene.
+            InvalidViewsError: the same of the capture, or it does not show the scene.
             UnsupportedError: a limit is exceeded, a setting is invalid, or the ending is that of another container.
             RemoteError: the service cannot be reached, refuses the job or fails.
             OutputError: ``destination`` cannot be written.
@@ -107,7 +119,13 @@ class Remote:
         kind = named_container(container, destination)
         refuse_existing(target, overwrite=overwrite)
         status = self.submit(
-            source, settings=settings, container=kind, evaluate=evaluate, origin=origin, progress=progress
+            source,
+            settings=settings,
+            container=kind,
+            evaluate=evaluate,
+            origin=origin,
+            capture=capture,
+            progress=progress,
         )
         try:
             status = self.follow(status["id"], progress)
@@ -129,6 +147,7 @@ class Remote:
         container: ContainerName = "sogxt",
         evaluate: bool = False,
         origin: Literal["auto"] | None = None,
+        capture: str | PathLike[str] | None = None,
         progress: Progress = silent,
     ) -> dict[str, Any]:
         """Upload a scene; retry if the connection breaks or the service is overloaded, without a second job.
@@ -139,6 +158,7 @@ class Remote:
             container: ``"sogxt"`` or ``"sog"``.
             evaluate: whether the service also compares rendered images.
             origin: see :class:`kissgs.ReadOptions`.
+            capture: see :meth:`compress`.
             progress: receives "upload" and "wait for server".
 
         Returns:
@@ -147,20 +167,28 @@ class Remote:
         Raises:
             KissgsError: see :meth:`compress`.
         """
-        path = Path(source)
+        path, key = Path(source), uuid.uuid4().hex
         options = {**_given(settings or Settings()), "format": container, "evaluate": evaluate}
         options |= {} if origin is None else {"origin": origin}
-        with open_scene_file(path) as opened:
-            params, size = {"options": json.dumps(options), "name": path.name}, opened.size
-        headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
-        headers["Idempotency-Key"] = uuid.uuid4().hex
+        options |= {} if capture is None else {"capture": f"sha256:{_sha256(Path(capture))}"}
+        params = {"options": json.dumps(options), "name": path.name}
 
-        def send() -> dict[str, Any]:
-            body = _blocks(path, size, progress)
-            return _checked(self._http.post("/v1/jobs", params=params, headers=headers, content=body)).json()
+        def send(kind: str, parts: Sequence[bytes | Path]) -> dict[str, Any]:
+            size = sum(map(_size, parts))
+            headers = {"Content-Type": kind, "Content-Length": str(size), "Idempotency-Key": key}
+            body = _blocks(parts, size, progress)
+            timeout = (10.0, ANSWER_SECONDS, 60.0, 60.0)
+            answer = self._http.post("/v1/jobs", params=params, headers=headers, content=body, timeout=timeout)
+            return _checked(answer).json()
 
         try:
-            return self._with_retries(send, progress)
+            try:
+                return self._with_retries(lambda: send("application/octet-stream", [path]), progress)
+            except RemoteError as error:
+                if capture is None or error.problem != "gone":
+                    raise
+            parts = _form(key, capture=Path(capture), file=path)
+            return self._with_retries(lambda: send(f"multipart/form-data; boundary={key}", parts), progress)
         except KissgsError as error:
             raise _with_file_name(error, path) from error
 
@@ -302,17 +330,37 @@ def _given(settings: Settings) -> dict[str, Any]:
     return values
 
 
-def _blocks(path: Path, size: int, progress: Progress) -> Iterator[bytes]:
+def _sha256(capture: Path) -> str:
+    with open_scene_file(capture, "; name an archive", InvalidViewsError) as opened:
+        digest = hashlib.sha256()
+        while block := opened.file.read(BLOCK_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _form(boundary: str, **files: Path) -> list[bytes | Path]:
+    """Return the parts of a form with these files, in order."""
+    parts: list[bytes | Path] = []
+    for name, path in files.items():
+        head = f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n'
+        parts += [head.encode(), path, b"\r\n"]
+    return [*parts, f"--{boundary}--\r\n".encode()]
+
+
+def _size(part: bytes | Path) -> int:
+    with open_scene_file(part) as opened:
+        return opened.size
+
+
+def _blocks(parts: Sequence[bytes | Path], size: int, progress: Progress) -> Iterator[bytes]:
     done = 0
     progress("upload", 0.0)
-    try:
-        with path.open("rb") as file:
-            while block := file.read(BLOCK_BYTES):
+    for part in parts:
+        with open_scene_file(part) as opened:
+            while block := opened.file.read(BLOCK_BYTES):
                 yield block
                 done += len(block)
                 progress("upload", min(1.0, done / max(size, 1)))
-    except OSError as error:
-        raise InvalidSceneError(f"cannot read {path}: {reason_of(error)}") from error
 
 
 def _events(response: httpx.Response) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -355,5 +403,10 @@ def _checked(response: httpx.Response) -> httpx.Response:
 
 def _error(code: str, detail: str) -> KissgsError:
     """Return the error of a problem of the scene or the settings that the library itself would raise, or another."""
-    kinds: dict[str, type[KissgsError]] = {kind.code: kind for kind in (InvalidSceneError, UnsupportedError)}
-    return kinds.get(code, RemoteError)(detail)
+    kinds: dict[str, type[KissgsError]] = {
+        kind.code: kind for kind in (InvalidSceneError, InvalidViewsError, UnsupportedError)
+    }
+    error = kinds.get(code, RemoteError)(detail)
+    if isinstance(error, RemoteError):
+        error.problem = code
+    return error

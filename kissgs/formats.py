@@ -76,6 +76,17 @@ UPLOADS = {name: each.endings[0] for name, each in FORMATS.items() if each.endin
 
 DOUBLE_ENDINGS = tuple(ending for ending in WRITTEN if ending.count(".") > 1)
 
+PHOTOGRAPHS = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
+"""Endings of photographs, in lower case; any other suffix is part of the name."""
+
+CAMERA_FILES = frozenset(
+    {
+        *("cameras.bin", "images.bin", "cameras.txt", "images.txt", "dataparser_transforms.json"),
+        *("transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json"),
+    }
+)
+"""Names of the files of a capture that have its cameras."""
+
 _SLASHES = tuple({"/", os.sep})
 
 

@@ -26,9 +26,6 @@ _PLUGINS = (
 )
 FORMATS = tuple(plugin.format for plugin in _PLUGINS)  # Pillow's other readers get no untrusted files
 
-EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
-"""Extensions of photographs, in lower case; any other suffix is part of the name."""
-
 MAX_PIXELS = 1 << 28
 """Maximum number of pixels, 268 million: phones have up to 200 million. Decoded, they take 1.1 GB; a transparent image,
 which is composited, twice that."""

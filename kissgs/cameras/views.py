@@ -201,3 +201,8 @@ class Views:
     def all(self) -> tuple[View, ...]:
         """Training and held-out views, sorted by name."""
         return tuple(sorted(self.train + self.test, key=lambda view: view.name))
+
+    @property
+    def has_photographs(self) -> bool:
+        """Whether there are photographs to train on, and others to evaluate the result."""
+        return bool(self.test) and any(view.photo for view in self.train) and all(view.photo for view in self.test)

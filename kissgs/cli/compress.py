@@ -156,7 +156,6 @@ def compress(
             "first, it bounds the search. --evaluate takes longer.",
         ),
     ] = None,
-    seed: Annotated[int | None, Option(help="Seed of all random choices; same seed, same result. Default: 0.")] = None,
     unpacked: Annotated[bool, Option("--unpacked", help="Write a folder instead of a zip.")] = False,
     training: TrainingOptions,
     cache: Annotated[
@@ -183,7 +182,7 @@ def compress(
 
     manifest = None if output is None else named_manifest(Path(output))
     kind = named_container(encoding.container, None if manifest or output == "-" else output)
-    settings = encoding.settings(time=time, seed=seed)
+    settings = encoding.settings(time=time)
     renders = (
         encoding.evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
     )

@@ -273,7 +273,7 @@ class EncodingOptions:
     ] = False
     origin: OriginOption = None
 
-    def settings(self, *, time: str | None = None, seed: int | None = None) -> Settings:
+    def settings(self, *, time: str | None = None) -> Settings:
         """Return the settings that these options stand for."""
         return chosen(
             self.preset,
@@ -281,7 +281,6 @@ class EncodingOptions:
             compact=self.compact,
             finetune=self.finetune,
             time=time,
-            seed=seed,
             **{name: getattr(self, name) for name in ("psnr", "target_size", "max_psnr_drop", "quality")},
         )
 

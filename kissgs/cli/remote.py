@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +14,14 @@ import typer
 from typer import Argument, Option
 
 from kissgs.cli.files import Result, for_each_input, print_json, progress_bar, show
-from kissgs.cli.options import EncodingOptions, FilesArgument, ForceOption, output_option, with_option_groups
+from kissgs.cli.options import (
+    EncodingOptions,
+    FilesArgument,
+    ForceOption,
+    ViewsOption,
+    output_option,
+    with_option_groups,
+)
 from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.formats import ENDINGS, ending_of, named_container
 
@@ -41,6 +51,7 @@ def compress(
     server: ServerOption = DEFAULT_SERVER,
     *,
     encoding: EncodingOptions,
+    views: ViewsOption = None,
     force: ForceOption = False,
     as_json: ServiceJsonOption = False,
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print only errors.")] = False,
@@ -51,7 +62,7 @@ def compress(
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
     kind, settings = named_container(encoding.container, output), encoding.settings()
-    with _service(server) as remote:
+    with _service(server) as remote, _packed(views, quiet or as_json) as capture:
 
         def work(scene: str, target: Path) -> Result:
             with progress_bar(quiet or as_json) as progress:
@@ -62,6 +73,7 @@ def compress(
                     container=kind,
                     evaluate=encoding.evaluate,
                     origin=encoding.origin,
+                    capture=capture,
                     overwrite=force,
                     progress=_announcing(progress, server, quiet),
                 )
@@ -120,6 +132,21 @@ def _service(server: str) -> Remote:
     from kissgs.client import Remote
 
     return Remote(server, key=os.environ.get("KISSGS_KEY"))
+
+
+@contextlib.contextmanager
+def _packed(views: Path | None, quiet: bool) -> Iterator[Path | None]:
+    """Pack the capture, if there is one, into a temporary file."""
+    if views is None:
+        yield None
+        return
+    from kissgs.cameras.captures.load import pack_capture
+
+    with tempfile.TemporaryDirectory() as folder:
+        archive = Path(folder) / "capture.zip"
+        with progress_bar(quiet) as progress:
+            pack_capture(views, archive, progress)
+        yield archive
 
 
 def _announcing(progress: Progress, server: str, quiet: bool) -> Progress:

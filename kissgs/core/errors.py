@@ -53,11 +53,13 @@ class RemoteError(KissgsError):
     Attributes:
         retry_after: seconds after which a retry may succeed; None if it cannot succeed or the time is unknown.
         unreachable: whether there was no answer at all.
+        problem: code of the service's problem document; empty if it sent none.
     """
 
     code = "remote"
     retry_after: float | None = None
     unreachable: bool = False
+    problem: str = ""
 
 
 class RunnerError(KissgsError):

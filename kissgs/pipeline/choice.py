@@ -39,7 +39,7 @@ def resolved(settings: Settings, views: Views | None, *, keep_all: bool = False,
     that all Gaussians stay unless the settings request otherwise, ``torch`` whether it is installed."""
     if keep_all and settings.compact.auto_count is None:
         settings = settings.model_copy(update={"compact": settings.compact.model_copy(update={"auto_count": False})})
-    photographs = None if views is None else has_photographs(views)
+    photographs = None if views is None else views.has_photographs
     return settings.resolved(photographs=photographs, torch=has_torch() if torch is None else torch)
 
 
@@ -83,10 +83,3 @@ def in_time(
         return Choice(settings, time, note)
     fast = Settings.from_preset(Preset.FAST, time_limit=settings.time_limit, seed=settings.encode.seed)
     return Choice(fast, time, f"encoded with the preset fast: {settings.preset} would take about {takes:.0f} s")
-
-
-def has_photographs(views: Views | None) -> bool:
-    """Return whether a capture has photographs to train on, and others to evaluate the result."""
-    if views is None or not views.test:
-        return False
-    return any(view.photo for view in views.train) and all(view.photo for view in views.test)

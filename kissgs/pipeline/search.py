@@ -22,7 +22,6 @@ from kissgs.evaluation.results import ESTIMATED_DROP, Evaluation, drop_of
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline import curves
-from kissgs.pipeline.choice import has_photographs
 from kissgs.pipeline.curves import LambdaCurve, NoFurtherError, at_lambda, count_at, last_number
 from kissgs.pipeline.encoding import Measured, Work, encode, make_tuner, measure
 from kissgs.pipeline.goal import Attempt, Container, Goal
@@ -134,7 +133,8 @@ class Search:
     def photographs(self) -> bool:
         """Whether to train on photographs; never for a PSNR to the scene's own renderings, which then falls."""
         trains = self.compactor is not None and self.compactor.settings.trains
-        return trains and self.encode_settings.psnr is None and has_photographs(self.work.views)
+        views = self.work.views
+        return trains and self.encode_settings.psnr is None and views is not None and views.has_photographs
 
     @property
     def trains(self) -> bool:

@@ -37,6 +37,7 @@ def run_on_node(values: dict[str, Any], version: str, files: dict[str, list[Any]
                 return
             folder = stack.enter_context(temporary_folder())
             for name, blocks in files.items():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 with (folder / name).open("wb") as file:
                     for block in blocks:
                         file.write(ray.get(block))

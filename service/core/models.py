@@ -43,8 +43,8 @@ class Meta(Base):
 class Job(Base):
     """One upload, its options, its progress and its result. Times are seconds since 1970; sizes are bytes.
     ``disk_bytes`` is the size of its files; while the job runs, that of the upload plus ``work_bytes``, the upper bound
-    for its checkpoints. ``reclaimable_bytes`` is the part that can be deleted for new uploads once the job has ended:
-    the upload, which is kept for comparisons, and the decoded scene."""
+    for its checkpoints, and its capture. ``reclaimable_bytes`` is the part that can be deleted for new uploads once the
+    job has ended: the upload, which is kept for comparisons, the capture and the decoded scene."""
 
     __tablename__ = "jobs"
     __table_args__ = (
@@ -64,7 +64,7 @@ class Job(Base):
     name: Mapped[str] = mapped_column(String(200))
     state: Mapped[str] = mapped_column(String(16), default=State.QUEUED)
     options: Mapped[dict[str, Any]] = mapped_column(JSON)
-    preset: Mapped[str] = mapped_column(String(40))
+    preset: Mapped[str] = mapped_column(String(60))
     evaluate: Mapped[bool]
     gaussians: Mapped[int] = mapped_column(Integer)
     sh_degree: Mapped[int] = mapped_column(Integer)

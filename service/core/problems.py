@@ -26,6 +26,7 @@ class ProblemType:
 PROBLEM_TYPES: dict[str, ProblemType] = {
     # Errors of the library.
     "invalid-scene": ProblemType(422, "The upload is not a valid Gaussian scene"),
+    "invalid-views": ProblemType(422, "The capture, its cameras or its photographs cannot be used"),
     "invalid-container": ProblemType(422, "The file is not a valid container"),
     "unsupported": ProblemType(422, "The scene exceeds a limit or needs an unsupported feature"),
     "output": ProblemType(507, "The result could not be written", retryable=True),

@@ -16,7 +16,10 @@ from .problems import Problem
 COMPACTED = "+compact"
 FINETUNED = "+finetune"
 SEARCHED = "+search"
+CAPTURED = "+photos"
 TIMED = "+time"  # suffixes of the preset's name in kind
+
+REFERENCE = "^sha256:[0-9a-f]{64}$"  # of a capture
 
 
 class JobOptions(kissgs.Settings):
@@ -32,6 +35,7 @@ class JobOptions(kissgs.Settings):
                 {"finetune": {"enabled": True}},
                 {"encode": {"target_size": 3_000_000}, "time_limit": 120},
                 {"format": "sog"},
+                {"encode": {"max_psnr_drop": 0.1}, "capture": f"sha256:{'0' * 64}"},
             ]
         },
     )
@@ -50,6 +54,14 @@ class JobOptions(kissgs.Settings):
         "and record it; by default as in the file. For scenes far from the origin.",
     )
 
+    capture: str | None = Field(
+        None,
+        pattern=REFERENCE,
+        description="Capture of the scene, its cameras and photographs: the SHA-256 of the archive that the field "
+        "`capture` of a form has, or had for an earlier job whose upload is still kept.",
+    )
+    force_views: bool = Field(False, description="Accept a capture whose photographs do not show the scene.")
+
     @classmethod
     def stored(cls, options: dict[str, Any]) -> Self:
         """Return the options of a job in the database; older versions took values that belong to the preset now."""
@@ -62,6 +74,7 @@ class JobOptions(kissgs.Settings):
             COMPACTED: self.compact.enabled,
             FINETUNED: bool(self.finetune.enabled),
             SEARCHED: self.searches,
+            CAPTURED: self.capture is not None,
             TIMED: self.time_limit is not None,
         }
         return "".join([self.preset, *(suffix for suffix, wanted in stages.items() if wanted)])
@@ -171,7 +184,9 @@ class JobStatus(ApiModel):
         None,
         description="PSNR, SSIM and MS-SSIM against renderings of the upload, from cameras sampled over the whole "
         "scene: means, the worst view and its camera position, the fifth percentile of PSNR, changes of SSIM in "
-        "patches (detail), and the share of the scene that the views show. A PSNR of null is infinite.",
+        "patches (detail), and the share of the scene that the views show. A PSNR of null is infinite. With a capture "
+        "whose photographs are held out, from their cameras, and also the metrics of the upload's (reference) and of "
+        "the container's renderings (candidate) to these photographs.",
     )
     finetuning: dict[str, Any] | None = Field(
         None, description="PSNR and bytes before and after fine-tuning, and whether its result was kept."
@@ -200,6 +215,7 @@ class Limits(ApiModel):
     formats: list[str] = Field(description="Supported formats of uploads.")
     containers: list[Format] = Field(description="Formats of containers, for the option `format`.")
     max_upload_bytes: int
+    max_capture_bytes: int
     max_header_bytes: int
     max_gaussians: int
     max_sh_degree: int

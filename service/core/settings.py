@@ -62,6 +62,9 @@ class ServiceSettings(BaseSettings):
     )
 
     max_upload_bytes: ByteSize = Field(ByteSize(2 << 30), gt=0, description="Maximum bytes of one upload.")
+    max_capture_bytes: ByteSize = Field(
+        ByteSize(2 << 30), gt=0, description="Maximum bytes of a capture, the photographs of a scene, also unpacked."
+    )
     max_gaussians: int = Field(5_000_000, gt=0, le=20_000_000, description="Maximum number of Gaussians of one scene.")
     max_uploads: int = Field(
         16,
@@ -101,6 +104,10 @@ class ServiceSettings(BaseSettings):
     """Seconds that a stopping service waits for running jobs, before it puts them back into the queue."""
     max_header_bytes: ClassVar[int] = 64 << 10
     """Maximum bytes of a .ply header: one with all known properties has three thousand."""
+    max_capture_files: ClassVar[int] = 20_000
+    """Maximum number of files in the archive of a capture, used or not; large captures have a few thousand."""
+    capture_seconds: ClassVar[float] = 120
+    """Seconds in which a capture must be unpacked and checked; two gigabytes take twenty."""
     upload_idle_seconds: ClassVar[float] = 30
     """Seconds without data after which an upload is aborted: TCP recovers from a lost packet in fewer."""
     upload_min_rate: ClassVar[int] = 32 << 10

@@ -14,20 +14,22 @@ from anyio.to_thread import run_sync
 from pydantic import ValidationError
 from starlette.requests import Request
 
-from kissgs.formats import UPLOADS
+from kissgs.formats import UPLOADS, alternatives
 
 from ..core.files import checkpoint_bytes
 from ..core.models import Job
 from ..core.presets import can_train
 from ..core.problems import ProblemError, disk_full, field_errors, invalid, unusable_database
 from ..core.schemas import JobOptions
+from ..core.settings import ServiceSettings
 from ..jobs.container import ServiceContainer
 from ..jobs.worker import QUEUE
 from ..storage.job_records import LimitExceeded
+from .captures import CaptureUpload
 from .uploads import PartBegin, Received, Spool, parts, scene_name, timed
 
 RAW_TYPES = ("", "application/octet-stream", "application/ply", "application/x-ply", "model/ply")
-FORM_TYPE = "multipart/form-data"
+FORM_TYPE, FIELDS = "multipart/form-data", ("file", "capture", "options")
 log = logging.getLogger("kissgs.service")
 
 STOPPING = "stopping"  # subscription that only the closing of the notifier wakes
@@ -38,9 +40,10 @@ MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)  # maximum bytes of a form in ad
 
 @dataclass(frozen=True, slots=True)
 class Submission:
-    """Content of a request: upload, options, name and idempotency key."""
+    """Content of a request: upload, capture, options, name and idempotency key."""
 
     received: Received
+    capture: CaptureUpload
     options: JobOptions
     name: str
     key: str | None
@@ -64,21 +67,26 @@ async def submit(
     known = await run_sync(context.store.by_idempotency_key, owner, key) if key is not None else None
     if known is None:
         await run_sync(context.admission.check, owner)
-    parsed = parse_options(options) if options is not None else None
+    parsed = parse_options(options) if options is not None else JobOptions()
     with context.admission.slot(owner or address_of(request.client)):
         path = context.storage.new_upload()
         kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         _check_headers(request, kind)
-        at_most = _scene_bytes(request, kind, context.settings.max_upload_bytes)
-        async with Spool(context.settings, context.admission, path, at_most) as spool:
+        at_most = _scene_bytes(request, kind, context.settings)
+        async with (
+            CaptureUpload(context, owner) as capture,
+            Spool(context.settings, context.admission, path, at_most) as spool,
+        ):
+            text: str | bytes = options or "{}"
             spool.name = name or ""
             if kind == FORM_TYPE:
-                parsed, name = await _receive_form(context, request, spool, parsed, name)
+                text, name = await _receive_form(context, request, spool, capture, options, name)
             else:
+                await capture.check(parsed.capture)  # before the body
                 async for chunk in _body(context, request):
                     await spool.write(chunk)
-            submission = Submission(await spool.finish(), parsed or parse_options("{}"), scene_name(name), key)
             try:
+                submission = await _checked(spool, capture, text, scene_name(name), key)
                 job, new = await run_sync(_queue, context, submission, owner)
             finally:
                 await run_sync(context.storage.discard, path)  # already moved to the job, or not needed
@@ -91,10 +99,20 @@ async def submit(
     return job
 
 
-def parse_options(text: str | bytes) -> JobOptions:
-    """Parse options from JSON; the problem of invalid ones lists every invalid field."""
+async def _checked(spool: Spool, capture: CaptureUpload, text: str | bytes, name: str, key: str | None) -> Submission:
+    """Check the options, the complete scene and the capture."""
+    options = parse_options(text)
+    received = await spool.finish()
+    await capture.finish(options.capture)
+    options = parse_options(text, photographs=capture.photographs)
+    return Submission(received, capture, options.model_copy(update={"capture": capture.reference}), name, key)
+
+
+def parse_options(text: str | bytes, *, photographs: bool | None = None) -> JobOptions:
+    """Parse options from JSON; the problem of invalid ones lists every invalid field. ``photographs`` says whether a
+    capture has them, see :meth:`kissgs.Settings.resolved`."""
     try:
-        options = JobOptions.model_validate_json(text).resolved(photographs=None, torch=can_train())
+        options = JobOptions.model_validate_json(text).resolved(photographs=photographs, torch=can_train())
     except ValidationError as error:
         named, found = field_errors(error.errors())
         raise ProblemError(
@@ -132,41 +150,51 @@ def _check_headers(request: Request, kind: str) -> None:
         )
 
 
-def _scene_bytes(request: Request, kind: str, limit: int) -> int | None:
+def _scene_bytes(request: Request, kind: str, settings: ServiceSettings) -> int | None:
     """Return the maximum size of the scene according to Content-Length; None if that is unknown."""
     text = request.headers.get("content-length", "")
     if not (text.isascii() and text.isdigit()):
         return None
     length = int(text) if len(text) < 19 else 10**18
-    return limit if kind == FORM_TYPE and limit < length <= limit + MAX_FORM_BYTES else length
+    limit, beside = settings.max_upload_bytes, settings.max_capture_bytes + MAX_FORM_BYTES
+    return limit if kind == FORM_TYPE and limit < length <= limit + beside else length
 
 
 def _body(context: ServiceContainer, request: Request) -> AsyncIterator[bytes]:
     return timed(request, context.settings, context.notifier.subscribe(STOPPING))
 
 
-async def _form_bytes(context: ServiceContainer, request: Request, spool: Spool) -> AsyncIterator[bytes]:
-    """Yield the body of a form; raise an error if it exceeds the limit for bytes other than the scene."""
+async def _form_bytes(
+    context: ServiceContainer, request: Request, spool: Spool, capture: CaptureUpload
+) -> AsyncIterator[bytes]:
+    """Yield the body of a form; raise an error if it exceeds the limit for bytes other than scene and capture."""
     received = 0
     async for chunk in _body(context, request):
         yield chunk
         received += len(chunk)
-        if received - spool.size > MAX_FORM_BYTES + len(chunk):
-            beside = f"{MAX_FORM_BYTES} bytes beside the scene"
+        if received - spool.size - capture.size > MAX_FORM_BYTES + len(chunk):
+            beside = f"{MAX_FORM_BYTES} bytes beside the scene and the capture"
             raise invalid(f"the form has more than {beside}, which is the limit; send less")
 
 
 async def _receive_form(
-    context: ServiceContainer, request: Request, spool: Spool, options: JobOptions | None, name: str | None
-) -> tuple[JobOptions | None, str | None]:
-    """Receive a form with the fields ``file`` and ``options``, in any order; return the options and the name."""
+    context: ServiceContainer,
+    request: Request,
+    spool: Spool,
+    capture: CaptureUpload,
+    options: str | None,
+    name: str | None,
+) -> tuple[str | bytes, str | None]:
+    """Receive a form with the fields ``file``, ``capture`` and ``options``, in any order; return the options, perhaps
+    those of the URL, and the name."""
     seen: list[str] = []
     text = bytearray()
-    async for event in parts(request.headers["content-type"], _form_bytes(context, request, spool)):
+    async for event in parts(request.headers["content-type"], _form_bytes(context, request, spool, capture)):
         match event:
             case PartBegin(field, filename):
-                if field not in ("file", "options"):
-                    raise invalid(f"the form has an unknown field {field[:40]!r}; send 'file' and 'options' only")
+                if field not in FIELDS:
+                    known = alternatives([repr(name) for name in FIELDS])
+                    raise invalid(f"the form has an unknown field {field[:40]!r}; send {known}")
                 if field in seen:
                     raise invalid(f"the form has the field {field!r} twice; send each field once")
                 seen.append(field)
@@ -174,6 +202,8 @@ async def _receive_form(
                 spool.name = filename or name or "" if field == "file" else spool.name
             case bytes() if seen[-1] == "file":
                 await spool.write(event)
+            case bytes() if seen[-1] == "capture":
+                await capture.write(event)
             case bytes():
                 text += event
                 if len(text) > MAX_OPTIONS_BYTES:
@@ -182,14 +212,16 @@ async def _receive_form(
         raise invalid("the form has no field 'file'; send the scene in it")
     if "options" in seen and options is not None:
         raise invalid("the options are both in the form and in the URL; send them once")
-    return parse_options(bytes(text)) if "options" in seen else options, name
+    if "capture" in seen and not capture.size:
+        raise invalid("the field 'capture' is empty; send the archive in it, or leave it out")
+    return bytes(text) if "options" in seen else options or "{}", name
 
 
 def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tuple[Job, bool]:
     known = _known(context, submission, owner)
     if known is not None:
         return known, False
-    received, options = submission.received, submission.options
+    received, capture, options = submission.received, submission.capture, submission.options
     job = Job(
         id=uuid.uuid4().hex,
         owner=owner,
@@ -200,8 +232,9 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
         gaussians=received.info.count,
         sh_degree=received.info.sh_degree,
         upload_bytes=received.size,
-        disk_bytes=received.size,
-        work_bytes=checkpoint_bytes(
+        disk_bytes=received.size + capture.bytes,
+        work_bytes=capture.bytes
+        + checkpoint_bytes(
             received.info.count,
             received.info.sh_degree,
             compact=options.resumable and options.retrains,
@@ -212,7 +245,7 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
         idempotency_key=submission.key,
     )
     try:
-        context.storage.adopt(received.path, job.id, f"scene{UPLOADS[received.info.format]}")
+        context.storage.adopt(received.path, job.id, f"scene{UPLOADS[received.info.format]}", capture.folder)
         return context.admission.add(job), True
     except BaseException as error:
         context.storage.remove_job(job.id)

@@ -189,20 +189,28 @@ class Received:
 
 
 class Spool:
-    """Writes one scene to disk. As a context manager, removes it unless :meth:`finish` has succeeded. The header of a
-    ``.ply`` is checked while it arrives; other formats when they are complete. ``at_most`` bytes come according to the
-    client; None if that is unknown."""
+    """Writes one upload to disk: a scene, or the archive of a ``capture``. As a context manager, removes it unless
+    :meth:`finish` has succeeded. The header of a ``.ply`` is checked while it arrives; other formats when they are
+    complete. ``at_most`` bytes come according to the client; None if that is unknown."""
 
-    def __init__(self, settings: ServiceSettings, admission: Admission, path: Path, at_most: int | None = None) -> None:
+    def __init__(
+        self,
+        settings: ServiceSettings,
+        admission: Admission,
+        path: Path,
+        at_most: int | None = None,
+        *,
+        capture: bool = False,
+    ) -> None:
         self._settings, self._admission, self._path = settings, admission, path
-        self._at_most = at_most
+        self._at_most, self._capture = at_most, capture
         self.name = ""  # of the file according to the client; set it before the first write
         self.size = 0  # bytes received so far
         self._pending = bytearray()
         self._reserved, self._written = 0, 0
         self._hash = hashlib.sha256()
         self._file: BinaryIO | None = None
-        self._checked = self._kept = False
+        self._checked, self._kept = capture, False
 
     async def __aenter__(self) -> Self:
         if self._at_most is not None:
@@ -230,13 +238,18 @@ class Spool:
             await run_sync(self._flush)
 
     async def finish(self) -> Received:
-        """Write the remaining bytes to disk and validate the upload."""
-        await run_sync(self._close)
+        """Write the remaining bytes to disk and validate the scene."""
+        await self.close()
         async with self._admission.parsing:
             info = await run_sync(self._read_info)
         refuse_count(info.count, self.size, self._settings.max_gaussians)
         self._kept = True
         return Received(self._path, self.size, self._hash.hexdigest(), info)
+
+    async def close(self) -> str:
+        """Write the remaining bytes to disk, and return the SHA-256 of all."""
+        await run_sync(self._close)
+        return self._hash.hexdigest()
 
     def _close(self) -> None:
         self._flush()
@@ -301,7 +314,10 @@ class Spool:
         refuse_count(info.count, max(whole, self.size), self._settings.max_gaussians)
 
     def _refuse_size(self, size: int) -> None:
-        if size > self._settings.max_upload_bytes:
+        if self._capture and size > self._settings.max_capture_bytes:
+            most = f"{self._settings.max_capture_bytes:,} bytes, which is the limit"
+            raise ProblemError("too-large", f"the capture exceeds {most}; send fewer or smaller photographs")
+        if not self._capture and size > self._settings.max_upload_bytes:
             raise ProblemError(
                 "too-large",
                 f"the upload exceeds {self._settings.max_upload_bytes:,} bytes, which is the limit; "

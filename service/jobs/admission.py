@@ -35,6 +35,7 @@ class Admission:
     queue: QueueEstimator
     _uploads: Counter[str] = field(default_factory=Counter)
     parsing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(PARSES_AT_ONCE))
+    unpacking: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(1))
     _reserved: int = 0
     _written: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)

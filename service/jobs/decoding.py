@@ -77,14 +77,11 @@ class Decoder:
             process.kill()
 
     async def _run(self, job: Job, work: Path) -> None:
-        async def ignore(stage: str, fraction: float, note: str) -> None:
-            pass
-
         source = f"{RESULT}/{container_file(job.options).name}"
         task = {"function": DECODE, "folder": str(work.parent), "files": [source], "source": source, "work": work.name}
         process = self._processes[job.id] = JobProcess(self.runners)
         try:
-            outcome = await process.run(task, ignore)
+            outcome = await process.run(task)
         finally:
             del self._processes[job.id]
         if outcome.kind == "cancelled":

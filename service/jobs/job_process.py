@@ -30,7 +30,7 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     result.save(container)
     result.save(folder / "files")
     for path in (folder / "files", folder):
-        _sync(path)
+        sync_folder(path)
     report = result.report.as_dict()
     _write(folder / "report.json", json.dumps(report, indent=2).encode())
     stored = result.report.file_bytes
@@ -48,8 +48,11 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     }
     if report["evaluation"] is not None:
         evaluation = report["evaluation"]
+        mean = evaluation["mean"]
+        of_photographs = {} if mean["reference"] is None else {name: mean[name] for name in ("reference", "candidate")}
         summary["evaluation"] = {
-            **evaluation["mean"]["candidate_vs_reference"],
+            **mean["candidate_vs_reference"],
+            **of_photographs,
             **{name: evaluation[name] for name in ("worst", "fifth_percentile", "detail", "shown")},
         }
     _write(folder / "summary.json", json.dumps(summary).encode())
@@ -62,6 +65,7 @@ def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed
     job runs without."""
     import kissgs
 
+    views = None if task.get("views") is None else kissgs.load_views(Path(task["views"]), unpacked=True)
     checkpoint = None if task["checkpoint"] is None else Path(task["checkpoint"])
     while True:
         kept = [] if checkpoint is None else sorted(checkpoint.parent.glob(f"{checkpoint.stem}*{checkpoint.suffix}"))
@@ -72,6 +76,8 @@ def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed
                 reading=kissgs.ReadOptions(origin=task.get("origin")),
                 container=task["format"],
                 evaluate=task["evaluate"],
+                views=views,
+                force_views=task.get("force_views", False),
                 checkpoint=checkpoint,
                 threads=task["threads"],
                 device=task["device"],
@@ -99,7 +105,9 @@ def decode(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
 
 def without_paths(message: str, task: Task) -> str:
     """Return a message for clients, which does not say where the files of a task lie."""
-    return message.replace(task["source"], "the scene").replace(f"{task['work']}/", "")
+    for path in (f"{task['work']}/", f"{task['folder']}/"):
+        message = message.replace(path, "")
+    return message.replace(task["source"], "the scene") if task["source"] else message
 
 
 def _size_and_hash(path: Path) -> dict[str, Any]:
@@ -114,7 +122,8 @@ def _write(path: Path, data: bytes) -> None:
         os.fsync(file.fileno())
 
 
-def _sync(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's entries to the disk."""
     descriptor = os.open(folder, os.O_RDONLY)
     os.fsync(descriptor)
     os.close(descriptor)

@@ -18,7 +18,8 @@ from .job_process import without_paths
 
 log = logging.getLogger("kissgs.service")
 
-COMPRESS, DECODE = "job_process:compress", "job_process:decode"  # functions of this package that tasks name
+COMPRESS, DECODE, UNPACK = "job_process:compress", "job_process:decode", "archive:unpack"
+"""Functions of this package that tasks name."""
 
 UNUSABLE_NODES = "the machines that run jobs cannot work on this one; try again later"
 UNUSABLE_MACHINE = "the job's files cannot be used on this machine; try again later"
@@ -37,8 +38,8 @@ def postponed(reason: str = "") -> Outcome:
 
 @dataclass(frozen=True, slots=True)
 class JobRunners:
-    """The runners of all jobs, and what each of them requests. ``local`` decodes, which is quick and for which a
-    request waits: no job of a cluster delays it."""
+    """The runners of all jobs, and what each of them requests. ``local`` decodes and unpacks, which is quick and for
+    which a request waits: no job of a cluster delays it."""
 
     settings: ServiceSettings
     runner: Runner
@@ -63,7 +64,7 @@ class JobRunners:
 
     def runner_of(self, task: dict[str, Any]) -> Runner:
         """Return the runner of a task."""
-        return self.local if task["function"] == DECODE else self.runner
+        return self.runner if task["function"] == COMPRESS else self.local
 
     def request(self, *, trains: bool = False) -> Resources:
         """Return what a job requests: on a cluster, by default all processors of its smallest node."""
@@ -83,7 +84,7 @@ class JobRunners:
             f"{__package__}.{task['function']}",
             {**task, "threads": threads, "device": "cuda" if requested.gpus else "cpu"},
             requested,
-            seconds=self.settings.job_seconds,
+            seconds=self.settings.capture_seconds if task["function"] == UNPACK else self.settings.job_seconds,
             memory_limit=int(self.settings.job_memory),
             folder=task["folder"],
             files=tuple(task["files"]),
@@ -111,7 +112,7 @@ class JobProcess:
         if self._handle is not None:
             self._used.cancel(self._handle.id)
 
-    async def run(self, task: dict[str, Any], on_progress: OnProgress) -> Outcome:
+    async def run(self, task: dict[str, Any], on_progress: OnProgress | None = None) -> Outcome:
         """Run a task (see :mod:`service.jobs.job_process`); if the caller is cancelled, the process is killed."""
         if self.killed:
             return Outcome("cancelled")
@@ -128,7 +129,8 @@ class JobProcess:
         outcome.add_done_callback(lambda _: events.put_nowait(None))
         try:
             while (event := await events.get()) is not None:
-                await on_progress(*event)
+                if on_progress is not None:
+                    await on_progress(*event)
         finally:
             self._end()
             await asyncio.wait([outcome])

@@ -15,7 +15,7 @@ from ..core.clock import as_datetime
 from ..core.models import ACTIVE, Event, Job, State
 from ..core.notifier import JobNotifier, wait
 from ..core.presets import can_train, limited_seconds, usual_seconds
-from ..core.schemas import FINETUNED, TIMED, Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
+from ..core.schemas import CAPTURED, FINETUNED, TIMED, Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
 from ..storage.job_records import Store
 
 
@@ -130,7 +130,7 @@ def _kind_without_limit(job: Job) -> str:
     """Return the kind of the same job without a time limit, with fine-tuning where that is left to the time."""
     if not job.preset.endswith(TIMED):
         return job.preset
-    open_to_tuning = job.options["finetune"]["enabled"] is None and can_train()
+    open_to_tuning = job.options["finetune"]["enabled"] is None and CAPTURED not in job.preset and can_train()
     return job.preset.removesuffix(TIMED) + (FINETUNED if open_to_tuning else "")
 
 

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
+import kissgs
 from kissgs.runners import Outcome
 
 from ..core.clock import Clock
@@ -24,7 +25,7 @@ from ..core.problems import PROBLEM_TYPES, problem
 from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings
 from ..storage.database import error_text, is_full
-from ..storage.job_files import JobStorage
+from ..storage.job_files import CAPTURE, JobStorage
 from ..storage.job_records import Store
 from .process import COMPRESS, POSTPONED, JobProcess, JobRunners, postponed
 
@@ -113,7 +114,7 @@ class JobCompletion:
         values = {
             "result": summary,
             "upload_kept": kept,
-            "reclaimable_bytes": job.upload_bytes if kept else 0,
+            "reclaimable_bytes": self.storage.reclaimable_bytes(job.id) if kept else 0,
             "disk_bytes": self.storage.job_bytes(job.id),
         }
         if not self.end(job, State.SUCCEEDED, **values):
@@ -328,7 +329,7 @@ class Worker:
         if current is None or current.state != State.RUNNING:
             return Outcome("cancelled")
         upload = await run_sync(self.storage.upload_name, job.id)
-        if upload is None:
+        if upload is None or (job.options.get("capture") and not await run_sync(self.storage.capture_files, job.id)):
             return Outcome("error", code="internal", message=LOST)
         process.work = await run_sync(self.storage.new_work, job.id)
         task = await run_sync(self._task, job, upload, process.work)
@@ -349,11 +350,13 @@ class Worker:
         return {
             "function": COMPRESS,
             "folder": str(work.parent),
-            "files": [upload, *checkpoints],
+            "files": [upload, *self.storage.capture_files(job.id), *checkpoints],
             "source": upload,
+            "views": CAPTURE if options.capture else None,
+            "force_views": options.force_views,
             "work": work.name,
             "checkpoint": CHECKPOINT if options.resumable else None,
-            "settings": options.model_dump(mode="json", exclude={"format", "evaluate", "origin"}),
+            "settings": options.model_dump(mode="json", include=set(kissgs.Settings.model_fields)),
             "format": options.format,
             "container": container_file(job.options).name,
             "evaluate": options.evaluate,

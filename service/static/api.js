@@ -8,6 +8,7 @@
  * @typedef {{ratio?: number | null, count?: number | null, max_psnr_drop?: number | null,
  *   auto_count?: boolean | null}} Budget
  * @typedef {{preset: string, format?: string, evaluate: boolean, origin?: string | null, time_limit?: number | null,
+ *   capture?: string | null,
  *   encode: {rate_distortion: boolean, order: string} & Goals,
  *   compact: {method: string, sparsify_steps: number, refine_steps: number} & Budget,
  *   finetune: {enabled: boolean | null}}} JobOptions
@@ -19,10 +20,11 @@
  *   finetuning?: {kept: boolean, psnr_before: number | null, psnr_after: number | null, bytes_before: number | null,
  *     bytes_after: number},
  *   upload_bytes: number, gaussians: number, sh_degree: number, kept?: number, compacted?: number, invisible?: number, cleaned?: Record<string, number>,
- *   evaluation?: {psnr?: number | null, ssim: number, ms_ssim?: number, worst?: {psnr: number | string | null, position: number[]}}, sizes?: Sizes, timings: Timings, starts: number,
+ *   evaluation?: {psnr?: number | null, ssim: number, ms_ssim?: number, reference?: {psnr: number | string | null},
+ *     candidate?: {psnr: number | string | null}, worst?: {psnr: number | string | null, position: number[]}}, sizes?: Sizes, timings: Timings, starts: number,
  *   note?: string, problem?: ProblemDocument, links: Record<string, string>, expires_at?: string}} Status
  * @typedef {{jobs: Status[], next: string | null}} JobPage
- * @typedef {{max_upload_bytes: number, max_header_bytes: number, max_gaussians: number, job_seconds: number,
+ * @typedef {{max_upload_bytes: number, max_capture_bytes: number, max_header_bytes: number, max_gaussians: number, job_seconds: number,
  *   formats: string[], keys_required: boolean, training: boolean}} Limits
  * @typedef {{name: string, title: string, description: string, bytes_per_gaussian: number, psnr_change: number,
  *   cpu_seconds_per_million: number, settings: {encode: {rate_distortion: boolean}}}} Preset

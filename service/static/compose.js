@@ -2,6 +2,7 @@
 
 import { announce, byId, el } from "./dom.js";
 import { bytes, count } from "./format.js";
+import { captureField, isArchive } from "./capture.js";
 import { formatField } from "./container_formats.js";
 import { goalField } from "./goal.js";
 import { keepField } from "./keep.js";
@@ -11,8 +12,8 @@ import { timeField } from "./time_limit.js";
 
 /**
  * @typedef {{preset: string, evaluate: boolean, format: string, origin?: string, time_limit?: number, encode?: import("./api.js").Goals,
- *   compact?: import("./api.js").Budget, finetune?: {enabled: boolean}}} Options options that differ from the preset
- * @typedef {{file: File, options: Options}} Submission
+ *   compact?: import("./api.js").Budget, finetune?: {enabled: boolean}, capture?: string}} Options options that differ from the preset
+ * @typedef {{file: File, capture: File | null, options: Options}} Submission
  */
 
 /**
@@ -33,6 +34,7 @@ export function composer(limits, presets, submit) {
 
   /** @param {File} file */
   async function choose(file) {
+    if (isArchive(file)) return fields.capture.choose(file);
     const inspection = ++inspections;
     showError("");
     try {
@@ -57,7 +59,9 @@ export function composer(limits, presets, submit) {
   });
   form.addEventListener("submit", (/** @type {SubmitEvent} */ event) => {
     event.preventDefault();
-    if (chosen) return submit({ file: chosen, options: fields.chosen() });
+    const capture = fields.capture.chosen();
+    if (chosen)
+      return submit({ file: chosen, capture: capture instanceof File ? capture : null, options: fields.chosen() });
     showError("Choose a scene first.");
     input.focus();
   });
@@ -82,32 +86,45 @@ function optionFields(limits, presets) {
   const [time, keep] = [timeField(limits), keepField(limits.training)];
   const [finetune, evaluate, origin] = [byId("finetune"), byId("evaluate"), byId("origin")];
 
+  const capture = captureField(limits, refresh);
+  let trains = false;
+
   finetune.disabled = !limits.training;
-  byId("finetune-note").textContent = limits.training
-    ? "Trains the quantised scene with renderings: better quality at equal size, after one or two minutes."
-    : "This server has no torch, which training needs.";
 
   /** Enable the choices that can be combined, and explain them. */
   function refresh() {
-    goal.refresh(list.plans());
+    const captured = capture.chosen() !== null;
+    goal.refresh(list.plans(), captured);
     const [preset, plans, aims] = [list.chosen(), list.plans(), goal.chosen() !== null];
+    if (trains !== (limits.training && captured && aims)) {
+      trains = !trains; // on photographs, which serves the goal best
+      finetune.checked = trains;
+      keep.prefer(trains ? { auto_count: true } : {});
+    }
     keep.refresh(aims, time.chosen() !== null);
-    time.refresh({ preset, plans, goal: aims, tunes: finetune.checked, kept: keep.chosen() });
+    time.refresh({ preset, plans, captured, goal: aims, tunes: finetune.checked, kept: keep.chosen() });
+    const targets = captured ? "its photographs" : "renderings";
+    byId("finetune-note").textContent = limits.training
+      ? `Trains the quantised scene with ${targets}: better quality at equal size, after one or two minutes.`
+      : "This server has no torch, which training needs.";
   }
 
   byId("compose").addEventListener("change", refresh);
   refresh();
   return {
+    capture,
     estimate: list.estimate,
     /** @returns {Options} */
     chosen() {
       const [encode, compact, limit] = [goal.chosen(), keep.chosen(), time.chosen()];
+      const reference = capture.chosen();
       return {
         preset: list.chosen(),
         evaluate: evaluate.checked,
         format: format.chosen(),
         ...(origin.checked && { origin: "auto" }),
         ...(limit && { time_limit: limit }),
+        ...(typeof reference === "string" && { capture: reference }),
         ...(encode && { encode }),
         ...(compact ? { compact } : encode && { compact: { auto_count: false } }), // else a goal would choose
         ...((finetune.checked || encode) && { finetune: { enabled: finetune.checked } }), // a goal alone would train
@@ -117,6 +134,7 @@ function optionFields(limits, presets) {
     prefer(earlier) {
       list.choose(earlier.preset);
       goal.prefer(earlier.encode);
+      capture.prefer(earlier.capture);
       time.prefer(earlier.time_limit);
       keep.prefer(earlier.compact);
       format.prefer(earlier.format);
@@ -181,7 +199,8 @@ export function dropAnywhere({ accepts, choose }) {
     if (!files(event)) return;
     event.preventDefault();
     setOverlay(false);
-    const file = event.dataTransfer?.files[0];
-    if (file && accepts()) choose(file);
+    const dropped = [...(event.dataTransfer?.files ?? [])];
+    const several = [dropped.find((file) => !isArchive(file)), dropped.find(isArchive)]; // a scene, its photographs
+    for (const file of several) if (file && accepts()) choose(file);
   });
 }

@@ -25,6 +25,7 @@ const GOALS = {
     note: "The smallest container whose renderings lose at most this, assuming that the scene has 30 dB against photographs.",
   },
 };
+const PHOTOGRAPHED = "The smallest container that loses at most this against held-out photographs.";
 
 /** Connect the controls of the goal. */
 export function goalField() {
@@ -32,15 +33,17 @@ export function goalField() {
   const earlier = new Option("As in the earlier job"); // only in the list if the other controls cannot express its goals
   const selected = () => GOALS[goal.value];
 
-  /** @param {boolean} supported whether the preset supports goals */
-  function refresh(supported) {
+  /** @param {boolean} supported whether the preset supports goals @param {boolean} captured by photographs */
+  function refresh(supported, captured) {
     goal.disabled = !supported;
     if (goal.disabled) goal.value = "";
     byId("goal-amount").hidden = amount.disabled = !selected();
-    byId("goal-note").textContent = supported ? note() : "This preset does not support goals.";
+    byId("goal-note").textContent = supported ? note(captured) : "This preset does not support goals.";
   }
 
-  function note() {
+  /** @param {boolean} captured */
+  function note(captured) {
+    if (captured && goal.value === "max_psnr_drop") return PHOTOGRAPHED;
     if (selected() || !goal.value) return selected()?.note ?? "";
     return `${capitalised(goalLabels(JSON.parse(goal.value)).join(", "))}: the smallest container that meets this.`;
   }

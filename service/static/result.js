@@ -64,12 +64,16 @@ function figures(status) {
   if (goal) pairs.push(["Goal", capitalised(goal), goals.length ? `and ${goals.join(", ")}` : undefined]);
   if (finetuning) pairs.push(["Fine-tuning", gain(finetuning), "on held-out views"]);
   if (evaluation) {
-    const { psnr, ssim, ms_ssim, worst } = evaluation; // no PSNR if the images are identical
+    const { psnr, ssim, ms_ssim, worst, reference, candidate } = evaluation; // no PSNR if the images are identical
     pairs.push([
       "PSNR",
       typeof psnr === "number" ? `${psnr.toFixed(2)} dB` : "identical",
       "to the upload's renderings",
     ]);
+    if (typeof candidate?.psnr === "number" && typeof reference?.psnr === "number") {
+      const scene = `the upload has ${reference.psnr.toFixed(2)} dB`;
+      pairs.push(["PSNR to photographs", `${candidate.psnr.toFixed(2)} dB`, `held out; ${scene}`]);
+    }
     pairs.push(["SSIM", ssim.toFixed(4), "1 is identical"]);
     if (typeof ms_ssim === "number") pairs.push(["MS-SSIM", ms_ssim.toFixed(4), "1 is identical"]);
     if (typeof worst?.psnr === "number") {

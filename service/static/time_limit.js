@@ -11,12 +11,14 @@ const MEETS = "The search ends in this time, but not before the goal is met.";
 const TUNES = "Fine-tuning takes as many steps as fit in.";
 const FITS = "If the preset takes longer, Fast is used.";
 const FILLS = `Time that is left is used for fine-tuning. ${FITS}`;
+const PHOTOGRAPHS = "The smallest container found in this time that loses at most 0.1 dB against the photographs.";
 const UNUSED = "No effect on Fast without fine-tuning.";
 
 /**
  * @typedef {object} Chosen
  * @property {string} preset
  * @property {boolean} plans whether the preset has rate–distortion planning
+ * @property {boolean} captured whether there are photographs
  * @property {boolean} goal whether there is a goal
  * @property {boolean} tunes whether fine-tuning is requested
  * @property {import("./api.js").Budget | null} kept
@@ -32,9 +34,10 @@ export function timeField(limits) {
     if (seconds < limits.job_seconds) field.add(new Option(duration(seconds), String(seconds)));
 
   /** Return what the time is used for. @param {Chosen} chosen */
-  function use({ preset, plans, goal, tunes, kept }) {
+  function use({ preset, plans, captured, goal, tunes, kept }) {
     if (kept && !tunes) return UNCOUNTED;
     if (goal) return MEETS;
+    if (captured && plans && limits.training) return PHOTOGRAPHS;
     if (tunes) return TUNES;
     if (preset === "fast") return UNUSED;
     return plans && limits.training ? FILLS : FITS;

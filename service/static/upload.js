@@ -35,7 +35,7 @@ export function uploader(callbacks) {
    * @param {string} idempotencyKey unchanged in repetitions, so that a job is not created twice if a response was lost
    */
   function send(submission, idempotencyKey) {
-    const view = progressView(submission.file, () => request?.abort());
+    const view = progressView(submission, () => request?.abort());
     card.replaceChildren(...view.children);
     card.hidden = false;
     window.addEventListener("beforeunload", warn);
@@ -83,14 +83,17 @@ export function uploader(callbacks) {
  * @param {{progress: (sent: number) => void, accepted: (job: any) => void, failed: (problem: Problem) => void,
  *   aborted: () => void}} then
  */
-function post({ file, options }, idempotencyKey, then) {
+function post({ file, capture, options }, idempotencyKey, then) {
   const request = new XMLHttpRequest(); // fetch does not report upload progress
+  const form = new FormData();
+  if (capture) form.append("capture", capture);
+  form.append("file", file);
   const query = new URLSearchParams({ name: file.name, options: JSON.stringify(options) });
   request.open("POST", `/v1/jobs?${query}`);
   const headers = {
     ...authorization(),
-    "Content-Type": "application/octet-stream",
     "Idempotency-Key": idempotencyKey,
+    ...(!capture && { "Content-Type": "application/octet-stream" }), // else the browser's, of a form
   };
   for (const [name, value] of Object.entries(headers)) request.setRequestHeader(name, value);
   request.upload.onprogress = (event) => then.progress(event.loaded);
@@ -100,15 +103,16 @@ function post({ file, options }, idempotencyKey, then) {
   };
   request.onerror = () => then.failed(unreachable());
   request.onabort = then.aborted;
-  request.send(file);
+  request.send(capture ? form : file);
   return request;
 }
 
 /**
- * @param {File} file
+ * @param {Submission} submission
  * @param {() => void} abort
  */
-function progressView(file, abort) {
+function progressView({ file, capture }, abort) {
+  const size = file.size + (capture?.size ?? 0);
   const bar = el("progress", { max: 1, value: 0, "aria-labelledby": "upload-title" });
   const [done, left] = [el("span", {}, "0%"), el("span", {}, "")];
   const started = performance.now();
@@ -121,11 +125,14 @@ function progressView(file, abort) {
   ];
   /** @param {number} loaded */
   function update(loaded) {
-    const fraction = file.size ? Math.min(1, loaded / file.size) : 1;
+    const fraction = size ? Math.min(1, loaded / size) : 1;
     const spent = (performance.now() - started) / 1000;
     bar.value = fraction;
-    done.textContent = `${bytes(loaded)} of ${bytes(file.size)} · ${percent(fraction)}`;
-    if (fraction >= 1) left.textContent = "The service checks the scene…";
+    done.textContent = `${bytes(Math.min(loaded, size))} of ${bytes(size)} · ${percent(fraction)}`;
+    if (fraction >= 1)
+      left.textContent = capture
+        ? "The service checks the scene and its photographs…"
+        : "The service checks the scene…";
     else if (spent > 1) left.textContent = `${roughly((spent / fraction) * (1 - fraction))} left`; // the first second is not representative
     setTitle(`${percent(fraction)} ${file.name}`);
   }

@@ -1,7 +1,8 @@
 """``JobStorage``: the data folder, which one service uses at a time, and the files of jobs in it.
 
-    incoming/TOKEN.part          an upload in progress
+    incoming/TOKEN.part          an upload in progress, or the files of an archive
     jobs/ID/scene.ENDING         the complete upload: ply, sog, spz, splat, ksplat or glb
+    jobs/ID/capture/             cameras and photographs of the scene; their files may be those of other jobs, too
     jobs/ID/work-TOKEN/          files of a running job process
     jobs/ID/checkpoint*.npz      checkpoints of training, kept until the job ends
     jobs/ID/result/              the result, renamed to this when it is complete and on the disk
@@ -45,9 +46,10 @@ RESERVE_BYTES = 1 << 20  # to open an SQLite database and change it takes 100 kB
 _UPLOAD = re.compile(r"[0-9a-f]{16}\.part")
 
 RESULT = "result"  # name of the folder of a job's result
+CAPTURE = "capture"  # name of the folder of its photographs and their cameras
 UNFINISHED = ("work-*", ".*.part")  # in a job's folder: work folders, and checkpoints being written
 
-JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", "checkpoint*.npz", "decoded.ply", "decoded.json")
+JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", CAPTURE, "checkpoint*.npz", "decoded.ply", "decoded.json")
 """Patterns of all files that the service creates in a job's folder."""
 
 
@@ -104,10 +106,13 @@ class JobStorage:
 
     # Files of a job ---------------------------------------------------------------------------------------------------
 
-    def adopt(self, upload: Path, job_id: str, name: str = UPLOAD_FILES[0]) -> None:
-        """Move a complete upload to the folder of a job; ``name`` is one of :data:`UPLOAD_FILES`."""
+    def adopt(self, upload: Path, job_id: str, name: str = UPLOAD_FILES[0], capture: Path | None = None) -> None:
+        """Move a complete upload to the folder of a job, and the folder ``capture`` if there is one; ``name`` is one of
+        :data:`UPLOAD_FILES`."""
         folder = self.jobs / job_id
         folder.mkdir()
+        if capture is not None and capture.exists():
+            capture.rename(folder / CAPTURE)
         upload.rename(folder / name)
         sync_folder(folder)
         sync_folder(self.jobs)
@@ -130,13 +135,23 @@ class JobStorage:
         for path in (self.jobs / job_id).glob("checkpoint*.npz"):
             self.discard(path)
 
+    def link_capture(self, job_id: str, folder: Path) -> None:
+        """Make a folder with links to all files of a job's capture."""
+        shutil.copytree(self.jobs / job_id / CAPTURE, folder, copy_function=os.link)
+
+    def capture_files(self, job_id: str) -> list[str]:
+        """Return the names of all files of a job's capture, relative to the job's folder; none if it has none."""
+        folder = self.jobs / job_id
+        return sorted(str(path.relative_to(folder)) for path in (folder / CAPTURE).rglob("*") if path.is_file())
+
     def reclaimable_files(self, job_id: str) -> list[Path]:
-        """Return the files that an ended job can do without, if they exist: its upload and its decoded scene."""
-        return [path for path in (self.upload(job_id), self.decoded(job_id)) if path.exists()]
+        """Return what an ended job can do without, if it exists: its upload, its capture and its decoded scene."""
+        paths = self.upload(job_id), self.jobs / job_id / CAPTURE, self.decoded(job_id)
+        return [path for path in paths if path.exists()]
 
     def reclaimable_bytes(self, job_id: str) -> int:
         """Return the bytes that an ended job can do without."""
-        return sum(path.stat().st_size for path in self.reclaimable_files(job_id))
+        return sum(map(tree_bytes, self.reclaimable_files(job_id)))
 
     def upload_name(self, job_id: str) -> str | None:
         """Return the name of the job's upload; None if there is none."""
@@ -190,7 +205,7 @@ class JobStorage:
 
     def job_bytes(self, job_id: str) -> int:
         """Return the size of all files of a job, bytes."""
-        return sum(path.stat().st_size for path in (self.jobs / job_id).rglob("*") if path.is_file())
+        return tree_bytes(self.jobs / job_id)
 
     # Removal ----------------------------------------------------------------------------------------------------------
 
@@ -339,6 +354,11 @@ def _complete_summary(text: bytes, sizes: dict[str, int], container: str) -> dic
         return summary if complete and {"count", "seconds", "cpu_seconds"} <= summary.keys() else None
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
+
+
+def tree_bytes(path: Path) -> int:
+    """Return the size of a file, or of all files below a folder, bytes."""
+    return sum(each.stat().st_size for each in (path, *path.rglob("*")) if each.is_file())
 
 
 def sync_folder(folder: Path) -> None:

@@ -93,6 +93,12 @@ class Store:
         """Return the job that ``owner`` submitted with this key; None if there is none."""
         return self._one(sa.select(Job).where(Job.owner == owner, Job.idempotency_key == key))
 
+    def with_capture(self, owner: str, reference: str) -> list[str]:
+        """Return the ids of the jobs of an owner that have kept this capture, latest first."""
+        same = Job.options["capture"].as_string() == reference
+        query = sa.select(Job.id).where(Job.owner == owner, Job.upload_kept, same).order_by(Job.number.desc())
+        return self._all(query)
+
     def listing(self, owner: str, *, limit: int, before: int | None = None, state: State | None = None) -> list[Job]:
         """Return up to ``limit`` jobs of an owner with a number below ``before``, newest first."""
         query = sa.select(Job).where(Job.owner == owner).order_by(Job.number.desc()).limit(limit)

@@ -87,7 +87,7 @@ def test_goals_and_cached_sensitivity(scene, tmp_path):
 
 
 def test_settings_from_the_command_line(scene, tmp_path):
-    words = "-p", "fast", "--set", "sh_neighbors=16", "--seed", "3"
+    words = "-p", "fast", "--set", "sh_neighbors=16", "--set", "seed=3"
     report = json.loads(run("compress", scene, "-o", tmp_path / "a.zip", "--json", *words).stdout)
     assert (report["source_count"], report["container_bytes"]) == (600, (tmp_path / "a.zip").stat().st_size)
     settings = json.loads(run("info", tmp_path / "a.zip", "--json").stdout)["details"]["settings"]

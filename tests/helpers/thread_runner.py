@@ -67,8 +67,8 @@ class _ItemThread:
         if arguments.get("settings", {}).get("encode", {}).get("seed") == HELD_SEED:
             progress("order", 0.0)
             self._killed.wait()
-        for name in ("source", "work", "checkpoint"):
-            if arguments.get(name) is not None:
+        for name in ("source", "work", "checkpoint", "views"):
+            if arguments.get(name):
                 arguments[name] = self._folder + arguments[name]
         module, _, name = self._item.function.partition(":")
         return getattr(importlib.import_module(module), name)(arguments, progress)

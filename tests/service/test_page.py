@@ -61,6 +61,7 @@ def test_upload_compression_and_download(visit, service, local, tmp_path):
     page.get_by_text("300 Gaussians").wait_for()
     page.locator("#file").focus()
     page.keyboard.press("Tab")
+    page.keyboard.press("Tab")  # past the photographs
     page.keyboard.press("ArrowUp")  # from balanced to fast
     for _ in range(4):
         page.keyboard.press("Tab")

@@ -49,7 +49,7 @@ def test_expected_stages(name, tmp_path):
     options = parse_options(json.dumps({**JOBS[name], "for_research": True}))
     scene, reported = tmp_path / "scene.ply", []
     scene.write_bytes(SMALL)
-    settings = kissgs.Settings.model_validate(options.model_dump(exclude={"format", "evaluate", "origin"}))
+    settings = kissgs.Settings.model_validate(options.model_dump(include=set(kissgs.Settings.model_fields)))
     kissgs.compress(
         scene,
         settings=settings,

@@ -302,7 +302,9 @@ def read_colmap(folder: Path) -> Capture:
         posed_images.append(PosedImage(record.name, photo, where, viewmat, intrinsics[record.camera]))
     if not posed_images:
         raise InvalidViewsError(f"{images_path} has no images; reconstruct the capture again")
-    return Capture(tuple(posed_images), _root(folder), f"COLMAP model {folder}")
+    root = _root(folder)
+    files = {str(path.resolve().relative_to(root)): path for path in (cameras_path, images_path)}
+    return Capture(tuple(posed_images), root, f"COLMAP model {folder}", files)
 
 
 def _is_model(folder: Path, suffix: str) -> bool:

@@ -2,19 +2,40 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from kissgs.cameras.captures.colmap import MODEL_FOLDERS, find_colmap, missing_part, read_colmap
-from kissgs.cameras.captures.photos import Capture, FoundPhoto, PosedImage, find_photos, searched_folders
-from kissgs.cameras.captures.transforms_json import read_split_transforms, read_transforms, similarities
-from kissgs.cameras.photographs import QUARTER_TURNS, full_window, orientation, read_photo_header
-from kissgs.cameras.views import View, Views
+from kissgs.cameras.captures.photos import (
+    IMAGES,
+    Capture,
+    FoundPhoto,
+    PosedImage,
+    find_photos,
+    is_absolute,
+    open_file,
+    searched_folders,
+    without_parents,
+)
+from kissgs.cameras.captures.transforms_json import (
+    DATAPARSER_TRANSFORMS,
+    dataparser_file,
+    read_split_transforms,
+    read_transforms,
+    similarities,
+)
+from kissgs.cameras.photographs import QUARTER_TURNS, full_window, orientation, read_photo, read_photo_header
+from kissgs.cameras.views import View, Views, black
 from kissgs.core.array_types import Float32
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidViewsError
+from kissgs.io.files import atomic_file
 from kissgs.rendering.camera import Camera
 
 DEFAULT_RESOLUTION = 1600
@@ -32,6 +53,7 @@ def load_views(
     images: Path | None = None,
     resolution: int | None = None,
     hold_out: int = HOLD_OUT,
+    unpacked: bool = False,
 ) -> Views:
     """Load the views of a capture; of its photographs, only the headers are read.
 
@@ -60,6 +82,8 @@ def load_views(
         resolution: maximum of the longer side, pixels; None for 1600.
         hold_out: every ``hold_out``-th view in order of names, starting with the first, is held out; 0 for none. A
             split that the capture defines takes precedence.
+        unpacked: ``path`` is the folder of an archive from elsewhere. The capture is its uppermost folder with cameras,
+            and photographs are looked for in it only, wherever a camera file says they are.
 
     Raises:
         InvalidViewsError: there is no capture, its files are damaged, photographs are missing or of another aspect
@@ -73,12 +97,13 @@ def load_views(
         raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
     path = Path(path)
     try:
-        capture = _read_capture(path)
-        moves = similarities((path if path.is_dir() else path.parent, capture.root), capture.applied)
+        path = _uppermost_with_cameras(path) if unpacked else path
+        capture, folder = _read_capture(path), path if path.is_dir() else path.parent
+        moves = similarities(dataparser_file((folder, capture.root)), capture.applied)
     except OSError as error:  # even testing for a path fails without permission or if a name is too long
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
     names = [posed.photo for posed in capture.images]
-    photos = find_photos(names, capture.root, scale=scale, images=images)
+    photos = find_photos(names, capture.root, scale=scale, images=images, inside=unpacked)
     white = capture.white and (photos is None or read_photo_header(photos[0].path).transparent)
     background = np.full(3, float(white), dtype=np.float32)
     limit = DEFAULT_RESOLUTION if resolution is None else resolution
@@ -125,6 +150,14 @@ def _read_capture(path: Path) -> Capture:
         missing_part(path)
         or f"{path} has no cameras: neither a COLMAP model (in it or in {folders}) nor a transforms.json"
     )
+
+
+def _uppermost_with_cameras(path: Path) -> Path:
+    """Return the first of ``path`` and the folders in it, the uppermost first, that has cameras; else ``path``."""
+    below = sorted((each for each in path.rglob("*") if each.is_dir()), key=lambda each: (len(each.parts), each))
+    jsons = ("transforms.json", "transforms_train.json")
+    has_cameras = (each for each in (path, *below) if find_colmap(each) or any((each / n).is_file() for n in jsons))
+    return next(has_cameras, path)
 
 
 def _view(
@@ -200,3 +233,60 @@ def _split(views: Sequence[tuple[View, str | None]], hold_out: int) -> tuple[tup
     if hold_out == 0 or len(everything) < 2:  # a single view is for training
         return everything, ()
     return tuple(view for i, view in enumerate(everything) if i % hold_out), everything[::hold_out]
+
+
+# Packing for a service.
+
+
+def pack_capture(path: Path, destination: Path, progress: Progress = silent) -> None:
+    """Pack what :func:`load_views` uses of a capture into a zip, from which a service reads the same views: its camera
+    files, and the photographs of its views, those that are used reduced without further loss. Equal captures make equal
+    files."""
+    load_views(path)  # refuses what a service would refuse
+    capture = _read_capture(path)
+    photos = find_photos([posed.photo for posed in capture.images], capture.root) or ()
+    packed = {_packed_name(posed, photo): (posed, photo) for posed, photo in zip(capture.images, photos, strict=False)}
+    if len(packed) < len({photo.path for photo in photos}):
+        raise InvalidViewsError(f"two photographs of {path} have the same name in different folders; rename one")
+    cameras, folder = dict(capture.files), path if path.is_dir() else path.parent
+    if (dataparser := dataparser_file((folder, capture.root))) is not None:
+        cameras[DATAPARSER_TRANSFORMS] = dataparser
+    with atomic_file(destination) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, camera_file in sorted(cameras.items()):
+            archive.writestr(_entry(name), _content(camera_file), zipfile.ZIP_DEFLATED)
+        for done, (name, (posed, photo)) in enumerate(sorted(packed.items())):
+            progress("pack", done / len(packed))
+            archive.writestr(_entry(name), _packed_photo(posed, photo))
+    progress("pack", 1.0)
+
+
+def _packed_name(posed: PosedImage, photo: FoundPhoto) -> str:
+    """Return the name under which :func:`find_photos` finds a photograph inside the root of an unpacked capture."""
+    parts = without_parents(posed.photo).parts
+    if is_absolute(posed.photo):
+        parts = (IMAGES if photo.factor == 1 else f"{IMAGES}_{photo.factor}", *parts[1:])
+    elif len(parts) > 1:
+        parts = (photo.folder.name, *parts[1:])  # perhaps that of a scaled copy
+    return "/".join(parts)
+
+
+def _packed_photo(posed: PosedImage, photo: FoundPhoto) -> bytes:
+    """Return the file of a photograph, or that of the reduced one. Only opaque ones are reduced, since transparent ones
+    say what is behind the scene, and only if the camera file has the size to which the intrinsics belong."""
+    header, sized = read_photo_header(photo.path), posed.intrinsics.width and posed.intrinsics.height
+    reduced = _reduced((header.width, header.height), DEFAULT_RESOLUTION)
+    if header.transparent or not sized or reduced == (header.width, header.height):
+        return _content(photo.path)
+    file = io.BytesIO()
+    pixels = read_photo(photo.path, *reduced, black())
+    Image.fromarray(pixels).save(file, "webp", lossless=True, quality=0, method=0)
+    return file.getvalue()
+
+
+def _content(path: Path) -> bytes:
+    with open_file(path) as (file, _):
+        return file.read()
+
+
+def _entry(name: str) -> zipfile.ZipInfo:
+    return zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))

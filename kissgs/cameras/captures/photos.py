@@ -17,9 +17,10 @@ from typing import Literal
 import numpy as np
 from pydantic import ValidationError
 
-from kissgs.cameras.photographs import EXTENSIONS, NO_DISTORTION, Distortion, Lens
+from kissgs.cameras.photographs import NO_DISTORTION, Distortion, Lens
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
+from kissgs.formats import PHOTOGRAPHS
 from kissgs.io.files import open_scene_file, reason_of
 
 MAX_JSON_BYTES = 1 << 28  # maximum bytes of a JSON file; ten thousand cameras take about 10 MB
@@ -109,6 +110,7 @@ class Capture:
     images: tuple[PosedImage, ...]  # one or more
     root: Path  # folder that paths of photographs are relative to
     source: str  # description of the files that were read, for messages
+    files: dict[str, Path]  # these files by their names relative to ``root``, under which any capture may have them
     white: bool = False  # whether transparent pixels are composited over white
     applied: Float64[np.ndarray, "4 4"] | None = None  # rotation and translation from a former model to the poses
 
@@ -148,19 +150,19 @@ class _SearchFolder:
 
 
 def find_photos(
-    names: Sequence[str], root: Path, *, scale: int | None = None, images: Path | None = None
+    names: Sequence[str], root: Path, *, scale: int | None = None, images: Path | None = None, inside: bool = False
 ) -> tuple[FoundPhoto, ...] | None:
     """Find the file of each photograph, in order; None if there is no folder of photographs. The default is the
     full-size folder, else that of scale 4, at which the protocol of 3DGS trains outdoor scenes, else the largest;
     ``input`` if there is no ``images`` of any scale. If no file has the exact name, one with another Unicode form,
     extension or case is accepted; a folder may have another Unicode form, too. An absolute path that does not exist is
-    searched for in the capture's folder."""
+    searched for in the capture's folder. With ``inside``, no file outside ``root`` is looked at."""
     if images is not None and scale is not None:
         raise InvalidViewsError("--images and --scale exclude each other; give only one of them")
     listing = _FolderListing()
     if images is None:
         searched = [
-            [_search_folder(folder, tried, root, scale, listing) for folder, tried in _candidates(name, root)]
+            [_search_folder(folder, tried, root, scale, listing) for folder, tried in _candidates(name, root, inside)]
             for name in names
         ]
     else:
@@ -186,7 +188,7 @@ def find_photos(
 
 def searched_folders(names: Sequence[str], root: Path) -> str:
     """Describe the folders in which :func:`find_photos` searches for these names, without scaled ones."""
-    folders = dict.fromkeys(folder for name in names for folder, _ in _candidates(name, root))
+    folders = dict.fromkeys(folder for name in names for folder, _ in _candidates(name, root, inside=False))
     searched = []
     for folder in folders:
         if folder != root:
@@ -200,6 +202,11 @@ def searched_folders(names: Sequence[str], root: Path) -> str:
 def is_absolute(name: str) -> bool:
     """Whether a photograph's name is an absolute path, of POSIX or of Windows."""
     return re.match(r"[A-Za-z]:[/\\]|[/\\]", name) is not None
+
+
+def without_parents(name: str) -> PurePosixPath:
+    """Return a path without its parts "..", with forward slashes."""
+    return PurePosixPath(*(part for part in PurePosixPath(name.replace("\\", "/")).parts if part != ".."))
 
 
 class _FolderListing:
@@ -275,7 +282,7 @@ def _list(folder: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
         raise InvalidViewsError(f"cannot read {folder}: {reason_of(error)}") from error
     stems: dict[str, list[str]] = {}
     for file in names:
-        if Path(file).suffix.lower() in EXTENSIONS:
+        if Path(file).suffix.lower() in PHOTOGRAPHS:
             stems.setdefault(_stem(composed(file)).lower(), []).append(file)
     return {**{composed(file): file for file in names}, **{file: file for file in names}}, stems
 
@@ -283,7 +290,7 @@ def _list(folder: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
 def _stem(name: str) -> str:
     # A name without extension may have a dot, as in frame.0001, so only image extensions count.
     path = PurePosixPath(name)
-    return path.stem if path.suffix.lower() in EXTENSIONS else path.name
+    return path.stem if path.suffix.lower() in PHOTOGRAPHS else path.name
 
 
 def _search_folder(
@@ -306,16 +313,13 @@ def _search_folder(
     return _SearchFolder(variants[factor], factor, names, has_photos)
 
 
-def _candidates(name: str, root: Path) -> list[tuple[Path, tuple[str, ...]]]:
+def _candidates(name: str, root: Path, inside: bool) -> list[tuple[Path, tuple[str, ...]]]:
     """Return the folders of photographs that ``name`` may refer to, in order, each with the names to try in it."""
-    path = PurePosixPath(name.replace("\\", "/"))
+    path = without_parents(name) if inside else PurePosixPath(name.replace("\\", "/"))
     if is_absolute(name):  # the capture may have been moved
         names = (path.name,)
-        return [
-            (Path(path.parent), names),
-            (root / path.parent.name, names),
-            (root / IMAGES, _suffixes(path.parts[1:])),
-        ]
+        moved = [(root / path.parent.name, names), (root / IMAGES, _suffixes(path.parts[1:]))]
+        return moved if inside else [(Path(path.parent), names), *moved]
     parts = path.parts
     ups = next((i for i, part in enumerate(parts) if part != ".."), len(parts))
     folder = root.joinpath(*parts[:ups])

@@ -249,7 +249,8 @@ def read_transforms(path: Path) -> Capture:
     splits = _splits(path, document)
     if splits is not None:
         images = [replace(image, split=splits[key]) for image in images if (key := composed(image.name)) in splits]
-    return Capture(tuple(images), path.parent, f"cameras of {path}", _is_synthetic(document), _applied(path, document))
+    white, applied = _is_synthetic(document), _applied(path, document)
+    return Capture(tuple(images), path.parent, f"cameras of {path}", {"transforms.json": path}, white, applied)
 
 
 def read_split_transforms(folder: Path) -> Capture:
@@ -260,17 +261,22 @@ def read_split_transforms(folder: Path) -> Capture:
     document = _read(train_path, _Transforms)
     train, white = _posed_images(train_path, document), _is_synthetic(document)
     if test_path is None:
-        return Capture(tuple(train), folder, f"cameras of {train_path}", white)
+        return Capture(tuple(train), folder, f"cameras of {train_path}", {train_path.name: train_path}, white)
     test = _posed_images(test_path, _read(test_path, _Transforms))
     images = [*(replace(image, split="train") for image in train), *(replace(image, split="test") for image in test)]
-    return Capture(tuple(images), folder, f"cameras of {train_path} and {test_path.name}", white)
+    files = {path.name: path for path in (train_path, test_path)}
+    return Capture(tuple(images), folder, f"cameras of {train_path} and {test_path.name}", files, white)
 
 
-def similarities(folders: Iterable[Path], applied: Float64[np.ndarray, "4 4"] | None) -> tuple[Similarity, ...]:
-    """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have. The first of
-    ``folders`` that has a ``dataparser_transforms.json`` counts."""
+def dataparser_file(folders: Iterable[Path]) -> Path | None:
+    """Return the ``dataparser_transforms.json`` of the first of ``folders`` that has one."""
+    return next((path for folder in folders if (path := folder / DATAPARSER_TRANSFORMS).is_file()), None)
+
+
+def similarities(path: Path | None, applied: Float64[np.ndarray, "4 4"] | None) -> tuple[Similarity, ...]:
+    """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have; ``path`` is
+    that of its ``dataparser_transforms.json``."""
     found = []
-    path = next((path for folder in folders if (path := folder / DATAPARSER_TRANSFORMS).is_file()), None)
     if path is not None:
         document = _read(path, _DataparserTransforms)
         matrix = _similarity(document.transform, f"{path}, transform")

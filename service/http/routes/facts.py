@@ -39,6 +39,7 @@ async def get_limits(context: Service) -> Limits:
         job_memory_bytes=settings.job_memory,
         max_wait_seconds=MAX_WAIT_SECONDS,
         max_upload_bytes=settings.max_upload_bytes,
+        max_capture_bytes=settings.max_capture_bytes,
         max_header_bytes=settings.max_header_bytes,
         max_gaussians=settings.max_gaussians,
         max_queue=settings.max_queue,

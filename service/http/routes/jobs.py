@@ -60,14 +60,15 @@ SubmittedJob = Annotated[Job, Depends(_submit)]
 Wait = Annotated[float, Query(description="Maximum wait for the end of the job, seconds.", ge=0, le=MAX_WAIT_SECONDS)]
 
 _REFUSALS = (
-    *("invalid-scene", "unsupported", "key-reused", "media-type", "too-large", "upload-timeout", "upload-aborted"),
-    *("queue-full", "too-many-jobs", "too-many-uploads", "disk-full", "stopping"),
+    *("invalid-scene", "invalid-views", "unsupported", "gone", "key-reused", "media-type", "too-large"),
+    *("upload-timeout", "upload-aborted", "queue-full", "too-many-jobs", "too-many-uploads", "disk-full", "stopping"),
 )
 
 _BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "description": "The scene: the field `file` of a form with an optional field `options`, or the body itself.",
+        "description": "The scene: the field `file` of a form with the optional fields `capture` and `options`, or the "
+        "body itself.",
         "content": {
             "multipart/form-data": {
                 "schema": {
@@ -76,6 +77,13 @@ _BODY: dict[str, Any] = {
                     "additionalProperties": False,
                     "properties": {
                         "file": {"type": "string", "format": "binary", "description": "The scene."},
+                        "capture": {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "Photographs of the scene and their cameras, a COLMAP model or "
+                            "transforms.json, as zip or tar: jobs with a goal train on them. Other jobs name it by "
+                            "its SHA-256, in the option `capture`.",
+                        },
                         "options": {"$ref": "#/components/schemas/JobOptions"},
                     },
                 },

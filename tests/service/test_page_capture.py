@@ -1,0 +1,148 @@
+"""Photographs on the web page in Chromium; oracle: kissgs.compress with the same photographs."""
+
+import io
+import json
+import zipfile
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+from helpers.captured_scene import SCENE, write_capture
+from helpers.service import SLOW
+from helpers.viewers import NO_GPU, chromium
+
+import kissgs
+from kissgs.io.ply import write_ply
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium(NO_GPU) as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_capture(tmp_path_factory.mktemp("capture") / "statue", names=[f"{n}.png" for n in range(9)])
+
+
+@pytest.fixture(scope="module")
+def archive(folder):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as packed:
+        for path in folder.rglob("*.*"):
+            packed.write(path, f"statue/{path.relative_to(folder)}")
+    return {"name": f"{'photographs_' * 10}.zip", "mimeType": "", "buffer": buffer.getvalue()}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    file = io.BytesIO()
+    write_ply(file, SCENE)
+    return {"name": "statue.ply", "mimeType": "", "buffer": file.getvalue()}
+
+
+@pytest.fixture
+def page(browser, service, scene):
+    context, errors = browser.new_context(), []
+    page = context.new_page()
+    page.set_default_timeout(20_000)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(service.url)
+    page.locator("#drop").wait_for()
+    page.set_input_files("#file", scene)
+    yield page
+    context.close()
+    assert errors == []
+
+
+def newest(service):
+    return service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
+
+
+def test_photographs_make_the_container_of_the_command_line(page, service, folder, scene, archive, tmp_path):
+    page.set_input_files("#capture", archive)
+    page.locator("#capture-title", has_text=".zip").wait_for()
+    page.get_by_label("Also measure quality").check()
+    page.get_by_role("button", name="Compress").click()
+    page.locator("#job .ratio").wait_for()
+    local = kissgs.compress(scene["buffer"], views=kissgs.load_views(folder), evaluate=True)
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download container").click()
+    download.value.save_as(tmp_path / "x.zip")
+    assert (tmp_path / "x.zip").read_bytes() == local.to_zip()
+    shown = page.locator("#job .facts > div", has_text="PSNR to photographs").inner_text()
+    mean = local.report.evaluation.mean
+    assert f"{mean.candidate.psnr:.2f} dB" in shown
+    assert f"{mean.reference.psnr:.2f} dB" in shown
+
+
+def test_a_goal_trains_on_the_photographs(page, service, archive):
+    """The page chooses what the command line does; the user sees it, and may change it."""
+    pytest.importorskip("torch")
+    goal, keep, tune = (page.locator(f"#{name}") for name in ("goal", "keep", "finetune"))
+    goal.select_option("Maximum PSNR loss")
+    assert "assuming that the scene has 30 dB" in page.locator("#goal-note").inner_text()
+    assert (keep.input_value(), tune.is_checked()) == ("", False)
+    page.set_input_files("#capture", archive)
+    assert "against held-out photographs" in page.locator("#goal-note").inner_text()
+    assert (keep.locator("option:checked").inner_text(), tune.is_checked()) == ("As many as the goal needs", True)
+    page.get_by_role("button", name="Remove").click()
+    assert (keep.input_value(), tune.is_checked()) == ("", False)
+    page.set_input_files("#capture", archive)
+    page.route("**/v1/jobs?**", lambda route: route.abort())
+    with page.expect_request("**/v1/jobs?**") as sent:
+        page.get_by_role("button", name="Compress").click()
+    options = json.loads(parse_qs(urlsplit(sent.value.url).query)["options"][0])
+    assert options["encode"] == {"max_psnr_drop": 0.1}
+    assert (options["compact"], options["finetune"]) == ({"auto_count": True}, {"enabled": True})
+    page.get_by_text("The connection failed or was interrupted").wait_for()
+    page.unroute("**/v1/jobs?**")
+    page.get_by_role("button", name="Try again").click()
+    page.locator("#job-title").wait_for()
+    job = newest(service)
+    service.cancel(job)
+    assert job["options"]["capture"].startswith("sha256:")
+
+
+def test_what_is_no_archive_is_refused_before_the_upload(page, archive):
+    page.set_input_files("#capture", {"name": "photos.rar", "mimeType": "", "buffer": b"x"})
+    assert page.locator("#capture-error").inner_text() == (
+        "photos.rar is not an archive: pack the photographs as .zip or .tar."
+    )
+    page.set_input_files("#capture", archive)
+    assert page.locator("#capture-error").inner_text() == ""
+    for width in (360, 375, 1280):
+        page.set_viewport_size({"width": width, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_a_scene_and_its_photographs_are_dropped_anywhere(page, scene, archive):
+    page.evaluate(
+        """(names) => {
+            const data = new DataTransfer();
+            for (const name of names) data.items.add(new File([new Uint8Array(9)], name));
+            window.dispatchEvent(new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true }));
+        }""",
+        ["photos.tar.gz", "scene.spz"],
+    )
+    page.locator("#capture-title", has_text="photos.tar.gz, 9 bytes").wait_for()
+    page.locator("#file-title", has_text="scene.spz").wait_for()
+
+
+def test_a_repeated_job_names_the_photographs(page, service, scene, archive):
+    page.get_by_label("Fast").check()
+    page.set_input_files("#capture", archive)
+    page.get_by_role("button", name="Compress").click()
+    page.locator("#job .ratio").wait_for()
+    reference = newest(service)["options"]["capture"]
+    cancelled = service.submit(scene["buffer"], json.dumps({**json.loads(SLOW), "capture": reference}))
+    service.cancel(cancelled)
+    page.goto(f"{service.url}/#{cancelled['id']}")
+    page.get_by_role("button", name="Try again").click()
+    page.locator("#capture-title", has_text="The photographs of the earlier job").wait_for()
+    page.set_input_files("#file", scene)
+    page.get_by_label("Fast").check()
+    page.get_by_role("button", name="Compress").click()
+    page.locator("#job .ratio").wait_for()
+    repeated = newest(service)
+    assert (repeated["state"], repeated["options"]["capture"]) == ("succeeded", reference)
