@@ -77,7 +77,7 @@ class Decoder:
             process.kill()
 
     async def _run(self, job: Job, work: Path) -> None:
-        async def ignore(stage: str, fraction: float, note: str) -> None:
+        async def ignore(stage: str, fraction: float, note: str, left: float | None) -> None:
             pass
 
         source = f"{RESULT}/{container_file(job.options).name}"

@@ -258,6 +258,7 @@ def test_training_notes_are_shown(visit, start):
     changes = {"count": 100, "sparsify_steps": 1000, "refine_steps": 1000, "views": 24, "view_size": 48}
     job = service.submit(options=json.dumps({"preset": "fast", "compact": changes, "for_research": True}))
     page.goto(f"{service.url}/#{job['id']}")
+    page.locator("#job summary", has_text="Training").click()  # stages are folded away
     page.locator("#job .note", has_text="Gaussians, loss").wait_for()
     page.locator("#live", has_text="Training").wait_for(state="attached")
     assert "loss" not in page.locator("#live").inner_text()  # screen readers announce only the stage
