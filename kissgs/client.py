@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import functools
 import hashlib
 import json
 import re
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 from urllib.parse import urlsplit
 
-from kissgs.core.context import Progress, silent
+from kissgs.core.context import Progress, silent, with_seconds_left
 from kissgs.core.errors import (
     Cancelled,
     InvalidSceneError,
@@ -118,6 +119,7 @@ class Remote:
         target = Path(destination)
         kind = named_container(container, destination)
         refuse_existing(target, overwrite=overwrite)
+        share = functools.partial(Share, progress)
         status = self.submit(
             source,
             settings=settings,
@@ -125,11 +127,11 @@ class Remote:
             evaluate=evaluate,
             origin=origin,
             capture=capture,
-            progress=progress,
+            progress=share(0.0, 0.1),
         )
         try:
-            status = self.follow(status["id"], progress)
-            self.download(status, target, overwrite=overwrite, progress=progress)
+            status = self.follow(status["id"], share(0.1, 0.95))
+            self.download(status, target, overwrite=overwrite, progress=share(0.95, 1.0))
         except BaseException as error:
             if not isinstance(error, KissgsError) or isinstance(error, Cancelled):
                 with contextlib.suppress(KissgsError):  # the original error matters more
@@ -201,7 +203,7 @@ class Remote:
         Raises:
             KissgsError: the job failed or was cancelled.
         """
-        last = ""
+        last, receive = "", with_seconds_left(progress)
 
         def listen() -> None:
             nonlocal last
@@ -210,8 +212,7 @@ class Remote:
                 for number, event, data in _events(_checked(response)):
                     last = number
                     if event == "progress":
-                        # Without a note, only two arguments: receivers need not accept notes.
-                        progress(data["stage"], data["fraction"], *([data["note"]] if "note" in data else []))
+                        receive(data["stage"], data["fraction"], data.get("note", ""), data.get("seconds_left"))
                     elif data["state"] == "queued":
                         progress("queue", 0.0)
 
@@ -309,6 +310,18 @@ class Remote:
                 while time.monotonic() < end:  # in short steps: progress may raise
                     progress(WAIT, 0.0, f"not ready ({reason}); trying again for {time_limit}")
                     time.sleep(min(0.5, delay))
+
+
+class Share:
+    """Receiver of a part of a job, from one fraction of the whole to another; a part that begins again waits."""
+
+    def __init__(self, progress: Progress, start: float, end: float) -> None:
+        self._receive, self._start, self._end, self._latest = with_seconds_left(progress), start, end, start
+
+    def __call__(self, stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
+        """See :class:`kissgs.Progress`."""
+        self._latest = max(self._latest, self._start + fraction * (self._end - self._start))
+        self._receive(stage, self._latest, note, seconds_left)
 
 
 def _is_address(server: str) -> bool:

@@ -22,7 +22,7 @@ from typing import Any
 from urllib.parse import quote, unquote, urlsplit
 
 from kissgs._version import __version__
-from kissgs.core.context import Context, Progress, silent
+from kissgs.core.context import Context, JobProgress, Progress, silent
 from kissgs.core.errors import InvalidSceneError, KissgsError, UnsupportedError
 from kissgs.core.positions import WORLD
 from kissgs.formats import CONTAINERS, FORMATS, ending_of
@@ -176,6 +176,7 @@ def page_scene(
     source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, *, threads: int = 0, progress: Progress = silent
 ) -> PageScene:
     """Return a scene for the page: a SOG-XT or SOG container unchanged, any other as a ``.ply`` of equal values."""
+    progress = JobProgress(progress, [("read", 1.0), ("kernels", 1.0), ("cameras", 2.0), ("write", 1.0)])
     splats, cleaned, _ = open_scene(source, reading, threads, progress)
     found = _as_container(source, reading)
     if found is None:

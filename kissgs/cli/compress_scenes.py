@@ -25,7 +25,7 @@ from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
 from kissgs.cli.options import open_views
 from kissgs.cli.signals import stoppable
 from kissgs.cli.tables import report_table, streamed_table
-from kissgs.core.context import Progress, load_kernels, silent
+from kissgs.core.context import Progress, silent, with_seconds_left
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 from kissgs.formats import ContainerName
 from kissgs.io.files import move_into_place, open_scene_file, reason_of
@@ -61,8 +61,6 @@ class SceneCompression(BaseModel):
 
     def run(self, scene: str, target: Path | None, capture: Views | None, progress: Progress) -> Compressed:
         """Compress a scene; ``capture`` are the ``views``, loaded."""
-        if self.evaluate:  # reported here, because evaluation reports only one stage
-            load_kernels(progress)
         return compress(
             source(scene),
             target,
@@ -117,6 +115,7 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
 
         work = work_folder(target)
         say_when_interrupted(lambda: continuation(work) if work.exists() else NOTHING_LEFT)
+        forward = with_seconds_left(bar)
         bar("kernels", 0.0)
         from kissgs.streaming.compress import compress_streamed as run
 
@@ -126,10 +125,10 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
             runner = RayRunner(ray)
             ending.callback(runner.close)
 
-        def progress(stage: str, fraction: float, note: str = "") -> None:
+        def progress(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
             if stage == "scratch" and not options.quiet:
                 sys.stderr.write(f"kissgs: {note}\n")
-            bar(stage, fraction, note)
+            forward(stage, fraction, note, seconds_left)
 
         report = run(
             scene,

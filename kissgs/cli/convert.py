@@ -131,7 +131,7 @@ def convert(
         piped = str(target) == "-"
         if not piped:
             refuse_existing(target, overwrite=force)
-        with progress_bar(quiet) as progress:
+        with progress_bar(quiet, [("read", 1.0), ("write", 1.0)]) as progress:
             splats, cleaned = clean(read_scene(source(scene), reading, threads=common.threads, progress=progress))
             splats = splats if origin else in_world(splats)
             with stdout() if piped else atomic_file(target, overwrite=force) as file:

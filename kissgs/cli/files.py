@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
+from kissgs.core.context import JobProgress, Step, silent
 from kissgs.core.context import Progress as Receiver
-from kissgs.core.context import silent
 from kissgs.core.errors import InvalidSceneError, KissgsError, OutputError, UnsupportedError
 from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, SCENE_ENDINGS, named_manifest, names_folder
 
@@ -45,45 +45,69 @@ def output() -> Console:
     return console
 
 
-class _ElapsedColumn(ProgressColumn):
-    """Time since the command began. Rich's own column stops when a stage is complete: one task serves all stages."""
+STAGES = {
+    "reading": ("read", "decode", "partition", "upload"),
+    "preparing": ("kernels", "cluster", "scratch"),
+    "choosing cameras": ("cameras",),
+    "measuring what matters": ("sensitivity", "score"),
+    "drawing": ("targets", "render"),
+    "training": ("sparsify", "refine", "finetune", "refit"),
+    "merging": ("merge",),
+    "sorting": ("rate_distortion", "order", "forms", "codebook", "sort codebook", "rounding", "reorder"),
+    "compressing images": ("images",),
+    "checking": ("evaluate",),
+    "writing": ("write", "html", "download"),
+}
+"""Everyday names of stages; others are shown as they are."""
+
+_NAMES = {stage: name for name, stages in STAGES.items() for stage in stages}
+
+
+def roughly(seconds: float) -> str:
+    """Format an estimate with few digits: "about 7 s", "about 40 s", "about 3 min", "about 1.5 h"."""
+    if seconds < 55:
+        return f"about {max(1, round(seconds)) if seconds < 10 else 5 * round(seconds / 5)} s"
+    return f"about {max(1, round(seconds / 60))} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"
+
+
+class _TimeColumn(ProgressColumn):
+    """Time since the command began, and the time left, which the clock counts down between events."""
 
     def render(self, task: Task) -> Text:
-        """Return hours, minutes and seconds."""
-        return Text(str(timedelta(seconds=int(task.elapsed or 0))), style="progress.elapsed")
+        """Return for example "0:01:15, about 40 s left"."""
+        elapsed, end = task.elapsed or 0.0, task.fields["end"]
+        left = "" if end is None else f", {roughly(end - elapsed)} left" if end > elapsed else ", longer than expected"
+        return Text(f"{timedelta(seconds=int(elapsed))}{left}", style="progress.elapsed")
 
 
 @contextlib.contextmanager
-def progress_bar(quiet: bool) -> Iterator[Receiver]:
-    """Yield a receiver of progress events that draws a bar on standard error, if that is a terminal."""
+def progress_bar(quiet: bool, steps: Sequence[Step] = ()) -> Iterator[Receiver]:
+    """Yield a receiver of progress events that draws a bar on standard error, if that is a terminal. With ``steps``, it
+    gets the fractions of stages, see :class:`kissgs.core.context.JobProgress`; else those of the whole command."""
     console = Console(stderr=True)
     if quiet:
         yield silent
         return
-    columns = (
-        TextColumn("{task.description:>14}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        _ElapsedColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
+    columns = (BarColumn(), TextColumn("{task.percentage:>3.0f} %"), _TimeColumn(), TextColumn("{task.description}"))
     with (
         Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
         contextlib.ExitStack() as watch,
     ):
-        task = bar.add_task("", total=1.0, note="")
+        task = bar.add_task("", total=1.0, end=None)
         watched = False
 
-        def receive(stage: str, fraction: float, note: str = "") -> None:
+        def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
             nonlocal watched
             if stage == "kernels" and not watched:  # numba is about to be needed, and not before
                 from kissgs.core.numba_kernels import report_compilation
 
                 watched = True
                 watch.enter_context(report_compilation(console.print))
-            bar.update(task, description=stage, completed=fraction, note=note)
+            described = "; ".join(filter(None, [_NAMES.get(stage, stage), note]))
+            end = None if seconds_left is None else (bar.tasks[task].elapsed or 0.0) + seconds_left
+            bar.update(task, description=described, completed=fraction, end=end)
 
-        yield receive
+        yield JobProgress(receive, steps) if steps else receive
 
 
 # Input and output files of the commands, and the handling of failures among several inputs.

@@ -106,6 +106,7 @@ def get(
 ) -> None:
     """Wait for a job to finish, and download its container."""
     from kissgs.cli.tables import status_table
+    from kissgs.client import Share
     from kissgs.io.files import refuse_existing
 
     if output is not None and output.suffix.lower() not in ENDINGS:
@@ -116,8 +117,8 @@ def get(
         kind = named_container(known["options"].get("format"), output)  # services of older versions state none
         target = output or Path(f"{known['name']}{ending_of(kind)}")
         refuse_existing(target, overwrite=force)
-        status = remote.follow(job, progress)
-        remote.download(status, target, overwrite=force, progress=progress)
+        status = remote.follow(job, Share(progress, 0.0, 0.95))
+        remote.download(status, target, overwrite=force, progress=Share(progress, 0.95, 1.0))
     show(status_table(status, str(target)))
 
 
@@ -152,14 +153,15 @@ def _packed(views: Path | None, quiet: bool) -> Iterator[Path | None]:
 def _announcing(progress: Progress, server: str, quiet: bool) -> Progress:
     """Return a receiver that prints a line when the service refuses a request for the first time."""
     from kissgs.client import WAIT
+    from kissgs.core.context import with_seconds_left
 
-    said = quiet
+    said, forward = quiet, with_seconds_left(progress)
 
-    def receive(stage: str, fraction: float, note: str = "") -> None:
+    def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
         nonlocal said
         if stage == WAIT and not said:
             sys.stderr.write(f"kissgs: {server}: {note}\n")
             said = True
-        progress(stage, fraction, "" if stage == WAIT else note)
+        forward(stage, fraction, "" if stage == WAIT else note, seconds_left)
 
     return receive

@@ -152,6 +152,7 @@ def _listed(names: tuple[str, ...]) -> str:
 # ``kissgs render``: render images and animations of a scene. Heavy imports are deferred until it runs.
 
 FPS, QUALITY = 12, 85
+STEPS = [("read", 1.0), ("kernels", 1.0), ("cameras", 2.0), ("render", 5.0), ("write", 1.0)]  # seconds, about
 COLOURS = {"black": "#000000", "white": "#ffffff"}
 
 
@@ -279,7 +280,7 @@ def render(
         for path in (target, image.save_camera):
             if path is not None and str(path) != "-":
                 refuse_existing(path, overwrite=force)
-        with progress_bar(quiet) as progress:
+        with progress_bar(quiet, STEPS) as progress:
             job = RenderJob(
                 splats=load(Path(name), threads=threads, progress=progress, **asdict(common.reading())),
                 size=size,

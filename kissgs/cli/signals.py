@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from kissgs.cli import interrupts
+from kissgs.core.context import with_seconds_left
 from kissgs.core.errors import StopSearch
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ def stoppable(progress: Progress, searches: bool) -> Iterator[Progress]:
         yield progress
         return
     pending: list[int] = []
+    forward = with_seconds_left(progress)
     before = signal.getsignal(signal.SIGINT)
 
     def on_interrupt(number: int, frame: FrameType | None) -> None:
@@ -61,11 +63,11 @@ def stoppable(progress: Progress, searches: bool) -> Iterator[Progress]:
         signal.signal(signal.SIGINT, before)
         os.write(2, _STOPPING)  # at once: the next progress event may take a while
 
-    def receive(stage: str, fraction: float, note: str = "") -> None:
+    def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
         if pending:
             pending.clear()
             raise StopSearch
-        progress(stage, fraction, note)
+        forward(stage, fraction, note, seconds_left)
 
     signal.signal(signal.SIGINT, on_interrupt)
     try:

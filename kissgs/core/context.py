@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from kissgs.core.errors import StopSearch
 
@@ -16,8 +18,9 @@ from kissgs.core.errors import StopSearch
 class Progress(Protocol):
     """Receives progress events.
 
-    To stop the work, raise :class:`kissgs.Cancelled` from the call; to end a search for a goal with the best result so
-    far, raise :class:`kissgs.StopSearch`.
+    A receiver with a parameter ``seconds_left`` also gets the seconds that the call is expected to take from now on,
+    None while they are unknown. To stop the work, raise :class:`kissgs.Cancelled` from the call; to end a search for a
+    goal with the best result so far, raise :class:`kissgs.StopSearch`.
     """
 
     def __call__(self, stage: str, fraction: float, note: str = "", /) -> None:
@@ -25,7 +28,7 @@ class Progress(Protocol):
 
         Args:
             stage: name of the current stage ("read", "order", "codebook", …).
-            fraction: fraction of that stage that is done, 0 to 1.
+            fraction: fraction of the whole call that is done, 0 to 1; it never falls.
             note: text for the user: the state of training (Gaussians, loss, PSNR) and of a search for a goal; empty in
                 other stages.
         """
@@ -55,6 +58,130 @@ class SearchNote:
     def __call__(self, stage: str, fraction: float, note: str = "") -> None:
         """See :class:`Progress`."""
         self.progress(stage, fraction, "; ".join(filter(None, [self.note, note])))
+
+
+# ``JobProgress``: one fraction of a job that never falls, and the seconds left, from the progress of its stages.
+
+Step = tuple[str, float]  # an expected stage, and the seconds that it takes on some machine
+LOADING = "kernels"  # the stage that takes time only when it comes first
+PRIOR = 0.1  # share of all work after which what is measured counts as much as what is expected
+OVERDUE = 0.25  # expected rest of a stage that takes longer than expected, in units of the time it has taken
+PAST_DEADLINE = 0.05  # the same of a job
+
+
+class JobProgress:
+    """Receiver of the stages of a job, with the fraction of each. It passes on the fraction of the whole job and the
+    seconds left, and keeps the times of all stages.
+
+    The seconds left are those of the expected steps, corrected by the speed so far, and by the pace of the current one.
+    Steps that are left out are skipped, and a stage that comes again without being expected repeats the steps since it
+    came last. The fraction gains its share of what is left: where that turns out to be more, it becomes slower."""
+
+    def __init__(self, receiver: Progress, steps: Sequence[Step] = ()) -> None:
+        """Begin a job; see :meth:`expect` for ``steps``."""
+        self.seconds: dict[str, float] = {}
+        """Wall time of each stage."""
+        self.cpu_seconds = 0.0
+        """Processor time of this process up to the last :meth:`stop`."""
+        self.fraction = 0.0
+        """Fraction of the job that is done."""
+        self.seconds_left: float | None = None
+        """The expected seconds from the latest event to the end; None without expected steps."""
+        self._receive, self._cpu_began = with_seconds_left(receiver), time.process_time()
+        self._began = self._latest = self._stage_began = time.perf_counter()
+        self._stage: str | None = None
+        self._factor: dict[str, float] = {}  # by stage, of its seconds to those expected, the last time
+        self.expect(steps)
+
+    def expect(self, steps: Sequence[Step], deadline: Deadline | None = None) -> None:
+        """Set the steps from here on. Stages that are not among them count as parts of the current step. A job with a
+        ``deadline`` is expected to end then if it has steps enough."""
+        self._steps, self._at, self._deadline = list(steps), -1, deadline
+        self._expected = self._measured = 0.0  # seconds of the steps so far
+        self._prior = PRIOR * sum(seconds for _, seconds in steps)
+        self._step_began, self._step_first, self._step_fraction = time.perf_counter(), 0.0, 0.0
+
+    def __call__(self, stage: str, fraction: float, note: str = "") -> None:
+        """Receive the ``fraction`` of a stage; a new stage ends the current one."""
+        now, fraction = time.perf_counter(), min(max(float(fraction), 0.0), 1.0)
+        if stage != self._stage:
+            self._end_stage(now)
+            self._stage, self._stage_began = stage, now
+            self._enter(stage, fraction, now)
+        if self._at >= 0 and stage == self._steps[self._at][0]:
+            self._step_fraction = max(self._step_fraction, fraction)
+        if self._steps:
+            since = self._began if self.seconds_left is None else self._latest
+            self.seconds_left = self._left(now)
+            self.fraction += (1 - self.fraction) * (now - since) / max(now - since + self.seconds_left, 1e-9)
+        self._latest = now
+        self._receive(stage, self.fraction, note, self.seconds_left)
+
+    def stop(self) -> None:
+        """End the current stage."""
+        self._end_stage(time.perf_counter())
+        self.cpu_seconds = time.process_time() - self._cpu_began
+
+    def _end_stage(self, now: float) -> None:
+        if self._stage is not None:
+            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._stage_began
+        self._stage = None
+
+    def _enter(self, stage: str, fraction: float, now: float) -> None:
+        """Go to the next step of this stage, if it is one."""
+        known = [at for at, (name, _) in enumerate(self._steps) if name == stage]
+        following = [at for at in known if at > self._at]
+        if not known or (stage == LOADING and not following):
+            return
+        if self._at >= 0:
+            name, seconds = self._steps[self._at]
+            spent, seconds = now - self._step_began, max(seconds * (1 - self._step_first), 1e-3)
+            self._factor[name] = spent / seconds
+            if name != LOADING:  # which says little about the speed of other stages
+                self._expected, self._measured = self._expected + seconds, self._measured + spent
+        if not following:
+            self._steps[self._at + 1 :] = self._steps[known[-1] :]
+        self._at = following[0] if following else self._at + 1
+        self._step_began, self._step_first, self._step_fraction = now, fraction, fraction
+
+    def _slower(self, measured: float, expected: float) -> float:
+        """Return the factor on the seconds of steps to come, after ``measured`` ones instead of ``expected``."""
+        if min(measured, expected) <= 0:
+            return 1.0
+        return float((measured / expected) ** (expected / (expected + self._prior)))
+
+    def _left(self, now: float) -> float:
+        """Return the expected seconds left: the rest of the current step, and those to come."""
+        rest, measured, expected = 0.0, self._measured, self._expected
+        if self._at >= 0 and self._step_fraction < 1:
+            name, seconds = self._steps[self._at]
+            spent, done = now - self._step_began, self._step_fraction - self._step_first
+            usual = seconds * self._factor.get(name, self._slower(measured, expected))
+            rest = max(usual * (1 - self._step_first) - spent, OVERDUE * spent)
+            if done > 0:
+                by_pace, trust = spent * (1 - self._step_fraction) / done, 1 - (1 - done) ** 2
+                rest = trust * by_pace + (1 - trust) * (1 - self._step_fraction) * max(usual, spent)
+            measured, expected = measured + spent, expected + seconds * spent / max(spent + rest, 1e-9)
+        slower = self._slower(measured, expected)
+        left = rest + sum(seconds * self._factor.get(name, slower) for name, seconds in self._steps[self._at + 1 :])
+        if self._deadline is None:
+            return left
+        return min(left, max(self._deadline.seconds, PAST_DEADLINE * (now - self._began)))
+
+
+def with_seconds_left(progress: Progress) -> Callable[[str, float, str, float | None], None]:
+    """Return a receiver of stage, fraction, note and seconds left for one that may do without the last."""
+    call: Any = progress
+    takes_seconds = "seconds_left" in inspect.signature(progress).parameters
+
+    def receive(stage: str, fraction: float, note: str, seconds_left: float | None) -> None:
+        values = (stage, fraction, note) if note else (stage, fraction)  # receivers with two parameters work too
+        if takes_seconds:
+            call(*values, seconds_left=seconds_left)
+        else:
+            call(*values)
+
+    return receive
 
 
 # ``Deadline``: the time until which work shall be finished, and ``Pace``: the steps that fit in until then.

@@ -1,4 +1,4 @@
-"""Resources of the machine: freed memory, time and memory that work takes, torch, ordered thread pools."""
+"""Resources of the machine: freed memory, peak memory, torch, ordered thread pools."""
 
 from __future__ import annotations
 
@@ -7,16 +7,12 @@ import ctypes
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
-
-from kissgs.core.context import Progress
 
 if TYPE_CHECKING:
     from threadpoolctl import threadpool_limits
@@ -87,37 +83,7 @@ def _libc_function(name: str) -> ctypes._NamedFuncPointer | None:
         return None
 
 
-# Wall time by stage, processor time and peak memory.
-
-
-@dataclass
-class StageTimer:
-    """Receiver that forwards progress events and measures the wall time of each stage, and processor time."""
-
-    receiver: Progress
-    seconds: dict[str, float] = field(default_factory=dict)
-    cpu_seconds: float = 0.0  # processor time of this process up to the last stop
-    _stage: str | None = None
-    _since: float = 0.0
-    _cpu_since: float = field(default_factory=time.process_time)
-
-    def __call__(self, stage: str, fraction: float, note: str = "") -> None:
-        """Forward an event; a new stage ends the current one."""
-        if stage != self._stage:
-            self.stop()
-            self._stage, self._since = stage, time.perf_counter()
-        if note:  # without a note, receivers with two parameters work too
-            self.receiver(stage, fraction, note)
-        else:
-            self.receiver(stage, fraction)
-
-    def stop(self) -> None:
-        """End the current stage."""
-        if self._stage is not None:
-            spent = time.perf_counter() - self._since
-            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + spent
-            self._stage = None
-        self.cpu_seconds = time.process_time() - self._cpu_since
+# Peak memory.
 
 
 def peak_memory() -> int:

@@ -15,7 +15,7 @@ from kissgs.cameras.captures.load import as_views
 from kissgs.cameras.photographs import orientation
 from kissgs.cameras.views import Similarity, View, Views
 from kissgs.core.array_types import Float32, Float64, Shaped
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Device, Progress, load_kernels, silent
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Device, JobProgress, Progress, load_kernels, silent
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 from kissgs.core.positions import Origin, with_origin
 from kissgs.core.splats import Splats, clean
@@ -248,6 +248,7 @@ def evaluate(
     measure = _measure(flip, lpips, device)
     views = as_views(views)
     given = 0 if views is None else len(_select_split(views, split)[1])  # an empty split is refused before any work
+    progress = JobProgress(progress, [("kernels", 0.5), ("cameras", 1.0), ("evaluate", 2.0)])
     context = Context(threads, device, progress)
     if views is not None:
         views = in_scene_frame(reference, views, context)

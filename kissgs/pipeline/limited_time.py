@@ -1,18 +1,23 @@
-"""A limited time: how long encodings take, and how the time is divided among training and containers."""
+"""How long compressions take: the steps to expect, and how a limited time is divided among them."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from kissgs.core.context import Deadline
+from kissgs.core.context import Deadline, Step
 from kissgs.core.errors import OutputError
 from kissgs.core.resources import processors
 from kissgs.io.files import atomic_file, reason_of
-from kissgs.settings import Preset
+from kissgs.settings import Preset, Settings, TrainingViewSettings
+
+if TYPE_CHECKING:
+    from kissgs.cameras.views import Views
+    from kissgs.core.splats import Splats
 
 # Expected time of an encoding on this machine, from its speed as ``kissgs warmup`` has measured it.
 
@@ -32,18 +37,22 @@ REFERENCE_PROCESSORS, MOST_PROCESSORS = 2, 8  # of that machine, and beyond whic
 def encode_seconds(preset: Preset, count: int, threads: int = 0) -> float:
     """Return the expected wall time of an encoding of ``count`` Gaussians without training, seconds. ``threads`` is the
     number of threads; 0 means one per processor."""
-    used = min(threads or processors(), processors(), MOST_PROCESSORS)
-    return _reference_seconds(preset, count) / (_speed_per_processor() * used)
+    return _reference_seconds(ENCODE_SECONDS[preset], count) / speed(threads)
 
 
-def _reference_seconds(preset: Preset, count: int) -> float:
-    fixed, renderings, each = ENCODE_SECONDS[preset]
+def speed(threads: int) -> float:
+    """Return the speed of this machine with so many threads, in units of two processors of the reference."""
+    return _speed_per_processor() * min(threads or processors(), processors(), MOST_PROCESSORS)
+
+
+def _reference_seconds(parts: tuple[float, float, float], count: float) -> float:
+    fixed, renderings, each = parts
     return fixed + renderings * min(count / FULL_RENDERINGS, 1.0) + each * count
 
 
 def save_speed(seconds: float, preset: Preset, count: int) -> None:
     """Save the speed of this machine, which encoded ``count`` Gaussians in ``seconds`` with all its processors."""
-    speed = _reference_seconds(preset, count) / seconds
+    speed = _reference_seconds(ENCODE_SECONDS[preset], count) / seconds
     try:
         path = _speed_file()
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -67,6 +76,172 @@ def _speed_per_processor() -> float:
 def _speed_file() -> Path:
     """Return the file of the speed, in the user's folder for caches."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "kissgs" / "speed.json"
+
+
+# ``Expected``: the stages of a compression and the seconds of each, for its progress.
+
+STAGE_SECONDS = {
+    "kernels": (0.5, 0.0, 0.0),
+    "cameras": (0.5, 1.2, 7e-6),
+    "sensitivity": (0.4, 1.2, 4e-6),
+    "rate_distortion": (0.05, 0.0, 4e-6),
+    "order": (0.0, 0.0, 0.2e-6),
+    "forms": (0.0, 0.0, 0.2e-6),
+    "codebook": (0.01, 0.0, 13e-6),
+    "sort codebook": (0.01, 0.0, 3e-6),
+    "rounding": (0.01, 0.0, 2e-6),
+    "refit": (0.2, 1.0, 4e-6),
+    "reorder": (0.01, 0.0, 3e-6),
+    "images": (0.1, 0.0, 35e-6),
+    "evaluate": (0.3, 0.3, 15e-6),
+    "merge": (0.0, 0.0, 8e-6),
+}
+"""Seconds of each stage with the preset balanced, in parts as those of :data:`ENCODE_SECONDS`."""
+
+OTHER_PRESETS = {
+    Preset.FAST: {"codebook": 0.3, "sort codebook": 0.2, "images": 0.04},
+    Preset.PAPER: {"order": 350.0, "forms": 80.0, "sort codebook": 7.0, "images": 0.2},
+}
+"""Factors on these with other presets."""
+
+SMALL_IMAGES = 0.75e-8  # seconds of images with high effort by the square of the number of Gaussians
+FIRST_EVALUATION = 1.2  # seconds in which a search chooses the views that it evaluates in
+
+STEP, TUNING_STEP, SCORE, TARGET = (3e-3, 1.2e-7, 3e-7), (8e-3, 2e-7, 1.2e-6), (5e-3, 1.2e-7, 1e-6), (2e-3, 8e-8, 1e-7)
+"""Seconds of an image in training, fine-tuning, scoring and as a target: fixed, for each pixel, for each Gaussian."""
+
+ENCODES_FOR_SIZE, ENCODES, COMPACTIONS, PRUNED, POINTS, TUNED = 3, 5, 7, 2, 3, 3
+"""Results that searches usually make: containers for a size and for other goals, compactions for a loss, scenes that
+are pruned without training, others on the way, and trained containers."""
+
+FEWER = 0.4  # share of the Gaussians in these
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """The stages to expect of a compression, from what is known when it begins."""
+
+    settings: Settings
+    count: int  # Gaussians
+    sh_degree: int
+    captured: int = 0  # training views of the capture
+    speed: float = 1.0  # of this machine, see :func:`speed`
+
+    @classmethod
+    def of(cls, splats: Splats, settings: Settings, views: Views | None, threads: int) -> Expected:
+        """Return what is known of the compression of a scene."""
+        return cls(settings, len(splats), splats.sh_degree, 0 if views is None else len(views.train), speed(threads))
+
+    def stages(self, *names: str) -> list[Step]:
+        """Return stages with their seconds."""
+        factors = OTHER_PRESETS.get(self.settings.preset, {})
+        count, speed = self.count, self.speed
+        found = {name: factors.get(name, 1.0) * _reference_seconds(STAGE_SECONDS[name], count) for name in names}
+        return [(name, found[name] / speed) for name in names]
+
+    def steps(self, *, evaluate: bool = False) -> list[Step]:
+        """Return the steps of :func:`kissgs.compress`, from the scene on."""
+        settings, scene, before = self.settings, self, self.stages("kernels")
+        if settings.compact.enabled and not settings.compact.auto_count:
+            scene, before = self._fewer(self._kept), self.compaction()
+        tuned = bool(settings.finetune.enabled)
+        views = [*scene.stages("cameras"), scene._targets(settings.finetune)] * tuned
+        once = [*scene._measured(), *views, *scene._container(tuned=tuned)]
+        made = scene._search() if settings.encode.has_goal else once
+        return [*before, *made, *scene.stages("evaluate") * evaluate]
+
+    def compaction(self) -> list[Step]:
+        """Return the steps of a compaction to a number or share of the Gaussians, or with a loss."""
+        compact, steps, once = self.settings.compact, self.stages("kernels"), self.stages("merge")
+        if compact.method == "prune":
+            steps += self.stages("cameras")
+            first = self._kept**compact.initial_prune_fraction if compact.sparsify_steps else self._kept
+            once, fewer, left = [self._scored(first)], self._fewer(first), self._fewer(self._kept)
+            if compact.trains:
+                steps.append(self._targets(compact))
+                scoring = compact.prune_rounds * fewer._scored(1.0)[1]
+                once.append(("sparsify", scoring + fewer._images(STEP, compact.sparsify_steps, compact)))
+                once.append(("refine", left._images(STEP, compact.refine_steps, compact)))
+        if compact.max_psnr_drop is None:
+            return [*steps, *once]
+        return [*steps, *self._with_views([*once, *self.stages("evaluate")] * COMPACTIONS)]
+
+    @property
+    def _kept(self) -> float:
+        """The share of the Gaussians that a compaction keeps; a guess where a loss is given."""
+        compact = self.settings.compact
+        return min(compact.ratio or (compact.count or FEWER * self.count) / max(self.count, 1), 1.0)
+
+    def _fewer(self, share: float) -> Expected:
+        return replace(self, count=round(share * self.count))
+
+    def _images(self, seconds: tuple[float, float, float], images: float, views: TrainingViewSettings) -> float:
+        """Return the seconds of so many images of training, scoring or targets."""
+        side = views.view_size * (1.0 if self.captured else 0.6)
+        fixed, each_pixel, each_gaussian = seconds
+        return images * (fixed + each_pixel * 0.7 * side**2 + each_gaussian * self.count) / self.speed
+
+    def _targets(self, views: TrainingViewSettings) -> Step:
+        return "targets", self._images(TARGET, self.captured or views.views, views)
+
+    def _scored(self, kept: float) -> Step:
+        """Return the pruning of all but a share of the Gaussians, by a quarter of the views."""
+        compact = self.settings.compact
+        most = compact.min_keep_per_scoring or kept
+        rounds = max(1, math.ceil(math.log(kept) / math.log(most) - 1e-9)) if most < 1 else 1
+        return "score", self._images(SCORE, rounds * 0.25 * (self.captured or compact.views), compact)
+
+    def _measured(self) -> list[Step]:
+        """Return the steps before a scene is encoded for the first time."""
+        return self.stages("cameras", "sensitivity") if self.settings.encode.rate_distortion else []
+
+    def _container(self, *, tuned: bool) -> list[Step]:
+        """Return the steps of an encoding."""
+        encode, finetune = self.settings.encode, self.settings.finetune
+        plans, refits = encode.rate_distortion, self.captured > 0 and not (tuned and encode.has_goal)
+        reorder = ["reorder"] * (encode.order == "refined")
+        names = [*["rate_distortion"] * plans, "order", "forms", *["codebook", "sort codebook"] * (self.sh_degree > 0)]
+        names += [*["rounding"] * plans, *["refit"] * (plans and refits), *reorder]
+        images = self.stages("images")
+        if self.count <= encode.high_effort_pixels:
+            images = [("images", (0.1 + SMALL_IMAGES * self.count**2) / self.speed)]
+        tuning = ("finetune", images[0][1] + self._images(TUNING_STEP, finetune.steps, finetune))
+        return [*self.stages(*names), *[tuning, *self.stages(*reorder)] * tuned, *images]
+
+    def _evaluated(self) -> list[Step]:
+        """Return the comparison of a container in a search: the views of captures are few."""
+        return [(name, seconds * (0.2 if self.captured else 1.0)) for name, seconds in self.stages("evaluate")]
+
+    def _search(self) -> list[Step]:
+        """Return the steps of a search for a goal."""
+        compact, by_size = self.settings.compact, self.settings.encode.target_size is not None
+        evaluated, fewer = [] if by_size else self._evaluated(), self._fewer(FEWER)
+        whole = [*self._container(tuned=False), *evaluated] * (ENCODES_FOR_SIZE if by_size else ENCODES)
+        steps = [*self._measured(), *whole]
+        tuned, pruned = fewer._container(tuned=True), [self._scored(0.8), *self._evaluated()] * PRUNED
+        photographs = compact.auto_count and self.captured > 0
+        along = fewer._measured() if photographs and not by_size else []
+        trained = [*along, *tuned, *evaluated] * (TUNED * bool(self.settings.finetune.enabled))
+        if photographs:
+            unit = fewer._images(STEP, compact.sparsify_steps / compact.prune_rounds, compact)
+            path = [*[("sparsify", unit), fewer._scored(0.8)] * POINTS, ("sparsify", 3 * unit)]
+            steps = [
+                *self.stages("cameras"),
+                *pruned,
+                self._targets(compact),
+                *path,
+                *(fewer._measured() if by_size else []),
+            ]
+        elif compact.auto_count:
+            steps = [*self.stages("cameras"), *steps, *pruned, self._targets(compact), *fewer._measured()]
+        steps = [*steps, *trained, *self._evaluated() * by_size]
+        return steps if self.captured else self._with_views(steps)
+
+    def _with_views(self, steps: list[Step]) -> list[Step]:
+        """Return the steps of a search, the first evaluation of which includes the choice of its views."""
+        first = next(at for at, (name, _) in enumerate(steps) if name == "evaluate")
+        steps[first] = "evaluate", steps[first][1] + FIRST_EVALUATION / self.speed
+        return steps
 
 
 # ``SearchTime``: how a limited time is divided among training and containers. The unit is the expected time of an

@@ -11,9 +11,9 @@ import numpy as np
 
 from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.core.array_types import Int
-from kissgs.core.context import Context, Deadline, Device, Progress, ignore_stop_search, silent
+from kissgs.core.context import Context, Deadline, Device, JobProgress, Progress, ignore_stop_search, silent
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.resources import StageTimer, peak_memory, return_free_memory
+from kissgs.core.resources import peak_memory, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Cleaned, Splats, empty_splats
 from kissgs.evaluation.results import Evaluation
@@ -23,6 +23,7 @@ from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.choice import choose, resolved
 from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.goal import Attempt
+from kissgs.pipeline.limited_time import Expected
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
 from kissgs.settings import GOALS, EncodeSettings, Settings
 from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
@@ -199,10 +200,11 @@ def compact(
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_ply(target, overwrite=overwrite)
-    clock = StageTimer(progress)
+    clock = JobProgress(progress)
     context = Context(threads, device, clock)
     splats, cleaned, _ = open_scene(source, reading, threads, clock)
     views, note = _fitting(splats, views, context, force=force_views)
+    clock.expect(Expected.of(splats, settings, views, threads).compaction())
     file = Path(checkpoint) if checkpoint is not None else None
     result = compact_scene(splats, settings.compact, views, context, evaluate=evaluate, checkpoint=file)
     if target is not None:
@@ -284,7 +286,7 @@ def compress(
     target, kind = None if destination is None else Path(destination), named_container(container, destination)
     checkpoint = None if checkpoint is None else Path(checkpoint)
     _check(settings, views, target, checkpoint, overwrite=overwrite, device=device)
-    clock = StageTimer(progress)
+    clock = JobProgress(progress)
     deadline = None if settings.time_limit is None else Deadline.after(settings.time_limit)
     context = Context(threads, device, clock, deadline)
 
@@ -296,6 +298,7 @@ def compress(
         notes.append(views_note)
     choice = choose(requested, views, len(splats), context, keep_all=keep_all)
     settings = choice.settings
+    clock.expect(Expected.of(splats, settings, views, threads).steps(evaluate=evaluate), deadline)
     work = Work(
         splats=splats,
         original=splats,

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from kissgs.core.context import Progress, silent
+from kissgs.core.context import JobProgress, Progress, silent
 from kissgs.core.errors import InvalidContainerError, OutputError, UnsupportedError
 from kissgs.core.positions import WORLD, centred, in_world, origin_for, relative_to, world_positions
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, clean
@@ -387,6 +387,7 @@ def decompress(
     if destination is not None:
         check_ply(Path(destination), overwrite=overwrite)
     scene = source if isinstance(source, bytes | Mapping) else Path(source)
+    progress = JobProgress(progress, [("decode", 1.0), ("write", 1.0)])
     splats = read_scene(
         scene,
         ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased),

@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, Self
 
-from kissgs.core.context import Progress, silent
+from kissgs.core.context import Progress, silent, with_seconds_left
 from kissgs.core.errors import KissgsError, RunnerError
 
 log = logging.getLogger("kissgs.runners")
@@ -119,10 +119,10 @@ class Runner(Protocol):
         """Cancel all items, wait for their ends, and release everything; the runner cannot be used afterwards."""
 
 
-def report(progress: Progress, stage: str, fraction: float, note: str) -> None:
+def report(progress: Progress, stage: str, fraction: float, note: str, seconds_left: float | None) -> None:
     """Pass an event to a receiver; an exception of it is logged, and the work goes on."""
     try:
-        progress(stage, fraction, note)
+        with_seconds_left(progress)(stage, fraction, note, seconds_left)
     except Exception:
         log.exception("a receiver of progress events failed")
 

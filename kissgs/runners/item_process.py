@@ -79,14 +79,15 @@ class Throttle:
         self._send = send
         self._last, self._next = ("", -1.0, ""), 0.0
 
-    def __call__(self, stage: str, fraction: float, note: str = "") -> None:
+    def __call__(self, stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
         """See :class:`kissgs.Progress`."""
         now = time.monotonic()
         event = stage, round(min(1.0, max(0.0, fraction)), 4), note
         if event == self._last or (stage == self._last[0] and now < self._next):
             return
         self._last, self._next = event, now + EVENT_SECONDS
-        self._send({"stage": stage, "fraction": event[1], "note": note})
+        left = None if seconds_left is None else round(seconds_left, 2)
+        self._send({"stage": stage, "fraction": event[1], "note": note, "seconds_left": left})
 
 
 def _sender() -> Send:

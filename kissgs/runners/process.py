@@ -89,7 +89,7 @@ SAMPLE_SECONDS = 0.1  # seconds between looks at a process's time and memory
 LOG_BYTES = 4000  # bytes of the end of standard error that are kept
 
 
-ProgressEvent = tuple[str, float, str]  # stage, completed fraction and note of Progress
+ProgressEvent = tuple[str, float, str, float | None]  # stage, fraction, note and seconds left of Progress
 
 
 class ItemProcess:
@@ -140,7 +140,7 @@ class ItemProcess:
                 if "outcome" in event:
                     final = Outcome(**event["outcome"])
                 else:
-                    yield event["stage"], event["fraction"], event["note"]
+                    yield event["stage"], event["fraction"], event["note"], event["seconds_left"]
         finally:  # also if the caller asks for no more events
             status = self._finish(process, wait=final is not None)
         return status, final

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-import math
 import socket
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import asdict, dataclass
@@ -14,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from kissgs._version import __version__
-from kissgs.core.context import Context, Progress, silent
+from kissgs.core.context import Context, JobProgress, Progress, silent
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.positions import middle_of, with_origin, world_positions
 from kissgs.core.splats import BLOCK, Splats
@@ -22,6 +19,7 @@ from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, na
 from kissgs.io.files import reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
+from kissgs.pipeline.limited_time import speed
 from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_level, stored_bytes
 from kissgs.runners import Resources, Runner, WorkItem, error_of
 from kissgs.settings import EncodeSettings, Settings
@@ -44,44 +42,12 @@ from kissgs.streaming.layout import (
 )
 from kissgs.streaming.levels import row_bytes
 
-# ``with_time_left``: progress events of the work items of a streamed scene, with an estimate of the time left.
-
-SHARES = {
-    False: {"partition": 0.06, "merge": 0.4, "images": 0.54},
-    True: {"partition": 0.03, "merge": 0.18, "cameras": 0.02, "images": 0.77},
+SECONDS = {
+    False: {"partition": 1.0, "merge": 6.4, "images": 8.6},
+    True: {"partition": 1.0, "merge": 6.4, "cameras": 0.7, "images": 27.0},
 }
-"""Share of each stage in the CPU seconds of a million Gaussians of degree 3, without and with rate-distortion planning,
-that is, with the presets ``fast`` and ``balanced``."""
-
-LEAST_SECONDS = 5.0  # time after which the pace of the work is known well enough
-
-
-def with_time_left(progress: Progress, rate_distortion: bool) -> Progress:
-    """Return a receiver that adds the time left to notes, by the pace since its first event. Until more of the work is
-    done, the clock counts it down; once that is at zero, nothing is added."""
-    shares = SHARES[rate_distortion]
-    before = dict(zip(shares, itertools.accumulate(shares.values(), initial=0.0), strict=False))
-    first: tuple[float, float] | None = None
-    latest, end = 0.0, math.inf  # the work done, and the estimated time of its end
-
-    def receive(stage: str, fraction: float, note: str = "") -> None:
-        nonlocal first, latest, end
-        now, done = time.monotonic(), before[stage] + fraction * shares[stage]
-        first = first or (now, done)
-        elapsed, gained = now - first[0], done - first[1]
-        if gained > 0 and elapsed > LEAST_SECONDS and (done > latest or end == math.inf):
-            latest, end = done, now + elapsed * (1 - done) / gained
-        left = [f"{duration(end - now)} left"] if now <= end < math.inf else []
-        progress(stage, fraction, ", ".join([*filter(None, [note]), *left]))
-
-    return receive
-
-
-def duration(seconds: float) -> str:
-    """Format a time: "40 s", "12 min", "3.5 h"."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+"""Seconds of each stage for a million Gaussians of degree 3 on two processors, without and with rate-distortion
+planning, that is, with the presets ``fast`` and ``balanced``."""
 
 
 REPORT = "report.json"  # file of the work folder: the report, once everything is made
@@ -168,8 +134,9 @@ def compress_streamed(
         scratch.check_destination(manifest, source, overwrite=overwrite)
     with scratch.claimed(work, {"container": container, **_identity(source, settings, reading)}):
         if (found := scratch.read_json(work / REPORT)) is None:
-            layout = _partition(work, source, container, settings, reading, threads, progress)
-            found = asdict(_make(work, layout, settings, runner, threads, progress))
+            job = JobProgress(progress)
+            layout = _partition(work, source, container, settings, reading, threads, job)
+            found = asdict(_make(work, layout, settings, runner, threads, job))
             write_json(work / REPORT, found)
         scratch.finish(work, manifest, source, overwrite=overwrite)
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
@@ -180,7 +147,6 @@ def _make(
 ) -> StreamedReport:
     """Make all levels and files that are not in the work folder yet."""
     encode = settings.encode
-    report = with_time_left(progress, encode.rate_distortion)
 
     def run(stage: str, key: str, values: Sequence[int | str]) -> None:
         own_threads = threads if runner is None else max(1, threads)
@@ -189,7 +155,7 @@ def _make(
         done = 1 - len(items) / len(values)
 
         def part(fraction: float) -> None:
-            report(stage, done + fraction * (1 - done))
+            progress(stage, done + fraction * (1 - done))
 
         if runner is not None and items:
             _run_all(runner, items, layout, part)
@@ -201,10 +167,10 @@ def _make(
 
     run("merge", "chunk", layout.filled)
     if encode.rate_distortion and not (work / CAMERAS).exists():
-        report("cameras", 0.0)
+        progress("cameras", 0.0)
         build.make_cameras(work, layout, encode, threads)
     run("images", "file", [file.name for file in layout.all_files()])
-    report("images", 1.0)
+    progress("images", 1.0)
     build.make_manifest(work, layout)
     return _report(work, layout)
 
@@ -323,26 +289,21 @@ def _partition(
     settings: Settings,
     reading: ReadOptions,
     threads: int,
-    progress: Progress,
+    job: JobProgress,
 ) -> Layout:
-    """Partition the scene, unless that has been done."""
-    announced = "{} takes up to {} until the work is done"  # the size of the work folder
+    """Partition the scene, unless that has been done, and set the steps of the job."""
     if scratch.read_json(work / PARTITION) is not None:
         layout = read_layout(work)
-        needed = scratch.needed_bytes(layout.source_count, layout.sh_degree)
-        progress("scratch", 1.0, announced.format(work, scratch.megabytes(needed)))
+        _announce(job, work, layout.source_count, layout.sh_degree, settings, threads)
         return layout
-    encode, before = settings.encode, _identity(source, settings, reading)
+    before = _identity(source, settings, reading)
     try:
         (work / OUT).mkdir(exist_ok=True)
         blocks, count, sh_degree = _reader(source, reading, threads)
-        needed = scratch.needed_bytes(count, sh_degree)
-        scratch.check_space(
-            work, needed
-        )  # later, files are deleted as others are written, so that the folder hardly grows
-        progress("scratch", 1.0, announced.format(work, scratch.megabytes(needed)))
-        stages = with_time_left(progress, encode.rate_distortion)
-        layout = build.partition(work, blocks, count, container, encode, stages)
+        # Later, files are deleted as others are written, so that the folder hardly grows.
+        scratch.check_space(work, scratch.needed_bytes(count, sh_degree))
+        _announce(job, work, count, sh_degree, settings, threads)
+        layout = build.partition(work, blocks, count, container, settings.encode, job)
         if not any(layout.counts):
             raise InvalidSceneError(f"{source} has no Gaussian that is finite and visible; there is nothing to write")
         if _identity(source, settings, reading) != before:
@@ -352,6 +313,14 @@ def _partition(
         raise
     keep_layout(work, layout)
     return layout
+
+
+def _announce(job: JobProgress, work: Path, count: int, sh_degree: int, settings: Settings, threads: int) -> None:
+    """Set the steps of the job, and report the size of the work folder."""
+    millions = count / 1e6 / speed(threads)
+    job.expect([(stage, each * millions) for stage, each in SECONDS[settings.encode.rate_distortion].items()])
+    needed = scratch.megabytes(scratch.needed_bytes(count, sh_degree))
+    job("scratch", 1.0, f"{work} takes up to {needed} until the work is done")
 
 
 def _report(work: Path, layout: Layout) -> StreamedReport:

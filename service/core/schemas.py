@@ -104,10 +104,10 @@ class ApiModel(BaseModel):
 
 
 class Progress(ApiModel):
-    """Stage of a running job, as the library reports it."""
+    """Progress of a running job, as the library reports it."""
 
     stage: str = Field(description="Name of the current stage.", examples=["codebook"])
-    fraction: float = Field(ge=0, le=1, description="Completed fraction of the stage, from 0 to 1.")
+    fraction: float = Field(ge=0, le=1, description="Completed fraction of the job, from 0 to 1; never falls.")
     note: str | None = Field(
         None,
         max_length=NOTE_CHARS,
@@ -117,10 +117,12 @@ class Progress(ApiModel):
 
 
 class Estimate(ApiModel):
-    """Estimated time of completion, from earlier jobs with the same preset; updated in every response."""
+    """Estimated time of completion, from the progress of the job, and before from those with the same preset."""
 
     seconds_left: float = Field(
-        ge=0, description="Estimated seconds until the result is available, including the time in the queue."
+        ge=0,
+        description="Estimated seconds until the result is available, including the time in the queue; 0 where it "
+        "takes longer than estimated.",
     )
     ready_at: datetime = Field(description="Estimated time at which the result is available.")
 

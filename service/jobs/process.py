@@ -25,7 +25,8 @@ UNUSABLE_NODES = "the machines that run jobs cannot work on this one; try again 
 UNUSABLE_MACHINE = "the job's files cannot be used on this machine; try again later"
 """Sentences for clients about nodes of a cluster, and about this machine, whose names and faults are in the log."""
 
-OnProgress = Callable[[str, float, str], Awaitable[None]]  # gets stage, fraction (0 to 1), and a note or ""
+OnProgress = Callable[[str, float, str, float | None], Awaitable[None]]
+"""Gets stage, fraction of the job (0 to 1), a note or "", and the seconds left, None while they are unknown."""
 
 
 POSTPONED = (runners.UNREACHABLE, runners.NOT_STARTED)  # codes of "lost" outcomes of jobs that cannot run at the moment
@@ -119,10 +120,10 @@ class JobProcess:
         item, self._used = self._runner.item(task), self._runner.runner_of(task)
         if item.resources.gpus and self._used.refusal(item.resources):
             return self._refused(item.resources)
-        loop, events = asyncio.get_running_loop(), asyncio.Queue[tuple[str, float, str] | None]()
+        loop, events = asyncio.get_running_loop(), asyncio.Queue[tuple[str, float, str, float | None] | None]()
 
-        def receive(stage: str, fraction: float, note: str = "") -> None:
-            loop.call_soon_threadsafe(events.put_nowait, (stage, fraction, note))
+        def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
+            loop.call_soon_threadsafe(events.put_nowait, (stage, fraction, note, seconds_left))
 
         self._handle = self._used.submit(item, receive)
         outcome = asyncio.wrap_future(self._handle.outcome)

@@ -71,7 +71,9 @@ class Queue:
         return total
 
     def _remaining(self, job: Job) -> float:
-        """Estimate the seconds that a queued or running job is still to run; it is never taken for done."""
+        """Estimate the seconds that a queued or running job is still to run, from its progress if that is known."""
+        if (end := self._store.ends.get(job.number)) is not None:
+            return max(end - self.now, 0.0)
         total, started = self._total(job), job.started_at if job.state == State.RUNNING else None
         return max(total - (self.now - started if started is not None else 0.0), 0.1 * total, 0.5)
 

@@ -334,9 +334,9 @@ class Worker:
         process.work = await run_sync(self.storage.new_work, job.id)
         task = await run_sync(self._task, job, upload, process.work)
 
-        async def progress(stage: str, fraction: float, note: str) -> None:
+        async def progress(stage: str, fraction: float, note: str, left: float | None) -> None:
             try:
-                await run_sync(self.store.progress, job.number, stage, fraction, note)
+                await run_sync(self.store.progress, job.number, stage, fraction, note, left)
             except SQLAlchemyError as error:  # for example a full disk; the job may still succeed
                 self._log_once(f"job {job.id}: progress was not recorded", error)
             self.notifier.notify(job.id)

@@ -1,7 +1,7 @@
 /** Requests to the service: keys, problem documents, responses. */
 
 /**
- * @typedef {{stage: string, fraction: number, note?: string}} Progress
+ * @typedef {{stage: string, fraction: number, note?: string, seconds_left?: number}} Progress
  * @typedef {{title: string, detail: string, code: string, status: number, retryable: boolean}} ProblemDocument
  * @typedef {{target_size?: number | null, max_psnr_drop?: number | null, max_ssim_drop?: number | null,
  *   psnr?: number | null, quality?: string | null}} Goals

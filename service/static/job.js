@@ -13,8 +13,8 @@ import { jobLabel, stateLabel } from "./labels.js";
 
 /**
  * Create the job card, which shows one job at a time.
- * @param {{keyed: boolean, training: boolean, seen: (status: Status | null) => void, again: (status: Status) => void}} page
- *   training says whether the server can train; seen is called with each status, null for a job that cannot be tracked any more; again is called to repeat a
+ * @param {{keyed: boolean, seen: (status: Status | null) => void, again: (status: Status) => void}} page
+ *   seen is called with each status, null for a job that cannot be tracked any more; again is called to repeat a
  *   submission
  */
 export function jobCard(page) {
@@ -31,7 +31,7 @@ export function jobCard(page) {
 
   /** @param {Status} status @param {boolean} focus */
   function watch(status, focus) {
-    const view = runningView(status, page.training, async () => {
+    const view = runningView(status, async () => {
       try {
         end(await cancel(status.id));
       } catch (error) {

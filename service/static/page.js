@@ -22,7 +22,7 @@ function run(limits, presets) {
   const recent = recentJobs((id) => id === job.shown() && home());
   const upload = uploader({ started: () => show(false), accepted, abandoned: () => show(true) });
   const compose = composer(limits, presets, upload.send);
-  const job = jobCard({ keyed: limits.keys_required, training: limits.training, seen, again });
+  const job = jobCard({ keyed: limits.keys_required, seen, again });
 
   function home() {
     location.hash = "";

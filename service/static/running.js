@@ -1,27 +1,31 @@
-/** The view of a queued or running job: stage, progress and time estimate. */
+/** The view of a queued or running job: a bar over the whole job, the time left, and its stages, folded away. */
 
 import { announce, el, setTitle } from "./dom.js";
 import { clock, percent, roughly } from "./format.js";
 import { jobLabel } from "./labels.js";
-import { plannedStages, stageLabel } from "./stages.js";
+import { stageLabel } from "./stages.js";
 
 /** @typedef {import("./api.js").Status} Status */
 
 /**
  * Create the view of a job that has not ended.
  * @param {Status} first
- * @param {boolean} training whether the server can train
  * @param {() => void} cancel
  */
-export function runningView(first, training, cancel) {
-  const kicker = el("p", { class: "kicker" });
-  const [headline, amount] = [el("span", { class: "stage" }), el("span", { class: "stage" })];
-  const bar = el("progress", { max: 1, "aria-label": "Progress of this stage" });
+export function runningView(first, cancel) {
+  const [kicker, headline, amount] = [
+    el("p", { class: "kicker" }),
+    el("span", { class: "stage" }),
+    el("span", { class: "stage" }),
+  ];
+  const bar = el("progress", { max: 1, "aria-label": "Progress" });
   const [elapsed, left] = [el("span"), el("span")];
-  const note = el("p", { class: "note small muted", hidden: true }); // not announced: it changes often
+  const note = el("p", { class: "note small muted" }); // not announced: it changes often
+  const steps = el("ol", { class: "steps", "aria-label": "Stages" });
+  const summary = el("summary", {}, "Starting");
+  const stages = el("details", { class: "small" }, summary, steps, note);
   const notice = el("p", { class: "small muted", hidden: true }, "The connection was lost; reconnecting…");
   const button = el("button", { class: "quiet", type: "button", onclick: press }, "Cancel job");
-  const steps = stepList(plannedStages(first, training));
   const children = [
     kicker,
     el("h1", { id: "job-title", tabindex: "-1" }, first.name),
@@ -29,12 +33,13 @@ export function runningView(first, training, cancel) {
     el("p", { class: "spread" }, headline, amount),
     bar,
     el("p", { class: "spread muted" }, elapsed, left),
-    note,
-    steps.element,
+    stages,
     notice,
     el("div", { class: "buttons" }, button),
   ];
-  let [status, seen, stage] = [first, performance.now(), ""];
+  let [status, seen, fraction] = [first, performance.now(), 0];
+  /** @type {string[]} names of the stages so far */
+  let passed = [];
 
   function press() {
     button.disabled = true;
@@ -44,9 +49,8 @@ export function runningView(first, training, cancel) {
 
   /** @param {string} text */
   function setHeadline(text) {
-    if (headline.textContent === text) return;
+    if (text && headline.textContent !== text) announce(`${first.name}: ${text}.`);
     headline.textContent = text;
-    announce(`${first.name}: ${text}.`);
   }
 
   /** @param {Status} next */
@@ -54,60 +58,78 @@ export function runningView(first, training, cancel) {
     [status, seen] = [next, performance.now()];
     const queued = next.state === "queued";
     kicker.textContent = queued ? "Queued" : "Compressing";
-    steps.element.hidden = queued;
+    stages.hidden = queued;
     if (queued) {
-      stage = "";
+      restarted();
       setHeadline(next.position === 1 ? "Next in the queue" : `Number ${next.position ?? "?"} in the queue`);
-      note.hidden = true;
-      showFraction(0);
-    } else if (!stage) setHeadline("Starting");
+    } else setHeadline("");
     tick();
   }
 
   /** @param {import("./api.js").Progress} now */
   function progress(now) {
-    if (now.stage !== stage) {
-      stage = now.stage;
-      steps.at(stage);
-      setHeadline(stageLabel(stage));
-      note.hidden = true;
+    const name = stageLabel(now.stage);
+    summary.textContent = name;
+    if (!passed.includes(name)) {
+      passed.push(name);
+      announce(`${first.name}: ${name}.`);
     }
-    showFraction(now.fraction);
+    steps.replaceChildren(
+      ...passed.map((each) =>
+        el("li", { class: each === name ? "now" : "past", "aria-current": each === name ? "step" : null }, each),
+      ),
+    );
     note.textContent = now.note ?? "";
-    if (now.note) note.hidden = false; // stays visible for the whole stage, so that the layout is stable
+    if (now.seconds_left !== undefined) {
+      status = {
+        ...status,
+        timings: { ...status.timings, run_seconds: ranFor() },
+        estimate: { seconds_left: now.seconds_left },
+      };
+      seen = performance.now();
+    }
+    showFraction(Math.max(fraction, now.fraction));
+    tick();
   }
 
   /**
-   * Show the completed fraction; many stages report only 0 or 1, and then the bar is indeterminate.
-   * @param {number} fraction
+   * Show the completed fraction of the job; before its start, the bar is indeterminate.
+   * @param {number} now
    */
-  function showFraction(fraction) {
-    const known = fraction > 0 && fraction < 1;
-    if (known) bar.value = fraction;
+  function showFraction(now) {
+    fraction = now;
+    if (now > 0) bar.value = now;
     else bar.removeAttribute("value");
-    amount.textContent = known ? percent(fraction) : "";
-    setTitle(`${known ? percent(fraction) : "…"} ${first.name}`);
+    amount.textContent = now > 0 ? percent(now) : "";
+    setTitle(`${now > 0 ? percent(now) : "…"} ${first.name}`);
   }
+
+  const since = () => (performance.now() - seen) / 1000;
+  const ranFor = () => status.timings.run_seconds && status.timings.run_seconds + since();
 
   function tick() {
-    const since = (performance.now() - seen) / 1000;
-    elapsed.textContent =
-      status.timings.run_seconds === undefined ? "" : `${clock(status.timings.run_seconds + since)} elapsed`;
-    const seconds = status.estimate ? Math.max(1, status.estimate.seconds_left - since) : null;
-    left.textContent = seconds === null ? "" : `${roughly(seconds)} left`;
+    const [ran, seconds] = [ranFor(), status.estimate && status.estimate.seconds_left - since()];
+    elapsed.textContent = ran === undefined ? "" : `${clock(ran)} elapsed`;
+    if (seconds === undefined) left.textContent = "";
+    else left.textContent = seconds > 0 ? `${roughly(seconds)} left` : "longer than expected";
   }
 
+  function restarted() {
+    passed = [];
+    summary.textContent = "Starting";
+    steps.replaceChildren();
+    note.textContent = "";
+    showFraction(0);
+  }
+
+  restarted();
   update(first);
   return {
     children,
     update,
     progress,
     tick,
-    restarted() {
-      stage = "";
-      steps.at("");
-      note.hidden = true;
-    },
+    restarted,
     /** @param {boolean} connected */
     connection: (connected) => (notice.hidden = connected),
     /** Enable the cancel button again after a failed cancellation. */
@@ -116,30 +138,4 @@ export function runningView(first, training, cancel) {
       button.textContent = "Cancel job";
     },
   };
-}
-
-/**
- * Create the list of past, present and future stages.
- * @param {string[]} planned
- */
-function stepList(planned) {
-  const element = el("ol", { class: "steps", "aria-label": "Stages" });
-  /** @type {string[]} */
-  let passed = [];
-
-  /** @param {string} now empty before the first stage */
-  function at(now) {
-    if (!now) passed = [];
-    else if (!passed.includes(now)) passed.push(now);
-    const ahead = planned.slice(1 + Math.max(...planned.map((name, at) => (passed.includes(name) ? at : -1))));
-    const items = [...passed, ...ahead.filter((name) => !passed.includes(name))].map((name) => {
-      const here = name === now;
-      const kind = here ? "now" : passed.includes(name) ? "past" : "later";
-      return el("li", { class: kind, "aria-current": here ? "step" : null }, stageLabel(name));
-    });
-    element.replaceChildren(...items);
-  }
-
-  at("");
-  return { element, at };
 }

@@ -46,6 +46,7 @@ class Store:
         self.clock = clock
         self.turns: dict[str, int] = {}  # by owner, the number of the last start of one of its jobs, counted from 1
         self.changes = 0  # of the queue so far
+        self.ends: dict[int, float] = {}  # when running jobs are expected to end, by their numbers
 
     def close(self) -> None:
         """Close all connections."""
@@ -208,13 +209,15 @@ class Store:
         self.changes += 1
         return job
 
-    def progress(self, number: int, stage: str, fraction: float, note: str = "") -> None:
-        """Store the progress of a running job: stage, fraction from 0 to 1, and an optional note."""
+    def progress(self, number: int, stage: str, fraction: float, note: str = "", left: float | None = None) -> None:
+        """Store the progress of a running job: stage, fraction from 0 to 1, a note if any, and the seconds left."""
         with self._write() as session:
             job = session.get(Job, number)
             if job is not None and job.state == State.RUNNING:
                 job.stage, job.fraction, job.note = stage, fraction, note[:NOTE_CHARS] or None
-                optional = {"note": job.note} if job.note else {}
+                optional: dict[str, Any] = {"note": job.note} if job.note else {}
+                if left is not None:
+                    optional["seconds_left"], self.ends[number] = left, self.clock() + left
                 _add_event(session, job, "progress", {"stage": stage, "fraction": fraction, **optional})
 
     def move(self, number: int, state: State, **values: Any) -> bool:  # noqa: ANN401
@@ -232,6 +235,7 @@ class Store:
                 job.finished_at = self.clock()
             job.state = state
             _add_event(session, job, "state", {"state": state, **({"problem": job.problem} if job.problem else {})})
+        self.ends.pop(number, None)
         self.changes += 1
         return True
 

@@ -17,6 +17,7 @@ from helpers.captured_scene import SCENE
 from helpers.command_line import KISSGS, failure, run
 from PIL import Image
 from rich.console import Console
+from rich.text import Text
 
 import kissgs
 from kissgs.cameras.captures.transforms_json import read_cameras
@@ -214,6 +215,26 @@ def test_the_clock_of_the_progress_bar_runs_through_all_stages(monkeypatch, caps
         now = 75.0
         progress("order", 0.5)
     assert "0:01:15" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("later", "expected"), [(0, "about 1 min left"), (21, "about 40 s left"), (59, "about 1 s left"), (61, "expected")]
+)
+def test_one_bar_over_the_whole_command_counts_the_time_left_down(monkeypatch, capsys, later, expected):
+    now = 5.0
+    monkeypatch.setattr(console, "Console", partial(Console, force_terminal=True, width=120, get_time=lambda: now))
+    with console.progress_bar(False) as progress:
+        progress("sparsify", 0.25, "9 Gaussians", seconds_left=60.0)
+        now += later
+    line = Text.from_ansi(capsys.readouterr().err).plain.splitlines()[-1]
+    assert f"25 % 0:0{later // 60}:{later % 60:02}, " in line
+    assert f"{expected} training; 9 Gaussians" in line
+
+
+def test_estimates_have_few_digits():
+    seconds = (0.2, 7.4, 12, 41, 54.9, 200, 5000, 5400)
+    texts = ["1 s", "7 s", "10 s", "40 s", "55 s", "3 min", "83 min", "1.5 h"]
+    assert [console.roughly(each) for each in seconds] == [f"about {text}" for text in texts]
 
 
 @pytest.mark.parametrize("torch", ["", "import sys; sys.modules['torch'] = None; "], ids=["torch", "no torch"])

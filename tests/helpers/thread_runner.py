@@ -43,12 +43,12 @@ class _ItemThread:
         self._killed.set()
 
     def outcome(self, progress):
-        send = Throttle(lambda event: report(progress, event["stage"], event["fraction"], event["note"]))
+        send = Throttle(lambda event: report(progress, *event.values()))
 
-        def watched(stage, fraction, note=""):
+        def watched(stage, fraction, note="", seconds_left=None):
             if self._killed.is_set():
                 raise kissgs.Cancelled("cancelled")
-            send(stage, fraction, note)
+            send(stage, fraction, note, seconds_left)
 
         try:
             if not Path(self._folder).is_dir():

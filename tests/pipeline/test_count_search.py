@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.stages import by_stages
 from helpers.training_scenes import around, cloud
 from PIL import Image
 
@@ -17,6 +18,13 @@ from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.result import CountTrial
 from kissgs.evaluation.results import drop_of
 from kissgs.rendering.rasterizer import render
+
+
+@pytest.fixture(autouse=True)
+def fractions_of_stages(monkeypatch):
+    """Receivers stop at fractions of stages, not of the whole work."""
+    by_stages(monkeypatch)
+
 
 SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)
 FEW_VIEWS = {"sensitivity_views": 16, "sensitivity_view_size": 96, "finetune": {"enabled": False}}

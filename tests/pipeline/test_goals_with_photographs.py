@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.photographed import FEW_VIEWS, QUICK, photographs, with_photographs
+from helpers.stages import by_stages
 from helpers.training_scenes import around, cloud
 
 import kissgs
@@ -13,6 +14,12 @@ from kissgs import Settings
 from kissgs.compaction.popspa import TrainingPath
 from kissgs.pipeline.limited_time import SearchTime
 from kissgs.rendering.sensitivity import WeightedCameras
+
+
+@pytest.fixture(autouse=True)
+def fractions_of_stages(monkeypatch):
+    """Receivers stop at fractions of stages, not of the whole work."""
+    by_stages(monkeypatch)
 
 
 @pytest.mark.parametrize("damaged", [False, True])

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.stages import by_stages
 
 import kissgs
 from kissgs import OutputError, Settings, Splats, StopSearch, UnsupportedError
@@ -11,6 +12,13 @@ from kissgs.compaction.search_evaluation import SearchEvaluation
 from kissgs.core.context import Context
 from kissgs.pipeline.goal import Attempt, Goal
 from kissgs.sogxt.encode import encode
+
+
+@pytest.fixture(autouse=True)
+def fractions_of_stages(monkeypatch):
+    """Receivers stop at fractions of stages, not of the whole work."""
+    by_stages(monkeypatch)
+
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)

@@ -17,7 +17,8 @@ class Records:
 
     turns, changes = {}, 0
 
-    def __init__(self, **rates):
+    def __init__(self, ends=None, **rates):
+        self.ends = {} if ends is None else {1: ends}
         self.given = {name.replace("_", "+"): rate for name, rate in rates.items()}
 
     def clock(self):
@@ -82,3 +83,9 @@ def test_rates_are_those_without_a_limit():
 
 def test_the_estimate_falls_as_time_passes():
     assert seconds(time_limit="60s", started=960) == 21
+
+
+def test_the_progress_of_a_job_says_when_it_ends():
+    """Until then; what takes longer is not done."""
+    assert seconds(Records(ends=1007.5), time_limit="60s", started=960) == 7.5
+    assert seconds(Records(ends=990.0), time_limit="60s", started=960) == 0

@@ -17,7 +17,10 @@ def test_following_an_event_stream(service):
     stages = [data["stage"] for _, kind, data in found if kind == "progress"]
     assert stages[0] == "read"
     assert "images" in stages
-    assert all(0 <= data["fraction"] <= 1 for _, kind, data in found if kind == "progress")
+    fractions = [data["fraction"] for _, kind, data in found if kind == "progress"]
+    assert fractions == sorted(fractions)
+    assert 0 <= fractions[0] <= fractions[-1] <= 1
+    assert all(data["seconds_left"] >= 0 for _, kind, data in found if kind == "progress" and data["stage"] != "read")
     assert found[-1][2]["job"]["sizes"] == service.status(job)["sizes"]
 
 

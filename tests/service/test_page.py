@@ -266,6 +266,7 @@ def test_training_notes_are_shown(visit, start):
     }
     job = service.submit(options=json.dumps({"preset": "fast", "compact": changes, "for_research": True}))
     page.goto(f"{service.url}/#{job['id']}")
+    page.locator("#job summary", has_text="Training").click()  # stages are folded away
     page.locator("#job .note", has_text="Gaussians, loss").wait_for()
     page.locator("#live", has_text="Training").wait_for(state="attached")
     assert "loss" not in page.locator("#live").inner_text()  # screen readers announce only the stage

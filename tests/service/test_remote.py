@@ -37,18 +37,22 @@ HELD = kissgs.Settings.from_preset("fast", seed=HELD_SEED)
 
 def test_remote_compression_equals_local_compression(service, scene, tmp_path):
     received = []
+
+    def progress(stage, fraction, note="", seconds_left=None):
+        received.append((stage, fraction, seconds_left))
+
     with kissgs.Remote(service.url) as remote:
-        status = remote.compress(
-            scene, tmp_path / "remote.zip", settings=FAST, progress=lambda *event: received.append(event)
-        )
+        status = remote.compress(scene, tmp_path / "remote.zip", settings=FAST, progress=progress)
     kissgs.compress(scene, tmp_path / "local.zip", settings=FAST)
     assert (tmp_path / "remote.zip").read_bytes() == (tmp_path / "local.zip").read_bytes()
     assert (status["state"], status["name"], status["gaussians"]) == ("succeeded", "Schloß 1", 300)
-    stages = list(dict.fromkeys(stage for stage, _ in received))
+    stages = list(dict.fromkeys(stage for stage, _, _ in received))
     in_order = ["upload", "queue", "read", "images", "download"]
     assert [stage for stage in stages if stage in in_order] == in_order
-    assert all(0 <= fraction <= 1 for _, fraction in received)
-    assert received[-1] == ("download", 1.0)
+    fractions = [fraction for _, fraction, _ in received]
+    assert fractions == sorted(fractions)
+    assert 0 <= fractions[0] <= fractions[-1] == 1
+    assert any(left is not None for _, _, left in received)
 
 
 @pytest.mark.parametrize(

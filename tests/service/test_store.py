@@ -107,6 +107,16 @@ def test_progress_notes(store):
     assert (waiting.stage, waiting.fraction, waiting.note) == (None, 0.0, None)
 
 
+def test_the_expected_end_is_forgotten_when_a_job_starts_again(store):
+    found = add(store)
+    store.claim()
+    store.progress(found.number, "refine", 0.5, "", 12.5)
+    assert store.events(found.number)[-1].data == {"stage": "refine", "fraction": 0.5, "seconds_left": 12.5}
+    assert store.ends == pytest.approx({found.number: store.clock() + 12.5}, abs=2)
+    store.move(found.number, State.QUEUED)
+    assert store.ends == {}
+
+
 def test_work_bytes_count_while_a_job_runs(store):
     number = add(store, upload_bytes=100, disk_bytes=100, work_bytes=600).number
     assert store.disk_bytes() == 100

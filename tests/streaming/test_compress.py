@@ -13,6 +13,7 @@ import pytest
 from helpers.codec_scenes import covariances
 from helpers.format_scenes import assert_alike
 from helpers.splat_transform import convert, needs_splat_transform
+from helpers.stages import by_stages
 from helpers.streamed_scenes import FAST, TARGETS, Stop, files_of, saved_sample, small_sizes, tree_leaves
 
 import kissgs
@@ -56,6 +57,7 @@ def written(scene, tmp_path_factory):
 
             with pytest.MonkeyPatch.context() as patch:
                 small_sizes(patch, **SIZES)
+                by_stages(patch)
                 made[name] = target, compress_streamed(scene, target, settings=FAST, progress=progress), stages
         return made[name]
 
@@ -112,7 +114,7 @@ def box_of(splats):
 
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
 @pytest.mark.quick(1)
-def test_rows_of_a_leaf_are_those_of_its_part_of_space(scene, written, tmp_path, preset):
+def test_rows_of_a_leaf_are_those_of_its_part_of_space(scene, written, tmp_path, monkeypatch, preset):
     """Leaves are cells between cuts, so that no Gaussian of a leaf, merged or not, is between those of another."""
     if preset == "fast":
         target, report, _ = written("city/lod-meta.json")
@@ -122,6 +124,7 @@ def test_rows_of_a_leaf_are_those_of_its_part_of_space(scene, written, tmp_path,
         def progress(stage, fraction, note=""):
             stages.setdefault(stage, []).append(fraction)
 
+        by_stages(monkeypatch)
         report = compress_streamed(scene, target, settings=Settings.from_preset(preset), progress=progress)
         assert_items_report_within(stages)
     document = json.loads(target.read_bytes())

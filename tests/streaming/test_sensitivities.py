@@ -17,7 +17,7 @@ from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import EncodeSettings
 from kissgs.streaming import layout
 from kissgs.streaming.build import measure_file
-from kissgs.streaming.compress import compress_streamed, duration, with_time_left
+from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.levels import SIZE, halvings, leaf_groups, level_errors
 
 BALANCED = Settings()
@@ -78,22 +78,6 @@ def test_the_default_preset_spends_bits_by_sensitivity_and_goes_on_after_its_cam
     assert compress_streamed(tmp_path / "scene.ply", target, settings=BALANCED, threads=1) == report
     for path in (tmp_path / "whole").rglob("*.*"):
         assert path.read_bytes() == (tmp_path / "city" / path.relative_to(tmp_path / "whole")).read_bytes()
-
-
-def test_the_clock_counts_the_time_left_down(monkeypatch):
-    """Half of the work takes 60 s; until more of it is done, reports have the time that is left of the same again."""
-    clock, notes = [0.0], {}
-    monkeypatch.setattr("time.monotonic", lambda: clock[0])
-    receive = with_time_left(lambda stage, fraction, note="": notes.update({clock[0]: note}), rate_distortion=False)
-    half = (0.5 - 0.06) / 0.4  # of the second stage
-    events = [(0, 0.0), (60, half), (61, half), (80, half), (119, half), (121, half), (125, half + 0.1)]
-    for seconds, fraction in events:
-        clock[0] = float(seconds)
-        receive("partition" if seconds == 0 else "merge", fraction)
-    assert [notes[seconds] for seconds in (60, 61, 80, 119)] == ["60 s left", "59 s left", "40 s left", "1 s left"]
-    assert notes[121] == ""  # it takes longer than the pace before said
-    assert notes[125] == "2 min left"  # 125 s for 54 %
-    assert [duration(seconds) for seconds in (40, 100, 3000, 12600)] == ["40 s", "2 min", "50 min", "3.5 h"]
 
 
 def positions(count, seed=0):

@@ -144,18 +144,11 @@ class ViewScorer:
         self.proxy, self._pool, self._progress = proxy, pool, progress
         self._log_sizes = proxy.scales.max(axis=1)
         self._central = np.linalg.norm(proxy.means - bounds.centre, axis=1) < 2 * bounds.radius
-        self._measured = 0
 
     def measure(self, cameras: list[Camera]) -> list[ViewStats]:
         """Render a thumbnail from each camera, at the camera's size, and return its statistics."""
-
-        def report(fraction: float) -> None:
-            measured = self._measured + fraction * len(cameras)
-            self._progress("cameras", measured / (measured + 300))  # the number of further cameras is unknown
-
-        stats = self._pool.map(self._stats, cameras, report)
-        self._measured += len(cameras)
-        return stats
+        # The number of further cameras is unknown, and so is the fraction that is done.
+        return self._pool.map(self._stats, cameras, lambda fraction: self._progress("cameras", 0.0))
 
     def _stats(self, camera: Camera) -> ViewStats:
         """Render log size, log depth and centrality as the three colours, so that blending averages what is visible."""

@@ -236,7 +236,8 @@ async def get_job(
     responses={
         200: {
             "description": "Server-sent events until the job has ended: `state` with the job's status, `progress` with "
-            "a stage, its fraction from 0 to 1 and, during training, a note. Ids count from 1 without gaps.",
+            "a stage, the completed fraction of the job, `seconds_left` and, during training, a note. Ids count from 1 "
+            "without gaps.",
             "content": {"text/event-stream": {"schema": _EVENT}},
         },
         204: {"description": "The job has ended, and `Last-Event-ID` was its last event."},

@@ -1,0 +1,195 @@
+"""``JobProgress``. Oracles: jobs whose stages take as long as the test says, on a clock that it sets."""
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kissgs.core import context
+from kissgs.core.context import Deadline, JobProgress, with_seconds_left
+
+PLAN = [("kernels", 1.0), ("cameras", 4.0), ("order", 2.0), ("images", 3.0)]
+
+
+class Clock:
+    """A clock instead of the system's."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def perf_counter(self):
+        return self.now
+
+    def process_time(self):
+        return 0.0
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(context, "time", clock)
+    return clock
+
+
+def run(clock, plan, work, *, reports=10, deadline=None):
+    """Do the ``work``, pairs of a stage and its seconds, each with so many reports. Return for each event the seconds
+    since the beginning, the fraction, and the seconds left."""
+    began, events = clock.now, []
+
+    def receive(stage, fraction, note="", seconds_left=None):
+        events.append((clock.now - began, fraction, seconds_left))
+
+    job = JobProgress(receive)
+    job.expect(plan, deadline)
+    for stage, seconds in work:
+        for done in range(reports + 1):
+            job(stage, done / reports)
+            clock.now += seconds / reports * (done < reports)
+    job.stop()
+    return events, job
+
+
+def errors(events, total, start=0.25):
+    """Return by which factor the seconds left were wrong from ``start`` on, up to the last twentieth."""
+    late = [(total - at, left) for at, _, left in events if start * total <= at <= 0.95 * total]
+    return [max(left / true, true / left) for true, left in late]
+
+
+def test_a_job_as_expected_has_a_bar_and_an_estimate_like_a_clock(clock):
+    events, job = run(clock, PLAN, PLAN)
+    for at, fraction, left in events:
+        assert fraction == pytest.approx(at / 10, abs=1e-9)
+        assert left == pytest.approx(10 - at, abs=1e-9)
+    assert job.seconds == pytest.approx(dict(PLAN))
+
+
+@pytest.mark.parametrize(("speed", "start"), [(0.3, 0.25), (3.0, 0.25), (0.1, 0.6), (10.0, 0.6)])
+def test_the_estimate_follows_the_speed_of_the_machine(clock, speed, start):
+    plan = [(f"stage {n}", 1.0) for n in range(20)]
+    events, _ = run(clock, plan, [(stage, seconds / speed) for stage, seconds in plan])
+    assert max(errors(events, 20 / speed, start)) < 1.5
+
+
+def test_a_slow_stage_is_found_out_by_its_pace(clock):
+    """It takes ten times as long as expected, and then nine tenths of all the time."""
+    events, _ = run(clock, [("a", 1.0), ("b", 9.0)], [("a", 1.0), ("b", 90.0)], reports=100)
+    assert max(errors(events, 91.0, start=0.5)) < 1.5
+
+
+def test_a_stage_that_reports_nothing_is_expected_to_go_on_for_a_while(clock):
+    events = []
+    job = JobProgress(lambda stage, fraction, note="", seconds_left=None: events.append(seconds_left), [("a", 4.0)])
+    for _ in range(100):
+        job("a", 0.0)
+        clock.now += 1.0
+    assert events[:3] == [4.0, 3.0, 2.0]
+    assert all(0 < left <= 25 for left in events)
+    assert events[-1] == pytest.approx(99 / 4)
+
+
+def test_steps_that_are_left_out_are_skipped(clock):
+    events, _ = run(clock, PLAN, [("cameras", 4.0), ("images", 3.0)])
+    fractions = [fraction for _, fraction, _ in events]
+    assert fractions == sorted(fractions)
+    assert [left for _, _, left in events[-11:]] == pytest.approx([3 - 0.3 * n for n in range(11)], abs=1e-9)
+    assert fractions[-1] == 1.0
+
+
+def test_a_search_that_takes_more_containers_slows_the_bar_and_never_turns_it_back(clock):
+    container = [("order", 1.0), ("images", 2.0), ("evaluate", 1.0)]
+    events, _ = run(
+        clock, [("read", 1.0), *container * 2, ("write", 0.5)], [("read", 1.0), *container * 6, ("write", 0.5)]
+    )
+    fractions = [fraction for _, fraction, _ in events]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == pytest.approx(1.0, abs=0.02)
+    for (before, start, _), (after, end, _) in itertools.pairwise(events):
+        if 9.0 < before < after:  # the containers that nobody expected
+            assert end - start < (after - before) / 9.5
+
+
+def test_a_search_that_ends_early_jumps_forward(clock):
+    container = [("order", 1.0), ("images", 2.0)]
+    events, _ = run(clock, [*container * 5, ("write", 0.5)], [*container * 2, ("write", 0.5)])
+    assert [left for at, _, left in events if at > 5.99][:2] == pytest.approx([9.5, 0.5])
+    assert events[-1][1] == 1.0
+
+
+def test_work_that_goes_on_from_a_checkpoint(clock):
+    """The stage begins at 60 %: its pace is that of what is left of it."""
+    events = []
+    job = JobProgress(lambda stage, fraction, note="", seconds_left=None: events.append(seconds_left), [("a", 100.0)])
+    for percent in range(60, 101):
+        job("a", percent / 100)
+        clock.now += 1.0
+    assert events == pytest.approx([40.0 - n for n in range(41)])
+
+
+def test_loading_counts_once(clock):
+    """Every part of the work makes sure that kernels are loaded, which is not the beginning of a repetition."""
+    work = [("kernels", 1.0), ("cameras", 4.0), ("kernels", 0.0), ("order", 2.0), ("kernels", 0.0), ("images", 3.0)]
+    events, _ = run(clock, PLAN, work)
+    assert all(fraction == pytest.approx(at / 10, abs=1e-9) for at, fraction, _ in events)
+
+
+def test_a_deadline_bounds_the_estimate(clock):
+    """Past the deadline, the job is not taken for done."""
+    events, _ = run(clock, [("a", 200.0)], [("a", 30.0)], reports=100, deadline=Deadline(clock.now + 20.0))
+    assert max(errors([event for event in events if event[0] <= 20], 20.0)) < 1.01
+    assert all(0 < left == pytest.approx(0.05 * at) for at, _, left in events if 20 < at < 25)
+    assert events[-2][1] < 1
+
+
+def test_without_steps_nothing_is_known(clock):
+    events, job = run(clock, [], PLAN)
+    assert {(fraction, left) for _, fraction, left in events} == {(0.0, None)}
+    assert sum(job.seconds.values()) == pytest.approx(10.0)
+
+
+STAGES = st.sampled_from(["kernels", "a", "b", "c", "other"])
+SECONDS = st.floats(0, 1e4)
+PLANS = st.lists(st.tuples(STAGES, SECONDS), max_size=12)
+EVENTS = st.lists(st.tuples(STAGES, st.floats(-0.5, 1.5), SECONDS, st.none() | PLANS), max_size=40)
+
+
+@given(PLANS, EVENTS, st.none() | SECONDS)
+def test_the_fraction_never_falls_whatever_happens(plan, events, limit):
+    """Stages come in any order, at any time, and plans change in between."""
+    clock, found = Clock(), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(context, "time", clock)
+        job = JobProgress(lambda stage, fraction, note="", seconds_left=None: found.append((fraction, seconds_left)))
+        job.expect(plan, None if limit is None else Deadline(clock.now + limit))
+        for stage, fraction, seconds, changed in events:
+            if changed is not None:
+                job.expect(changed)
+            clock.now += seconds
+            job(stage, fraction)
+    fractions = [fraction for fraction, _ in found]
+    assert fractions == sorted(fractions)
+    assert all(0 <= fraction <= 1 for fraction in fractions)
+    assert all(left is None or left >= 0 for _, left in found)
+
+
+def test_receivers_get_what_they_have_parameters_for():
+    got = []
+    receivers = [
+        lambda stage, fraction: got.append((stage, fraction)),
+        lambda stage, fraction, note="": got.append((stage, fraction, note)),
+        lambda stage, fraction, note="", scene=7: got.append((stage, fraction, note, scene)),
+        lambda stage, fraction, note="", seconds_left=None: got.append((stage, fraction, note, seconds_left)),
+        lambda *event: got.append(event),
+    ]
+    for receiver in receivers:
+        with_seconds_left(receiver)("order", 0.5, "", 3.0)
+    assert got == [("order", 0.5), ("order", 0.5, ""), ("order", 0.5, "", 7), ("order", 0.5, "", 3.0), ("order", 0.5)]
+    got.clear()
+    for receiver in receivers[1:]:
+        with_seconds_left(receiver)("refine", 0.5, "loss", None)
+    assert got == [
+        ("refine", 0.5, "loss"),
+        ("refine", 0.5, "loss", 7),
+        ("refine", 0.5, "loss", None),
+        ("refine", 0.5, "loss"),
+    ]
