@@ -24,6 +24,7 @@ from kissgs.evaluation.scene_parts import (
     prominence,
 )
 from kissgs.rendering.camera import Camera
+from kissgs.rendering.constants import NEAR
 from kissgs.rendering.cpu.frame import draw
 from kissgs.rendering.rasterizer import drawn_opacities
 
@@ -126,12 +127,15 @@ MIN_SIGMAS = 5.0  # smallest distance of a camera to its target Gaussian, in the
 MIN_MEAN_ALPHA = 0.02  # an image with a smaller mean alpha counts as empty
 INSIDE_SIGMAS = 3.0  # a camera within this Mahalanobis distance of a Gaussian's mean counts as inside it
 MAX_INSIDE_SHARE, MAX_SINGLE_SHARE = 0.5, 0.3  # of an image, by Gaussians around the camera, by a single one
+CUT_MARGIN = 0.1  # share of the near plane's depth within which the least change shows or hides a Gaussian whole
+MAX_CUT_SHARE = 0.01  # of an image, by such Gaussians
 
 
 def evaluation_views(splats: Splats, context: Context = DEFAULT_CONTEXT, *, seed: int = 0) -> Views:
     """Draw evaluation cameras over a whole scene; all of them are test views. Four kinds alternate, see :data:`KINDS`.
-    A camera is drawn again only if its image is empty, or mostly covered by Gaussians that contain the camera or by a
-    single one. Cameras are added for separate parts of the scene whose loss would hardly change any of these images.
+    A camera is drawn again only if its image is empty, mostly covered by Gaussians that contain the camera or by a
+    single one, or if Gaussians at the near plane are in it. Cameras are added for separate parts of the scene whose
+    loss would hardly change any of these images.
     The cameras depend on the scene and the seed only, not on the threads."""
     if seed < 0:
         raise InvalidViewsError(f"the seed of evaluation cameras is {seed}; give a whole number from 0")
@@ -267,6 +271,7 @@ def _whole_log_uniform(rng: np.random.Generator, low: int, high: int) -> int:
 def _check_camera(parts: Parts, camera: Camera) -> tuple[bool, Float64[np.ndarray, " P"]]:
     """Return whether the image is neither empty nor covered by Gaussians too near, and each part's share of it."""
     with Workers(1) as single:
+        cut = _cut_share(parts.splats, camera, single)
         frame = draw(parts.splats, camera, _grey(0.0), single)
         if 1 - float(frame.transmittance.mean(dtype=np.float64)) < MIN_MEAN_ALPHA:
             return False, np.zeros(len(parts.parts))
@@ -274,5 +279,18 @@ def _check_camera(parts: Parts, camera: Camera) -> tuple[bool, Float64[np.ndarra
     pixels = frame.transmittance.size
     shown = np.flatnonzero(weights > 0)
     inside = mahalanobis_distances(parts.splats.select(shown), camera.position) < INSIDE_SIGMAS
-    accepted = weights.max() < MAX_SINGLE_SHARE * pixels and weights[shown[inside]].sum() < MAX_INSIDE_SHARE * pixels
+    single_one, around = weights.max() / pixels, weights[shown[inside]].sum() / pixels
+    accepted = single_one < MAX_SINGLE_SHARE and around < MAX_INSIDE_SHARE and cut < MAX_CUT_SHARE
     return bool(accepted), parts.shares(weights, pixels)
+
+
+def _cut_share(splats: Splats, camera: Camera, pool: Workers) -> float:
+    """Return the share of an image by Gaussians whose depth is about that of the near plane, if all are in front."""
+    depths = splats.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+    cut = np.abs(depths - NEAR) < CUT_MARGIN * NEAR
+    if not cut.any():
+        return 0.0
+    viewmat = camera.viewmat.copy()
+    viewmat[2, 3] += CUT_MARGIN * NEAR
+    frame = draw(splats, replace(camera, viewmat=viewmat), _grey(0.0), pool)
+    return float(blending_weights(frame, pool)[cut].sum() / frame.transmittance.size)
