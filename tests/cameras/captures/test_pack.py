@@ -9,6 +9,7 @@ from helpers.captured_scene import write_capture
 from PIL import Image
 
 from kissgs.cameras.captures.load import load_views, pack_capture
+from kissgs.cameras.photographs import read_photo_header
 from kissgs.core.errors import InvalidViewsError
 
 
@@ -76,7 +77,8 @@ def test_large_photographs_are_packed_as_they_are_used(tmp_path):
     transparent = Image.fromarray(rng.integers(0, 255, (1100, 1650, 4), dtype=np.uint8))
     transparent.save(capture / "images" / "b.png")
     unpacked, _ = packed(capture, tmp_path)
-    sizes = {path.name: Image.open(path).size for path in (unpacked / "images").iterdir()}
+    headers = {path.name: read_photo_header(path) for path in (unpacked / "images").iterdir()}
+    sizes = {name: (header.width, header.height) for name, header in headers.items()}
     assert sizes == {"a.png": (1600, 1066), "b.png": (1650, 1100), "c.png": (1600, 1066)}
     assert_same_views(load_views(unpacked, unpacked=True), load_views(capture))
 
