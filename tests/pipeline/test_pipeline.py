@@ -312,3 +312,13 @@ def test_a_capture_may_be_given_by_its_path(tmp_path, kind):
     assert found.source == views.source
     with pytest.raises(InvalidViewsError, match="nowhere"):
         kissgs.compress(scene, views=kind(tmp_path / "nowhere"))
+
+
+@pytest.mark.parametrize("preset", ["fast", "balanced"])
+def test_the_order_leads_back_to_the_input_of_a_compaction(preset):
+    pruned = {"ratio": 0.5, "method": "prune", "sparsify_steps": 0, "refine_steps": 0, "views": 24, "view_size": 48}
+    result = kissgs.compress(SCENE, settings=Settings.research(preset, compact=pruned))
+    found = kissgs.decompress(result.files)
+    assert len(found) == len(result.order) <= 60
+    distances = np.linalg.norm(found.means[:, None] - SCENE.means[None], axis=2)
+    assert (distances.argmin(axis=1) == result.order).all()

@@ -86,6 +86,6 @@ def test_the_estimate_falls_as_time_passes():
 
 
 def test_the_progress_of_a_job_says_when_it_ends():
-    """Until then; what takes longer is not done."""
+    """The estimate is the time until then, and 0 where the job takes longer."""
     assert seconds(Records(ends=1007.5), time_limit="60s", started=960) == 7.5
     assert seconds(Records(ends=990.0), time_limit="60s", started=960) == 0
