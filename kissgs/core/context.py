@@ -156,8 +156,8 @@ class JobProgress:
         self._step_began, self._step_first, self._step_fraction = now, fraction, fraction
 
     def _room(self) -> float:
-        """Return the least share of the job to keep for its end and for the stages that have not begun yet: kernels that
-        are compiled before may take most of the time, and nobody expects that."""
+        """Return the least share of the job to keep for its end and for the stages that have not begun: the compilation
+        of kernels before them may take most of the time, which nobody expects."""
         begun = {name for name, _ in self._steps[: self._at + 1]} | {*self._factor, *self.seconds}
         return ROOM * (1 + len({name for name, _ in self._steps[self._at + 1 :]} - begun))
 

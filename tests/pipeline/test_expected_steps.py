@@ -55,7 +55,8 @@ class Recorder:
         self.stages, self.fraction, self.seconds_left = [], 0.0, None
 
     def __call__(self, stage, fraction, note="", seconds_left=None):
-        assert self.fraction <= fraction <= 1 and self.fraction < 1, "an event after the end"
+        assert self.fraction <= fraction <= 1
+        assert self.fraction < 1, "an event after the end"
         assert seconds_left is None or seconds_left >= 0
         self.stages.append(stage)
         self.fraction, self.seconds_left = fraction, seconds_left
