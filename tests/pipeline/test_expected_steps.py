@@ -24,7 +24,6 @@ def few(preset="balanced", **changes):
 ONCE = {
     "fast": few("fast"),
     "balanced": few(),
-    "small": Settings.from_preset("small"),
     "paper": Settings.from_preset("paper"),
     "pruned": few("fast", compact={"ratio": 0.5, **VIEWS}),
     "trained": few(compact={"ratio": 0.5, **TRAINED}),
