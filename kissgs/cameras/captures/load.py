@@ -6,7 +6,7 @@ import io
 import zipfile
 from collections.abc import Sequence
 from os import PathLike
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image
@@ -20,6 +20,7 @@ from kissgs.cameras.captures.photos import (
     find_photos,
     is_absolute,
     open_file,
+    quoted,
     searched_folders,
     without_parents,
 )
@@ -35,6 +36,7 @@ from kissgs.cameras.views import View, Views, black
 from kissgs.core.array_types import Float32
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidViewsError
+from kissgs.formats import MAX_PACKED_NAME, PHOTOGRAPHS, is_packable
 from kissgs.io.files import atomic_file
 from kissgs.rendering.camera import Camera
 
@@ -248,6 +250,11 @@ def pack_capture(path: Path, destination: Path, progress: Progress = silent) -> 
     packed = {_packed_name(posed, photo): (posed, photo) for posed, photo in zip(capture.images, photos, strict=False)}
     if len(packed) < len({photo.path for photo in photos}):
         raise InvalidViewsError(f"two photographs of {path} have the same name in different folders; rename one")
+    if (refused := next((name for name in packed if not is_packable(name)), None)) is not None:
+        longest = f"more than {MAX_PACKED_NAME} bytes"
+        raise InvalidViewsError(
+            f"the name {quoted(refused)} of a photograph is not printable or has {longest}; rename it"
+        )
     cameras, folder = dict(capture.files), path if path.is_dir() else path.parent
     if (dataparser := dataparser_file((folder, capture.root))) is not None:
         cameras[DATAPARSER_TRANSFORMS] = dataparser
@@ -261,13 +268,17 @@ def pack_capture(path: Path, destination: Path, progress: Progress = silent) -> 
 
 
 def _packed_name(posed: PosedImage, photo: FoundPhoto) -> str:
-    """Return the name under which :func:`find_photos` finds a photograph inside the root of an unpacked capture."""
+    """Return the name under which :func:`find_photos` finds a photograph inside the root of an unpacked capture. If the
+    camera file has none of the endings that a service unpacks, it gets that of the file, or any: content decides."""
     parts = without_parents(posed.photo).parts
     if is_absolute(posed.photo):
         parts = (IMAGES if photo.factor == 1 else f"{IMAGES}_{photo.factor}", *parts[1:])
     elif len(parts) > 1:
         parts = (photo.folder.name, *parts[1:])  # perhaps that of a scaled copy
-    return "/".join(parts)
+    name, suffix = "/".join(parts), photo.path.suffix
+    if PurePosixPath(name).suffix.lower() in PHOTOGRAPHS:
+        return name
+    return name + (suffix if suffix.lower() in PHOTOGRAPHS else ".png")
 
 
 def _packed_photo(posed: PosedImage, photo: FoundPhoto) -> bytes:
