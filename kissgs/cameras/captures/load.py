@@ -97,7 +97,7 @@ def load_views(
             raise InvalidViewsError(f"{name} must be {least} or more, not {value}")
     if hold_out == 1:
         raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
-    path = Path(path)
+    path = archive = Path(path)
     try:
         path = _uppermost_with_cameras(path) if unpacked else path
         capture, folder = _read_capture(path), path if path.is_dir() else path.parent
@@ -116,12 +116,16 @@ def load_views(
         file = None if photo is None else photo.path
         views.append((_view(posed, file, nominal, _reduced(size, limit), background), posed.split))
     train, test = _split(views, hold_out)
+    source = capture.source
+    if unpacked:  # where it is unpacked is nobody's concern
+        source = source.replace(f"{archive}/", "").replace(f"{archive}", "the archive")
     if photos is not None:
-        source = f"{capture.source}, photographs of {_folders(photos)}"
+        source = f"{source}, photographs of {_folders(photos)}"
         return Views(train, test, background, source, similarities=moves)
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
-    return Views(train, test, background, f"{capture.source}, no photographs", note, moves)
+    note = "the archive has no photographs" if unpacked else note
+    return Views(train, test, background, f"{source}, no photographs", note, moves)
 
 
 def as_views(views: Views | str | PathLike[str] | None) -> Views | None:
@@ -155,11 +159,17 @@ def _read_capture(path: Path) -> Capture:
 
 
 def _uppermost_with_cameras(path: Path) -> Path:
-    """Return the first of ``path`` and the folders in it, the uppermost first, that has cameras; else ``path``."""
+    """Return the first of ``path`` and the folders in it, the uppermost first, that has cameras; else ``path``. Refuse
+    cameras in another folder that is not inside this one: a model is inside, a second capture beside."""
     below = sorted((each for each in path.rglob("*") if each.is_dir()), key=lambda each: (len(each.parts), each))
     jsons = ("transforms.json", "transforms_train.json")
-    has_cameras = (each for each in (path, *below) if find_colmap(each) or any((each / n).is_file() for n in jsons))
-    return next(has_cameras, path)
+    has_cameras = [each for each in (path, *below) if find_colmap(each) or any((each / n).is_file() for n in jsons)]
+    first = has_cameras[0] if has_cameras else path
+    second = next((each for each in has_cameras if not each.is_relative_to(first)), None)
+    if second is not None:
+        names = " and ".join(quoted(str(each.relative_to(path))) for each in (first, second))
+        raise InvalidViewsError(f"the archive has two captures, {names}; pack one of them")
+    return first
 
 
 def _view(
