@@ -4,6 +4,7 @@ whose limits of memory and time end what a hostile archive begins."""
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import stat
@@ -21,8 +22,9 @@ from typing import IO, Any
 import kissgs
 from kissgs.formats import CAMERA_FILES, PHOTOGRAPHS, is_packable
 
-from .job_process import Task, sync_folder
+from .job_process import Task, sync_folder, write_file
 
+RECORD = "unpacked.json"  # the bytes of each file of a capture, to notice when a later job finds less
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
 
 DAMAGED = (
@@ -40,8 +42,11 @@ Opener = Callable[[], IO[bytes] | None]
 
 def unpack(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     """Unpack what a capture needs of the archive ``source``, if there is one, into the folder ``work``, and load its
-    views. Return the ``bytes`` of all files, and whether there are ``photographs`` to train on and to evaluate with."""
-    folder = Path(task["work"])
+    views. Return the ``bytes`` of all files, and whether there are ``photographs`` to train on and to evaluate with;
+    ``bytes`` is None of a capture that was unpacked earlier and has lost files."""
+    folder, record = Path(task["work"]), Path(task["work"]) / RECORD
+    if not task["source"] and not (record.exists() and json.loads(record.read_bytes()) == _sizes(folder)):
+        return {"bytes": None}
     skipped: list[PurePosixPath] = []
     try:
         with ExitStack() as stack:
@@ -63,11 +68,18 @@ def unpack(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     if views.note and (unused := _photograph(skipped, views)):
         remedy = "pack photographs as .png, .jpg or .webp, or the cameras alone"
         raise _refusal(f"has no photographs that can be used, but {str(unused)[:80]!r}; {remedy}")
-    paths = [folder, *folder.rglob("*")]
-    for path in paths:
+    if task["source"]:
+        write_file(record, json.dumps(_sizes(folder)).encode())
+    for path in (folder, *folder.rglob("*")):
         if path.is_dir():
             sync_folder(path)
-    return {"bytes": sum(path.stat().st_size for path in paths if path.is_file()), "photographs": views.has_photographs}
+    return {"bytes": sum(_sizes(folder).values()) + record.stat().st_size, "photographs": views.has_photographs}
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Return the bytes of each file of a capture."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != RECORD)
+    return {str(path.relative_to(folder)): path.stat().st_size for path in files}
 
 
 def _write_files(

@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import re
+import shutil
 import signal
 import stat
 import tarfile
@@ -93,7 +94,7 @@ def test_the_bytes_are_those_of_a_local_compression(service, folder, scene, expe
     assert status["options"]["capture"].startswith("sha256:")
     stored = service.folder / "jobs" / status["id"] / "capture"
     names = {path.name for path in stored.rglob("*") if path.is_file()}
-    assert names == {"transforms.json", *(f"{n}.png" for n in range(9))}
+    assert names == {"unpacked.json", "transforms.json", *(f"{n}.png" for n in range(9))}
 
 
 TRAINED = {
@@ -361,10 +362,29 @@ def test_a_killed_service_goes_on_and_leaves_nothing(start_process, folder, scen
     service.restart()
     assert service.only_result(job) == service.only_result(second) == expected
     assert sorted(path.name for path in (service.folder / "jobs").iterdir()) == sorted([job["id"], second["id"]])
-    capture = service.folder / "jobs" / second["id"] / "capture"
-    (capture / "images" / "0.png").unlink()
-    found = problem(by_reference(service, scene, {"capture": job["options"]["capture"]}), 422, "invalid-views")
-    assert "1 of 9 photographs is missing" in found["detail"]
+
+
+@pytest.mark.parametrize("lost", ["images", "images/0.png", "transforms.json", "unpacked.json"])
+def test_a_capture_that_has_lost_files_is_sent_again(service, folder, scene, lost):
+    archive = zipped({**files_of(folder), f"images/{lost.replace('/', ' ')}.png": lost.encode()})
+    job = submitted(service, scene, archive, {"preset": "fast"})
+    service.ended(job)
+    path = service.folder / "jobs" / job["id"] / "capture" / lost
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    found = problem(by_reference(service, scene, {"capture": job["options"]["capture"]}), 410, "gone")
+    assert "send its archive" in found["detail"]
+    assert service.uploads() == []
+
+
+def test_a_repeated_request_gives_its_job_without_the_capture(service, folder, scene):
+    archive, key = zipped({**files_of(folder), "images/key.png": b"of this test"}), {"Idempotency-Key": "capture"}
+    job = post(service, scene, archive, **key).json()
+    service.ended(job)
+    shutil.rmtree(service.folder / "jobs" / job["id"] / "capture")
+    options = {"options": json.dumps({**OPTIONS, "capture": job["options"]["capture"]})}
+    assert service.http.post("/v1/jobs", content=scene, params=options, headers=key).json()["id"] == job["id"]
+    assert post(service, scene, archive, **key).json()["id"] == job["id"]
+    problem(service.http.post("/v1/jobs", content=scene, headers=key), 422, "key-reused")
 
 
 @pytest.mark.quick(0)
