@@ -88,6 +88,7 @@ class Remote:
         evaluate: bool = False,
         origin: Literal["auto"] | None = None,
         capture: str | PathLike[str] | None = None,
+        force_views: bool = False,
         overwrite: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
@@ -102,6 +103,7 @@ class Remote:
             origin: see :class:`kissgs.ReadOptions`.
             capture: zip or tar of photographs of the scene and their cameras, as :func:`kissgs.load_views` reads them;
                 it is sent unless the service has kept it for an earlier job.
+            force_views: accept a ``capture`` whose photographs do not show the scene.
             overwrite: whether to replace ``destination`` if it exists.
             progress: receives "upload", "queue", the stages of the service, "download", and "wait for server" with the
                 reason as a note. An exception that it raises cancels the job.
@@ -127,6 +129,7 @@ class Remote:
             evaluate=evaluate,
             origin=origin,
             capture=capture,
+            force_views=force_views,
             progress=share(0.0, 0.1),
         )
         try:
@@ -150,6 +153,7 @@ class Remote:
         evaluate: bool = False,
         origin: Literal["auto"] | None = None,
         capture: str | PathLike[str] | None = None,
+        force_views: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
         """Upload a scene; retry if the connection breaks or the service is overloaded, without a second job.
@@ -161,6 +165,7 @@ class Remote:
             evaluate: whether the service also compares rendered images.
             origin: see :class:`kissgs.ReadOptions`.
             capture: see :meth:`compress`.
+            force_views: see :meth:`compress`.
             progress: receives "upload" and "wait for server".
 
         Returns:
@@ -169,10 +174,11 @@ class Remote:
         Raises:
             KissgsError: see :meth:`compress`.
         """
-        path, key = Path(source), uuid.uuid4().hex
+        path, key, progress = Path(source), uuid.uuid4().hex, Share(progress)
         options = {**_given(settings or Settings()), "format": container, "evaluate": evaluate}
         options |= {} if origin is None else {"origin": origin}
         options |= {} if capture is None else {"capture": f"sha256:{_sha256(Path(capture))}"}
+        options |= {"force_views": True} if force_views else {}  # which services of older versions do not know
         params = {"options": json.dumps(options), "name": path.name}
 
         def send(kind: str, parts: Sequence[bytes | Path]) -> dict[str, Any]:
@@ -203,7 +209,7 @@ class Remote:
         Raises:
             KissgsError: the job failed or was cancelled.
         """
-        last, receive = "", with_seconds_left(progress)
+        last, receive = "", Share(progress)
 
         def listen() -> None:
             nonlocal last
@@ -214,11 +220,11 @@ class Remote:
                     if event == "progress":
                         receive(data["stage"], data["fraction"], data.get("note", ""), data.get("seconds_left"))
                     elif data["state"] == "queued":
-                        progress("queue", 0.0)
+                        receive("queue", 0.0)
 
         while True:
-            self._with_retries(listen, progress)
-            status = self._with_retries(lambda: self.status(job), progress)
+            self._with_retries(listen, receive)
+            status = self._with_retries(lambda: self.status(job), receive)
             if status["state"] not in ("queued", "running"):
                 break
             time.sleep(0.2)  # the stream ended early: the service is stopping
@@ -235,6 +241,8 @@ class Remote:
         Raises:
             KissgsError: see :meth:`compress`.
         """
+
+        progress = Share(progress)
 
         def fetch() -> None:
             with self._http.stream("GET", status["links"]["result"]) as response:
@@ -315,7 +323,7 @@ class Remote:
 class Share:
     """Receiver of a part of a job, from one fraction of the whole to another; a part that begins again waits."""
 
-    def __init__(self, progress: Progress, start: float, end: float) -> None:
+    def __init__(self, progress: Progress, start: float = 0.0, end: float = 1.0) -> None:
         self._receive, self._start, self._end, self._latest = with_seconds_left(progress), start, end, start
 
     def __call__(self, stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:

@@ -188,6 +188,7 @@ def page_scene(
         near = replace(splats, origin=WORLD)  # viewers draw a scene better near the origin
         write_ply(file, near, progress=progress, comment=comment)
         found = PageScene(f"{_stem(source)}.ply", file.getvalue(), converted=recognise(source) != "ply")
+    progress.stop()
     return replace(found, notes=(*splats.notes, *cleaned.notes))
 
 

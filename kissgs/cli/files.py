@@ -107,7 +107,12 @@ def progress_bar(quiet: bool, steps: Sequence[Step] = ()) -> Iterator[Receiver]:
             end = None if seconds_left is None else (bar.tasks[task].elapsed or 0.0) + seconds_left
             bar.update(task, description=described, completed=fraction, end=end)
 
-        yield JobProgress(receive, steps) if steps else receive
+        if not steps:
+            yield receive
+            return
+        job = JobProgress(receive, steps)
+        yield job
+        job.stop()
 
 
 # Input and output files of the commands, and the handling of failures among several inputs.

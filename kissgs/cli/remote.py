@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -58,13 +57,24 @@ def compress(
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job."""
     from kissgs.cli.tables import status_table
+    from kissgs.io.files import open_scene_file, refuse_existing
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
     kind, settings = named_container(encoding.container, output), encoding.settings()
-    with _service(server) as remote, _packed(views, quiet or as_json) as capture:
+    with _service(server) as remote, tempfile.TemporaryDirectory() as folder:
+
+        @functools.cache
+        def packed() -> Path | None:
+            if views is None:
+                return None
+            _check_reachable(remote)
+            return _pack(views, Path(folder), quiet or as_json)
 
         def work(scene: str, target: Path) -> Result:
+            refuse_existing(target, overwrite=force)  # here, as packing may take minutes
+            with open_scene_file(Path(scene)):
+                capture = packed()
             with progress_bar(quiet or as_json) as progress:
                 status = remote.compress(
                     scene,
@@ -135,19 +145,25 @@ def _service(server: str) -> Remote:
     return Remote(server, key=os.environ.get("KISSGS_KEY"))
 
 
-@contextlib.contextmanager
-def _packed(views: Path | None, quiet: bool) -> Iterator[Path | None]:
-    """Pack the capture, if there is one, into a temporary file."""
-    if views is None:
-        yield None
-        return
+def _check_reachable(remote: Remote) -> None:
+    """Raise RemoteError if the service cannot be reached or refuses the key; it may be overloaded for a while."""
+    from kissgs.core.errors import RemoteError
+
+    try:
+        remote.jobs(1)
+    except RemoteError as error:
+        if error.retry_after is None:
+            raise
+
+
+def _pack(views: Path, folder: Path, quiet: bool) -> Path:
+    """Pack a capture into an archive in the folder."""
     from kissgs.cameras.captures.load import pack_capture
 
-    with tempfile.TemporaryDirectory() as folder:
-        archive = Path(folder) / "capture.zip"
-        with progress_bar(quiet) as progress:
-            pack_capture(views, archive, progress)
-        yield archive
+    archive = folder / "capture.zip"
+    with progress_bar(quiet) as progress:
+        pack_capture(views, archive, progress)
+    return archive
 
 
 def _announcing(progress: Progress, server: str, quiet: bool) -> Progress:

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from kissgs.core.errors import StopSearch
+from kissgs.core.errors import Cancelled, StopSearch
 
 # Progress events of long work: one callback for the command line, the service and tests.
 
@@ -28,7 +28,8 @@ class Progress(Protocol):
 
         Args:
             stage: name of the current stage ("read", "order", "codebook", …).
-            fraction: fraction of the whole call that is done, 0 to 1; it never falls.
+            fraction: fraction of the whole call that is done, 0 to 1; it never falls. It is 1 in the last event only,
+                when the work is done and :class:`kissgs.Cancelled` has no effect any more.
             note: text for the user: the state of training (Gaussians, loss, PSNR) and of a search for a goal; empty in
                 other stages.
         """
@@ -67,6 +68,8 @@ LOADING = "kernels"  # the stage that takes time only when it comes first
 PRIOR = 0.1  # share of all work after which what is measured counts as much as what is expected
 OVERDUE = 0.25  # expected rest of a stage that takes longer than expected, in units of the time it has taken
 PAST_DEADLINE = 0.05  # the same of a job
+ROOM = 0.01  # least share of the job that its end, and each stage that has not begun yet, is expected to take
+LEAST_SECONDS = 0.01  # left before the end
 
 
 class JobProgress:
@@ -75,7 +78,8 @@ class JobProgress:
 
     The seconds left are those of the expected steps, corrected by the speed so far, and by the pace of the current one.
     Steps that are left out are skipped, and a stage that comes again without being expected repeats the steps since it
-    came last. The fraction gains its share of what is left: where that turns out to be more, it becomes slower."""
+    came last. The fraction gains its share of what is left: where that turns out to be more, it becomes slower. It is
+    below 1 until :meth:`stop`, since a search may go on after all expected steps."""
 
     def __init__(self, receiver: Progress, steps: Sequence[Step] = ()) -> None:
         """Begin a job; see :meth:`expect` for ``steps``."""
@@ -90,6 +94,7 @@ class JobProgress:
         self._receive, self._cpu_began = with_seconds_left(receiver), time.process_time()
         self._began = self._latest = self._stage_began = time.perf_counter()
         self._stage: str | None = None
+        self._last_stage: str | None = None
         self._factor: dict[str, float] = {}  # by stage, of its seconds to those expected, the last time
         self.expect(steps)
 
@@ -112,15 +117,21 @@ class JobProgress:
             self._step_fraction = max(self._step_fraction, fraction)
         if self._steps:
             since = self._began if self.seconds_left is None else self._latest
-            self.seconds_left = self._left(now)
-            self.fraction += (1 - self.fraction) * (now - since) / max(now - since + self.seconds_left, 1e-9)
-        self._latest = now
+            room = self._room()
+            self.seconds_left = max(self._left(now), room * (now - self._began), LEAST_SECONDS)
+            gained = (1 - self.fraction) * (now - since) / (now - since + self.seconds_left)
+            self.fraction = max(self.fraction, min(self.fraction + gained, 1 - room))
+        self._latest, self._last_stage = now, stage
         self._receive(stage, self.fraction, note, self.seconds_left)
 
     def stop(self) -> None:
-        """End the current stage."""
+        """End the job, whose last event has fraction 1: the work is done, and cannot be cancelled any more."""
         self._end_stage(time.perf_counter())
         self.cpu_seconds = time.process_time() - self._cpu_began
+        if self._last_stage is not None:
+            self.fraction, self.seconds_left = 1.0, 0.0
+            with suppress(Cancelled):
+                self._receive(self._last_stage, 1.0, "", 0.0)
 
     def _end_stage(self, now: float) -> None:
         if self._stage is not None:
@@ -143,6 +154,12 @@ class JobProgress:
             self._steps[self._at + 1 :] = self._steps[known[-1] :]
         self._at = following[0] if following else self._at + 1
         self._step_began, self._step_first, self._step_fraction = now, fraction, fraction
+
+    def _room(self) -> float:
+        """Return the least share of the job to keep for its end and for the stages that have not begun: the compilation
+        of kernels before them may take most of the time, which nobody expects."""
+        begun = {name for name, _ in self._steps[: self._at + 1]} | {*self._factor, *self.seconds}
+        return ROOM * (1 + len({name for name, _ in self._steps[self._at + 1 :]} - begun))
 
     def _slower(self, measured: float, expected: float) -> float:
         """Return the factor on the seconds of steps to come, after ``measured`` ones instead of ``expected``."""

@@ -266,6 +266,7 @@ def evaluate(
     evaluation = None if views is None else compared(views, split, 0, given)
     surroundings = compared(drawn, "all", given, len(drawn.test))
     progress("evaluate", 1.0)
+    progress.stop()
     return surroundings if evaluation is None else replace(evaluation, surroundings=surroundings)
 
 

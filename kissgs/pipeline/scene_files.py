@@ -402,6 +402,7 @@ def decompress(
     splats = in_world(splats)
     if destination is not None:
         save_ply(splats, destination, overwrite=overwrite, progress=progress)
+    progress.stop()
     return splats
 
 

@@ -133,12 +133,13 @@ def compress_streamed(
     if scratch.read_json(work / REPORT) is None:
         scratch.check_destination(manifest, source, overwrite=overwrite)
     with scratch.claimed(work, {"container": container, **_identity(source, settings, reading)}):
+        job = JobProgress(progress)
         if (found := scratch.read_json(work / REPORT)) is None:
-            job = JobProgress(progress)
             layout = _partition(work, source, container, settings, reading, threads, job)
             found = asdict(_make(work, layout, settings, runner, threads, job))
             write_json(work / REPORT, found)
         scratch.finish(work, manifest, source, overwrite=overwrite)
+    job.stop()
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
 
 

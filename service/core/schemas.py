@@ -110,7 +110,9 @@ class Progress(ApiModel):
     """Progress of a running job, as the library reports it."""
 
     stage: str = Field(description="Name of the current stage.", examples=["codebook"])
-    fraction: float = Field(ge=0, le=1, description="Completed fraction of the job, from 0 to 1; never falls.")
+    fraction: float = Field(
+        ge=0, le=1, description="Completed fraction of the job, from 0 to 1; starts again when the job does."
+    )
     note: str | None = Field(
         None,
         max_length=NOTE_CHARS,

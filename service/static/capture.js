@@ -56,6 +56,7 @@ export function captureField(limits, changed) {
     choose,
     /** @returns {File | string | null} */
     chosen: () => held,
+    clear: () => hold(null, ""),
     /** Name the capture of an earlier job. @param {string | null} [reference] */
     prefer: (reference = null) => hold(reference, "The photographs of the earlier job"),
   };

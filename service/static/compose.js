@@ -73,6 +73,8 @@ export function composer(limits, presets, submit) {
     show: (visible) => (form.hidden = !visible),
     focus: () => byId("compose-title").focus({ preventScroll: true }),
     prefer: fields.prefer,
+    /** Forget the photographs of the scene that was sent: the next one has others. */
+    sent: fields.capture.clear,
   };
 }
 
@@ -88,8 +90,11 @@ function optionFields(limits, presets) {
 
   const capture = captureField(limits, refresh);
   let trains = false;
+  const decided = { finetune: false, keep: false }; // by the user, or by an earlier job
 
   finetune.disabled = !limits.training;
+  finetune.addEventListener("change", () => (decided.finetune = true));
+  byId("keep").addEventListener("change", () => (decided.keep = true));
 
   /** Enable the choices that can be combined, and explain them. */
   function refresh() {
@@ -98,8 +103,8 @@ function optionFields(limits, presets) {
     const [preset, plans, aims] = [list.chosen(), list.plans(), goal.chosen() !== null];
     if (trains !== (limits.training && captured && aims)) {
       trains = !trains; // on photographs, which serves the goal best
-      finetune.checked = trains;
-      keep.prefer(trains ? { auto_count: true } : {});
+      if (!decided.finetune) finetune.checked = trains;
+      if (!decided.keep) keep.prefer(trains ? { auto_count: true } : {});
     }
     keep.refresh(aims, time.chosen() !== null);
     time.refresh({ preset, plans, captured, goal: aims, tunes: finetune.checked, kept: keep.chosen() });
@@ -132,6 +137,7 @@ function optionFields(limits, presets) {
     },
     /** Set the options of an earlier job. @param {import("./api.js").JobOptions} earlier */
     prefer(earlier) {
+      decided.finetune = decided.keep = true;
       list.choose(earlier.preset);
       goal.prefer(earlier.encode);
       capture.prefer(earlier.capture);

@@ -52,6 +52,7 @@ function run(limits, presets) {
   /** @param {import("./api.js").Status} status @param {import("./compose.js").Submission} submission */
   function accepted(status, submission) {
     submissions.set(status.id, submission);
+    compose.sent();
     if (!jobInAddress()) location.hash = status.id; // unless another job is open
     refresh();
   }

@@ -7,6 +7,8 @@ import { problemBox } from "./problems.js";
 
 /** @typedef {import("./compose.js").Submission} Submission */
 
+const GONE = "The service no longer has the photographs of the earlier job. Go back, and choose their archive again.";
+
 /**
  * Create the upload card, for one upload at a time; other jobs can be opened during an upload.
  * @param {{started: () => void, accepted: (job: import("./api.js").Status, submission: Submission) => void,
@@ -145,14 +147,15 @@ function progressView({ file, capture }, abort) {
  * @param {() => void} retry
  * @param {() => void} giveUp
  */
-function failedView({ file }, problem, retry, giveUp) {
+function failedView({ file, options }, problem, retry, giveUp) {
+  const gone = problem.code === "gone" && options.capture ? { ...problem.document, detail: GONE } : problem.document;
   const again = problem.document.retryable
     ? el("button", { class: "primary", type: "button", onclick: retry }, "Try again")
     : null;
   return [
     el("p", { class: "kicker bad" }, "Upload failed"),
     el("h1", { id: "upload-title", tabindex: "-1" }, file.name),
-    problemBox(problem.document),
+    problemBox(gone),
     el("div", { class: "buttons" }, again, el("button", { class: "quiet", type: "button", onclick: giveUp }, "Back")),
   ];
 }

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kissgs import Cancelled
 from kissgs.core import context
 from kissgs.core.context import Deadline, JobProgress, with_seconds_left
 
@@ -58,9 +59,11 @@ def errors(events, total, start=0.25):
 
 def test_a_job_as_expected_has_a_bar_and_an_estimate_like_a_clock(clock):
     events, job = run(clock, PLAN, PLAN)
-    for at, fraction, left in events:
+    for at, fraction, left in events[:-2]:
         assert fraction == pytest.approx(at / 10, abs=1e-9)
         assert left == pytest.approx(10 - at, abs=1e-9)
+    assert events[-2][1:] == pytest.approx((0.99, 0.1))
+    assert events[-1][1:] == (1.0, 0.0)
     assert job.seconds == pytest.approx(dict(PLAN))
 
 
@@ -92,8 +95,41 @@ def test_steps_that_are_left_out_are_skipped(clock):
     events, _ = run(clock, PLAN, [("cameras", 4.0), ("images", 3.0)])
     fractions = [fraction for _, fraction, _ in events]
     assert fractions == sorted(fractions)
-    assert [left for _, _, left in events[-11:]] == pytest.approx([3 - 0.3 * n for n in range(11)], abs=1e-9)
+    assert [left for _, _, left in events[-12:-2]] == pytest.approx([3 - 0.3 * n for n in range(10)], abs=1e-9)
     assert fractions[-1] == 1.0
+
+
+def test_rounds_of_a_search_after_all_expected_steps_leave_the_bar_below_its_end(clock):
+    """The last step expected ends with fraction 1, and further rounds follow."""
+    round_ = [("order", 1.0), ("images", 2.0)]
+    events, _ = run(clock, round_, round_ * 5)
+    assert all(fraction <= 0.99 and left > 0.01 for _, fraction, left in events[:-1])
+    assert events[-1][1:] == (1.0, 0.0)
+
+
+def test_kernels_that_are_compiled_leave_room_for_the_stages_that_follow(clock):
+    """The first stages take a thousand times as long as expected, each with one event at its end."""
+    plan = [("order", 0.01), ("codebook", 0.01), ("images", 0.001), ("write", 0.001)]
+    events, _ = run(clock, plan, [("order", 10.0), ("codebook", 10.0), ("images", 5.0), ("write", 0.1)], reports=1)
+    most = [fraction for _, fraction, _ in events]
+    assert most[3] <= 0.97
+    assert most[5] <= 0.98
+    assert most[7] <= 0.99
+    assert most[-1] == 1.0
+
+
+def test_a_job_that_is_done_cannot_be_cancelled(clock):
+    fractions = []
+
+    def cancel(stage, fraction, note=""):
+        fractions.append(fraction)
+        if fraction == 1:
+            raise Cancelled
+
+    job = JobProgress(cancel, [("a", 1.0)])
+    job("a", 1.0)
+    job.stop()
+    assert fractions == [0.0, 1.0]
 
 
 def test_a_search_that_takes_more_containers_slows_the_bar_and_never_turns_it_back(clock):
@@ -123,14 +159,14 @@ def test_work_that_goes_on_from_a_checkpoint(clock):
     for percent in range(60, 101):
         job("a", percent / 100)
         clock.now += 1.0
-    assert events == pytest.approx([40.0 - n for n in range(41)])
+    assert events == pytest.approx([*(40.0 - n for n in range(40)), 0.4])
 
 
 def test_loading_counts_once(clock):
     """Every part of the work makes sure that kernels are loaded, which is not the beginning of a repetition."""
     work = [("kernels", 1.0), ("cameras", 4.0), ("kernels", 0.0), ("order", 2.0), ("kernels", 0.0), ("images", 3.0)]
     events, _ = run(clock, PLAN, work)
-    assert all(fraction == pytest.approx(at / 10, abs=1e-9) for at, fraction, _ in events)
+    assert all(fraction == pytest.approx(at / 10, abs=1e-9) for at, fraction, _ in events[:-2])
 
 
 def test_a_deadline_bounds_the_estimate(clock):
@@ -143,7 +179,8 @@ def test_a_deadline_bounds_the_estimate(clock):
 
 def test_without_steps_nothing_is_known(clock):
     events, job = run(clock, [], PLAN)
-    assert {(fraction, left) for _, fraction, left in events} == {(0.0, None)}
+    assert {(fraction, left) for _, fraction, left in events[:-1]} == {(0.0, None)}
+    assert events[-1][1:] == (1.0, 0.0)
     assert sum(job.seconds.values()) == pytest.approx(10.0)
 
 
@@ -166,10 +203,13 @@ def test_the_fraction_never_falls_whatever_happens(plan, events, limit):
                 job.expect(changed)
             clock.now += seconds
             job(stage, fraction)
+        assert job.fraction < 1
+        job.stop()
+    assert (not found) or found.pop() == (1.0, 0.0)
     fractions = [fraction for fraction, _ in found]
     assert fractions == sorted(fractions)
-    assert all(0 <= fraction <= 1 for fraction in fractions)
-    assert all(left is None or left >= 0 for _, left in found)
+    assert all(0 <= fraction <= 0.99 for fraction in fractions)
+    assert all(left is None or left > 0 for _, left in found)
 
 
 def test_receivers_get_what_they_have_parameters_for():

@@ -146,3 +146,50 @@ def test_a_repeated_job_names_the_photographs(page, service, scene, archive):
     page.locator("#job .ratio").wait_for()
     repeated = newest(service)
     assert (repeated["state"], repeated["options"]["capture"]) == ("succeeded", reference)
+
+
+def test_photographs_are_those_of_one_scene(page, archive):
+    """Regression: they stayed chosen for the next scene."""
+    page.get_by_label("Fast").check()
+    page.set_input_files("#capture", archive)
+    page.locator("#capture-title", has_text=".zip").wait_for()
+    page.get_by_role("button", name="Compress").click()
+    page.locator("#job .ratio").wait_for()
+    page.get_by_role("link", name="Another scene").click()
+    page.locator("#capture-title", has_text="Add its photographs").wait_for()
+    assert page.locator("#capture-remove").is_hidden()
+
+
+def test_photographs_that_are_gone_are_asked_for_in_words_of_the_page(page, service, scene, archive):
+    page.get_by_label("Fast").check()
+    page.set_input_files("#capture", archive)
+    page.get_by_role("button", name="Compress").click()
+    page.locator("#job .ratio").wait_for()
+    reference = newest(service)["options"]["capture"]
+    cancelled = service.submit(scene["buffer"], json.dumps({**json.loads(SLOW), "capture": reference}))
+    service.cancel(cancelled)
+    page.goto(f"{service.url}/#{cancelled['id']}")
+    page.get_by_role("button", name="Try again").click()
+    page.set_input_files("#file", scene)
+    gone = {"title": "Gone", "detail": "send its archive in the field 'capture'", "code": "gone", "status": 410}
+    page.route("**/v1/jobs?**", lambda route: route.fulfill(status=410, json={**gone, "retryable": False}))
+    page.get_by_role("button", name="Compress").click()
+    page.locator("#upload .problem", has_text="choose their archive again").wait_for()
+    assert "field" not in page.locator("#upload .problem").inner_text()
+
+
+def test_a_goal_leaves_the_choices_of_the_user(page, archive):
+    """Regression: photographs and a goal chose again what the user had chosen."""
+    pytest.importorskip("torch")
+    goal, keep, tune = (page.locator(f"#{name}") for name in ("goal", "keep", "finetune"))
+    tune.check()
+    tune.uncheck()
+    keep.select_option("Keep half")
+    chosen = keep.input_value()
+    goal.select_option("Maximum PSNR loss")
+    page.set_input_files("#capture", archive)
+    assert "against held-out photographs" in page.locator("#goal-note").inner_text()
+    assert (keep.input_value(), tune.is_checked()) == (chosen, False)
+    tune.check()
+    page.get_by_role("button", name="Remove").click()
+    assert (keep.input_value(), tune.is_checked()) == (chosen, True)

@@ -248,6 +248,86 @@ def test_the_command_says_once_that_the_service_refuses_and_why(scene, words):
     assert (done.returncode, answers) == (2, [])
 
 
+class Answers:
+    """A server that gives these answers, pairs of a status and a document or the lines of a stream, in order."""
+
+    def __init__(self, *answers):
+        self.requests, left = [], list(answers)
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_POST(handler):  # noqa: N805
+                handler.rfile.read(int(handler.headers["Content-Length"]))
+                handler.do_GET()
+
+            def do_GET(handler):  # noqa: N805
+                self.requests.append(handler.path)
+                status, content = left.pop(0)
+                body = (content if isinstance(content, str) else json.dumps(content)).encode()
+                handler.send_response(status)
+                if status == 503:
+                    handler.send_header("Retry-After", "1")
+                handler.send_header("Content-Length", str(len(body)))
+                handler.end_headers()
+                handler.wfile.write(body)
+
+            def log_message(self, *arguments):
+                pass
+
+        self.server = http.server.HTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.server.server_address[1]}"
+
+    def __enter__(self):
+        self.thread = threading.Thread(target=self.server.serve_forever)
+        self.thread.start()
+        return self
+
+    def __exit__(self, *error):
+        self.server.shutdown()
+        self.thread.join()
+        self.server.server_close()
+
+
+def fractions_of(act):
+    found = []
+    act(lambda stage, fraction, note="": found.append(fraction))
+    return found
+
+
+def test_uploads_that_are_repeated_never_go_back(scene, tmp_path):
+    """Once as the service is overloaded, and once as it has no longer the capture."""
+    (tmp_path / "capture.zip").write_bytes(bytes(100))
+    busy, gone = (503, {"code": "queue-full", "detail": "full"}), (410, {"code": "gone", "detail": "gone"})
+    with Answers(busy, gone, (202, {"id": "1"})) as server, kissgs.Remote(server.url) as remote:
+        capture = tmp_path / "capture.zip"
+        found = fractions_of(
+            lambda progress: remote.submit(scene, capture=capture, force_views=True, progress=progress)
+        )
+    assert found == sorted(found)
+    assert found[-1] == 1.0
+    sent = [json.loads(httpx.URL(request).params["options"]) for request in server.requests]
+    assert [options["force_views"] for options in sent] == [True] * 3
+
+
+def test_a_job_that_starts_again_never_goes_back_here(scene):
+    events = [("state", {"state": "queued"}), ("progress", {"stage": "order", "fraction": 0.5})] * 2
+    events += [("progress", {"stage": "read", "fraction": 0.1}), ("progress", {"stage": "write", "fraction": 1.0})]
+    stream = "".join(f"id: {at}\nevent: {name}\ndata: {json.dumps(data)}\n\n" for at, (name, data) in enumerate(events))
+    with Answers((200, stream), (200, {"state": "succeeded"})) as server, kissgs.Remote(server.url) as remote:
+        assert fractions_of(lambda progress: remote.follow("1", progress)) == [0.0, 0.5, 0.5, 0.5, 0.5, 1.0]
+
+
+def test_the_command_checks_everything_before_it_packs_photographs(unreachable, scene, tmp_path):
+    """The photographs are missing, which packing would say."""
+    words = ("compress", "--views", tmp_path / "photographs", "--server")
+    done = kissgs_command(*words, unreachable, scene)
+    assert (done.returncode, "cannot reach" in done.stderr) == (2, True)
+    done = kissgs_command(*words, unreachable, tmp_path / "none.ply")
+    assert (done.returncode, "none.ply: there is no such file" in done.stderr) == (2, True)
+    (tmp_path / "Schloß 1.zip").write_text("existing")
+    done = kissgs_command(*words, unreachable, scene)
+    assert (done.returncode, "exists already" in done.stderr) == (2, True)
+
+
 @pytest.mark.quick(0)
 def test_the_command_with_keys(start, scene):
     service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
