@@ -87,6 +87,14 @@ CAMERA_FILES = frozenset(
 )
 """Names of the files of a capture that have its cameras."""
 
+MAX_PACKED_NAME = 255  # bytes of the name of a file in the archive of a capture, with its folders
+
+
+def is_packable(name: str) -> bool:
+    """Whether a needed file in the archive of a capture may have this name."""
+    return name.isprintable() and len(name.encode()) <= MAX_PACKED_NAME
+
+
 _SLASHES = tuple({"/", os.sep})
 
 

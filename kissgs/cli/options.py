@@ -128,7 +128,7 @@ ViewsOption = Annotated[
 PANELS = {
     "Output": ("output", "container", "unpacked", "to", "html", "save_camera", "evaluate", "force", "as_json"),
     "Goal": ("preset", "quality", "max_psnr_drop", "psnr", "target_size", "time", "count", "ratio"),
-    "Method": ("method", "compact", "finetune", "changes", "seed"),
+    "Method": ("method", "compact", "finetune", "changes"),
     "Photographs": ("views", "force_views", "scale", "images"),
     "Input": ("origin",),
     "Machine": ("server", "quiet", "checkpoint", "device", "cache", "ray"),

@@ -57,23 +57,30 @@ class CaptureUpload:
         if reference is not None and not await run_sync(self._context.store.with_capture, self._owner, reference):
             raise _gone()
 
-    async def finish(self, reference: str | None) -> None:
-        """Unpack the archive, or find the capture of this ``reference``, and check it."""
-        self.reference = reference
-        most = min(int(self._context.settings.max_capture_bytes), UNPACKED_RATIO * self.size + UNPACKED_BYTES)
+    async def close(self, reference: str | None) -> str | None:
+        """Return the reference of the archive, or of an earlier job's capture without one."""
         if self.size:
             found = f"sha256:{await self._spool.close()}"
             if reference not in (None, found):
                 raise invalid(f"the option capture is not that of the archive, {found}; leave it out, or the archive")
-            self.reference = found
+            reference = found
+        self.reference = reference
+        return reference
+
+    async def finish(self) -> None:
+        """Unpack the archive, or find the capture of the reference, and check it; after :meth:`close`."""
+        most = min(int(self._context.settings.max_capture_bytes), UNPACKED_RATIO * self.size + UNPACKED_BYTES)
+        if self.size:
             await run_sync(self._context.admission.reserve, most)
             self._reserved = most
             self.folder.mkdir()
-        elif reference is not None:
-            await run_sync(self._link, reference)
+        elif self.reference is not None:
+            await run_sync(self._link, self.reference)
         else:
             return
         facts = await self._unpack(most)
+        if facts["bytes"] is None:
+            raise _gone()
         self.bytes, self.photographs = facts["bytes"], facts["photographs"]
 
     def _link(self, reference: str) -> None:

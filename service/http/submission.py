@@ -40,19 +40,20 @@ MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)  # maximum bytes of a form in ad
 
 @dataclass(frozen=True, slots=True)
 class Submission:
-    """Content of a request: upload, capture, options, name and idempotency key."""
+    """Content of a request: upload, capture, options, name, idempotency key and fingerprint."""
 
     received: Received
     capture: CaptureUpload
     options: JobOptions
     name: str
     key: str | None
+    fingerprint: str
 
-    @property
-    def fingerprint(self) -> str:
-        """Hash of the scene and the options; equal for equivalent requests."""
-        asked = json.dumps([self.received.sha256, self.options.model_dump(mode="json")], sort_keys=True)
-        return hashlib.sha256(asked.encode()).hexdigest()
+
+def _fingerprint(received: Received, options: JobOptions) -> str:
+    """Return a hash of the scene and the options, with the capture; equal for equivalent requests."""
+    asked = json.dumps([received.sha256, options.model_dump(mode="json")], sort_keys=True)
+    return hashlib.sha256(asked.encode()).hexdigest()
 
 
 async def submit(
@@ -82,12 +83,12 @@ async def submit(
             if kind == FORM_TYPE:
                 text, name = await _receive_form(context, request, spool, capture, options, name)
             else:
-                await capture.check(parsed.capture)  # before the body
+                if known is None:
+                    await capture.check(parsed.capture)  # before the body
                 async for chunk in _body(context, request):
                     await spool.write(chunk)
             try:
-                submission = await _checked(spool, capture, text, scene_name(name), key)
-                job, new = await run_sync(_queue, context, submission, owner)
+                job, new = await _checked(context, spool, capture, owner, text, scene_name(name), key)
             finally:
                 await run_sync(context.storage.discard, path)  # already moved to the job, or not needed
     if new:
@@ -99,13 +100,27 @@ async def submit(
     return job
 
 
-async def _checked(spool: Spool, capture: CaptureUpload, text: str | bytes, name: str, key: str | None) -> Submission:
-    """Check the options, the complete scene and the capture."""
+async def _checked(
+    context: ServiceContainer,
+    spool: Spool,
+    capture: CaptureUpload,
+    owner: str,
+    text: str | bytes,
+    name: str,
+    key: str | None,
+) -> tuple[Job, bool]:
+    """Check the options, the complete scene and the capture, and queue a job. A repeated request gives its job even if
+    its capture has been removed meanwhile. Return the job, and whether it is new."""
     options = parse_options(text)
     received = await spool.finish()
-    await capture.finish(options.capture)
-    options = parse_options(text, photographs=capture.photographs)
-    return Submission(received, capture, options.model_copy(update={"capture": capture.reference}), name, key)
+    reference = {"capture": await capture.close(options.capture)}
+    fingerprint = _fingerprint(received, options.model_copy(update=reference))
+    if (known := await run_sync(_known, context, owner, key, fingerprint)) is not None:
+        return known, False
+    await capture.finish()
+    options = parse_options(text, photographs=capture.photographs).model_copy(update=reference)
+    submission = Submission(received, capture, options, name, key, fingerprint)
+    return await run_sync(_queue, context, submission, owner)
 
 
 def parse_options(text: str | bytes, *, photographs: bool | None = None) -> JobOptions:
@@ -218,9 +233,9 @@ async def _receive_form(
 
 
 def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tuple[Job, bool]:
-    known = _known(context, submission, owner)
-    if known is not None:
-        return known, False
+    key, fingerprint = submission.key, submission.fingerprint
+    if (known := _known(context, owner, key, fingerprint)) is not None:
+        return known, False  # a concurrent request with the same key was faster
     received, capture, options = submission.received, submission.capture, submission.options
     job = Job(
         id=uuid.uuid4().hex,
@@ -241,27 +256,27 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
             finetune=options.resumable and bool(options.finetune.enabled),
         ),
         upload_sha256=received.sha256,
-        fingerprint=submission.fingerprint,
-        idempotency_key=submission.key,
+        fingerprint=fingerprint,
+        idempotency_key=key,
     )
     try:
         context.storage.adopt(received.path, job.id, f"scene{UPLOADS[received.info.format]}", capture.folder)
         return context.admission.add(job), True
     except BaseException as error:
         context.storage.remove_job(job.id)
-        if isinstance(error, LimitExceeded) and (known := _known(context, submission, owner)) is not None:
-            return known, False  # a concurrent request with the same key was faster
+        if isinstance(error, LimitExceeded) and (known := _known(context, owner, key, fingerprint)) is not None:
+            return known, False
         if isinstance(error, OSError):
             text = f"the upload cannot be stored: {(error.strerror or str(error)).lower()}; try again later"
             raise disk_full(text) from error
         raise
 
 
-def _known(context: ServiceContainer, submission: Submission, owner: str) -> Job | None:
-    if submission.key is None:
+def _known(context: ServiceContainer, owner: str, key: str | None, fingerprint: str) -> Job | None:
+    if key is None:
         return None
-    job = context.store.by_idempotency_key(owner, submission.key)
-    if job is not None and job.fingerprint != submission.fingerprint:
+    job = context.store.by_idempotency_key(owner, key)
+    if job is not None and job.fingerprint != fingerprint:
         raise ProblemError(
             "key-reused",
             "this Idempotency-Key was used with another scene or other options; use a new key for a new job",

@@ -3,9 +3,12 @@ whose limits of memory and time end what a hostile archive begins."""
 
 from __future__ import annotations
 
+import errno
+import json
 import os
 import shutil
 import stat
+import struct
 import tarfile
 import zipfile
 import zlib
@@ -17,36 +20,44 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 import kissgs
-from kissgs.formats import CAMERA_FILES, PHOTOGRAPHS
+from kissgs.formats import CAMERA_FILES, PHOTOGRAPHS, is_packable
 
-from .job_process import Task, sync_folder
+from .job_process import Task, sync_folder, write_file
 
-MAX_NAME_BYTES = 255  # of the name of a file in an archive, with its folders
+RECORD = "unpacked.json"  # the bytes of each file of a capture, to notice when a later job finds less
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
 
 DAMAGED = (
     *(zipfile.BadZipFile, tarfile.TarError, zlib.error, LZMAError, EOFError, ValueError),
+    *(OverflowError, struct.error),  # of sizes and offsets
     *(RuntimeError, NotImplementedError),  # of encrypted files, and of unknown compression
-    *(FileExistsError, NotADirectoryError, IsADirectoryError),  # of names that occur twice
+    OSError,  # of bz2 and gzip, of offsets, and of names that occur twice; except for DISK_ERRORS
 )
 """Errors of the readers, and of the file system, for damaged and odd archives."""
+
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 
 Opener = Callable[[], IO[bytes] | None]
 
 
 def unpack(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     """Unpack what a capture needs of the archive ``source``, if there is one, into the folder ``work``, and load its
-    views. Return the ``bytes`` of all files, and whether there are ``photographs`` to train on and to evaluate with."""
-    folder = Path(task["work"])
+    views. Return the ``bytes`` of all files, and whether there are ``photographs`` to train on and to evaluate with;
+    ``bytes`` is None of a capture that was unpacked earlier and has lost files."""
+    folder, record = Path(task["work"]), Path(task["work"]) / RECORD
+    if not task["source"] and not (record.exists() and json.loads(record.read_bytes()) == _sizes(folder)):
+        return {"bytes": None}
+    skipped: list[PurePosixPath] = []
     try:
         with ExitStack() as stack:
             if task["source"]:
-                _write_files(_entries(Path(task["source"]), stack), folder, task["most_bytes"], task["most_files"])
+                entries = _entries(Path(task["source"]), stack)
+                skipped = _write_files(entries, folder, task["most_bytes"], task["most_files"])
     except DAMAGED as error:
+        if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+            reason = (error.strerror or str(error)).lower()
+            raise kissgs.OutputError(f"the capture cannot be unpacked: {reason}; try again later") from error
         raise _refusal("is damaged or encrypted, or has two files of one name; pack it again") from error
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise kissgs.OutputError(f"the capture cannot be unpacked: {reason}; try again later") from error
     try:
         views = kissgs.load_views(folder, unpacked=True)
     except kissgs.KissgsError as error:
@@ -54,24 +65,40 @@ def unpack(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
         for path in (folder.resolve(), folder):
             text = text.replace(f"{path}/", "").replace(f"{path}", "the capture")
         raise type(error)(text) from error
-    paths = [folder, *folder.rglob("*")]
-    for path in paths:
+    if views.note and (unused := _photograph(skipped, views)):
+        remedy = "pack photographs as .png, .jpg or .webp, or the cameras alone"
+        raise _refusal(f"has no photographs that can be used, but {str(unused)[:80]!r}; {remedy}")
+    if task["source"]:
+        write_file(record, json.dumps(_sizes(folder)).encode())
+    for path in (folder, *folder.rglob("*")):
         if path.is_dir():
             sync_folder(path)
-    return {"bytes": sum(path.stat().st_size for path in paths if path.is_file()), "photographs": views.has_photographs}
+    return {"bytes": sum(_sizes(folder).values()) + record.stat().st_size, "photographs": views.has_photographs}
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Return the bytes of each file of a capture."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != RECORD)
+    return {str(path.relative_to(folder)): path.stat().st_size for path in files}
 
 
 def _write_files(
     entries: Iterator[tuple[str, int, bool | None, Opener]], folder: Path, most_bytes: int, most_files: int
-) -> None:
-    """Write the camera files and the photographs of an archive."""
-    left = most_bytes
+) -> list[PurePosixPath]:
+    """Write the camera files and the photographs of an archive; return the paths of all other files and links."""
+    left, skipped = most_bytes, []
+    folders: set[PurePosixPath] = set()
     for number, (name, size, is_file, opened) in enumerate(entries, 1):
-        if number > most_files:
-            raise _refusal(f"has more than {most_files:,} entries, which is the limit; pack only what is needed")
         path = PurePosixPath(name)
-        _check_name(name, path, is_file)
-        if not is_file or not (path.name in CAMERA_FILES or path.suffix.lower() in PHOTOGRAPHS):
+        needed = is_file is not False and (path.name in CAMERA_FILES or path.suffix.lower() in PHOTOGRAPHS)
+        if needed:
+            _check_name(name, path, is_file)
+            folders.update(path.parents[:-1])
+        elif is_file is not False:
+            skipped.append(path)
+        if number + len(folders) > most_files:
+            raise _refusal(f"has more than {most_files:,} entries, which is the limit; pack only what is needed")
+        if not needed:
             continue
         left -= size
         if left < 0:
@@ -83,6 +110,16 @@ def _write_files(
                 source.close()
             file.flush()
             os.fsync(file.fileno())
+    return skipped
+
+
+def _photograph(skipped: list[PurePosixPath], views: kissgs.Views) -> PurePosixPath | None:
+    """Return the first file with the name of a view, perhaps with another ending, or link to their folder."""
+    names = {"images"}
+    for view in views.all:
+        path = PurePosixPath(view.name)
+        names |= {path.name, path.stem, *path.parts[:-1]}
+    return next((path for path in skipped if path.name in names or path.stem in names), None)
 
 
 def _check_name(name: str, path: PurePosixPath, is_file: bool | None) -> None:
@@ -90,7 +127,7 @@ def _check_name(name: str, path: PurePosixPath, is_file: bool | None) -> None:
         raise _refusal(f"has {name[:80]!r}, a link or a device; pack files only")
     if path.is_absolute() or ".." in path.parts:
         raise _refusal(f"has {name[:80]!r}, which is outside its folder; pack the folder itself")
-    if not name.isprintable() or len(name.encode()) > MAX_NAME_BYTES:
+    if not is_packable(name):
         raise _refusal(f"has {name[:80]!r}, a name that is not printable or too long; rename the file")
 
 
@@ -111,8 +148,16 @@ def _entries(source: Path, stack: ExitStack) -> Iterator[tuple[str, int, bool | 
     except tarfile.ReadError as error:
         raise _refusal("is neither zip nor tar; pack the folder of its cameras and photographs as one") from error
     for entry in tar:
+        if entry.size < 0:
+            raise tarfile.ReadError("a negative size")
         is_file = True if entry.isreg() else False if entry.isdir() else None
         yield entry.name, entry.size, is_file, partial(tar.extractfile, entry)
+    if (packed_tar := tar.fileobj) is not None:
+        packed_tar.seek(tar.offset)
+        if packed_tar.read(tarfile.BLOCKSIZE) != bytes(tarfile.BLOCKSIZE):
+            raise tarfile.ReadError("not the end, but a damaged header, or nothing")  # where the loop ends, too
+        while packed_tar.read(1 << 20):  # to the checksum
+            pass
 
 
 def _refusal(text: str) -> kissgs.InvalidViewsError:

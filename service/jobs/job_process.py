@@ -32,7 +32,7 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     for path in (folder / "files", folder):
         sync_folder(path)
     report = result.report.as_dict()
-    _write(folder / "report.json", json.dumps(report, indent=2).encode())
+    write_file(folder / "report.json", json.dumps(report, indent=2).encode())
     stored = result.report.file_bytes
     files = {
         path.name: {**_size_and_hash(path), "stored": stored[path.name]}
@@ -55,7 +55,7 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
             **of_photographs,
             **{name: evaluation[name] for name in ("worst", "fifth_percentile", "detail", "shown")},
         }
-    _write(folder / "summary.json", json.dumps(summary).encode())
+    write_file(folder / "summary.json", json.dumps(summary).encode())
     return summary
 
 
@@ -99,7 +99,7 @@ def decode(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     target = Path(task["work"]) / "decoded.ply"
     kissgs.decompress(Path(task["source"]), target, threads=task["threads"], progress=progress)
     described = _size_and_hash(target)
-    _write(target.with_suffix(".json"), json.dumps(described).encode())
+    write_file(target.with_suffix(".json"), json.dumps(described).encode())
     return described
 
 
@@ -115,7 +115,8 @@ def _size_and_hash(path: Path) -> dict[str, Any]:
         return {"bytes": path.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 
-def _write(path: Path, data: bytes) -> None:
+def write_file(path: Path, data: bytes) -> None:
+    """Write a file, and flush it to the disk."""
     with path.open("wb") as file:
         file.write(data)
         file.flush()

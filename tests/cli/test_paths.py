@@ -132,7 +132,9 @@ def test_a_name_that_is_too_long_with_another_ending(folder, tmp_path):
 def test_the_library_raises_its_own_errors(name, folder, monkeypatch):
     monkeypatch.chdir(folder)
     kept = "loop/x" if name == "loop" else name  # a link is replaced, wherever it leads
-    few = kissgs.Settings.from_preset("fast", compact={"count": 9})
+    few = kissgs.Settings.research(
+        "balanced", compact={"count": 9, "sparsify_steps": 2, "refine_steps": 2, "views": 8, "view_size": 32}
+    )
     for work in (
         lambda: kissgs.load(name),
         lambda: kissgs.decompress(name),

@@ -285,6 +285,24 @@ def test_scenes_of_two_origins_and_a_capture_are_compared_in_one_world(tmp_path)
     assert found.shown > 0.5
 
 
+def test_objects_far_apart_are_kept_by_streamed_sog(tmp_path):
+    """The second object, a fiftieth of the size, is 1,000 units away: no origin serves both."""
+    rng = np.random.default_rng(1)
+    near, far = rng.normal(size=(1500, 3)), 0.02 * rng.normal(size=(1500, 3)) + (1000, 0, 0)
+    positions, sizes = np.concatenate([near, far]), np.repeat([0.05, 0.001], 1500)
+    scene = write(tmp_path / "a.ply", positions, size=sizes)
+    note = kissgs.compress(scene, settings=FAST, reading=AUTO).report.note
+    assert "positions have steps of" in note
+    assert "compressing into FOLDER/lod-meta.json" in note
+    report = kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST)
+    assert report.note == ""
+    found = kissgs.load(tmp_path / "tree").means.astype(float)
+    wanted = far.astype(np.float32).astype(float)
+    nearest = np.array([np.abs(found - one).max(axis=1).min() for one in wanted])
+    assert coarse_share(nearest, np.full((1500, 3), np.log(0.001), np.float32)) < 0.05
+    assert "steps" in kissgs.compress_streamed(scene, tmp_path / "tree.sogxt", settings=FAST).note
+
+
 @pytest.mark.parametrize("manifest", ["lod-meta.json", "levels.json"])
 def test_a_streamed_scene_records_its_origin(manifest, tmp_path):
     scene = write(tmp_path / "a.ply", around(OFFSETS["two axes"]))

@@ -109,7 +109,7 @@ def test_unreachable_goals_are_refused_and_nothing_is_written(tmp_path, goal, me
 @pytest.mark.parametrize(
     ("preset", "goal", "message"),
     [
-        ("fast", {"psnr": 40}, "psnr needs rate_distortion: choose preset balanced or small"),
+        ("fast", {"psnr": 40}, "psnr needs rate_distortion: choose preset balanced"),
         ("paper", {"target_size": "3MB"}, "target_size needs rate_distortion"),
         ("balanced", {"psnr": 40, "rd_lambda": 1e-9}, "rd_lambda and psnr cannot both be met"),
         ("balanced", {"rd_lambda": 1e-9, "max_ssim_drop": 0.1}, "rd_lambda and max_ssim_drop cannot both be met"),

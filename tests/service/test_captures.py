@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import re
+import shutil
 import signal
 import stat
 import tarfile
@@ -93,7 +94,7 @@ def test_the_bytes_are_those_of_a_local_compression(service, folder, scene, expe
     assert status["options"]["capture"].startswith("sha256:")
     stored = service.folder / "jobs" / status["id"] / "capture"
     names = {path.name for path in stored.rglob("*") if path.is_file()}
-    assert names == {"transforms.json", *(f"{n}.png" for n in range(9))}
+    assert names == {"unpacked.json", "transforms.json", *(f"{n}.png" for n in range(9))}
 
 
 TRAINED = {
@@ -174,6 +175,37 @@ def damaged(files):
     return bytes(data)
 
 
+def tar_of_size(size):
+    """Return an archive whose only file has this size according to its header."""
+    entry = tarfile.TarInfo("images/0.png")
+    entry.size = 1
+    header = bytearray(entry.tobuf(tarfile.GNU_FORMAT))
+    header[124:136] = b"\x80" + size.to_bytes(11) if size >= 0 else b"\xff" + (size + 256**11).to_bytes(11)
+    header[148:156] = b" " * 8
+    header[148:156] = b"%06o\0 " % sum(header)
+    return bytes(header) + bytes(10240)
+
+
+def changed(data, at, byte=0):
+    data = bytearray(data)
+    data[at] ^= byte or 0xFF
+    return bytes(data)
+
+
+def with_header_damaged(files):
+    """Return a tar with a damaged header in its midst: what comes after it cannot be found."""
+    data = tarred(files)
+    return changed(data, data.index(b"images/3.png\0"))
+
+
+def without_endings(files):
+    return {name.removesuffix(".png"): data for name, data in files.items()}
+
+
+def two(files):
+    return {f"{folder}/{name}": data for folder in ("one", "two") for name, data in files.items()}
+
+
 HOSTILE = {
     "no archive": (lambda files: b"hello" * 1000, "neither zip nor tar"),
     "a bomb": (lambda files: zipped({"images/0.bmp": bytes(100 << 20)}), "more than .* bytes when it is unpacked"),
@@ -184,7 +216,7 @@ HOSTILE = {
     "backslashes": (lambda files: zipped({"..\\0.png": b"x"}), "which is outside its folder"),
     "absolute": (lambda files: tarred({"/tmp/0.png": b"x"}), "'/tmp/0.png', which is outside its folder"),
     "a link": (lambda files: with_link("images/0.png", tarfile.SYMTYPE), "'images/0.png', a link or a device"),
-    "a hard link": (lambda files: with_link("images", tarfile.LNKTYPE), "'images', a link or a device"),
+    "a hard link": (lambda files: with_link("0.png", tarfile.LNKTYPE), "'0.png', a link or a device"),
     "a device": (lambda files: with_link("images/0.png", tarfile.CHRTYPE), "a link or a device"),
     "a link in a zip": (lambda files: zip_with_link(), "'images/0.png', a link or a device"),
     "a long name": (lambda files: zipped({"a/" * 150 + "0.png": b"x"}), "a name that is not printable or too long"),
@@ -193,6 +225,21 @@ HOSTILE = {
     "a file and a folder": (lambda files: tarred({"0.png": b"x", "0.png/0.png": b"y"}), "two files of one name"),
     "damaged": (damaged, "damaged or encrypted"),
     "truncated": (lambda files: tarred(files, "w:gz")[:-5000], "damaged"),
+    "a huge size": (lambda files: tar_of_size(2**62), "more than .* bytes when"),
+    "an impossible size": (lambda files: tar_of_size(2**70), "more than .* bytes when"),
+    "a negative size": (lambda files: tar_of_size(-1024), "damaged"),
+    "a wrong offset": (lambda files: changed(zipped(files), -4), "damaged"),
+    "a wrong checksum of tar.gz": (lambda files: changed(tarred(files, "w:gz"), -8), "damaged"),
+    "a wrong checksum of tar.bz2": (lambda files: changed(tarred(files, "w:bz2"), -2, 8), "damaged"),
+    "a truncated end of tar.gz": (lambda files: tarred(files, "w:gz")[:-6], "damaged"),
+    "a tar without end": (lambda files: tarred(files).rstrip(b"\0"), "damaged"),
+    "a damaged header": (with_header_damaged, "damaged"),
+    "nested folders": (
+        lambda files: zipped({f"{n}" + "/a" * 100 + "/0.png": b"" for n in range(200)}),
+        "more than 20,000 entries",
+    ),
+    "other endings": (lambda files: zipped(without_endings(files)), "no photographs that can be used, but 'images/."),
+    "two captures": (lambda files: zipped(two(files)), "two captures, 'one' and 'two'; pack one of them"),
     "an image that is none": (lambda files: zipped({**files, **image()}), "images/0.png is damaged, truncated, or not"),
     "no cameras": (lambda files: zipped(image()), "the capture has no cameras: neither"),
     "half a model": (
@@ -217,6 +264,27 @@ def test_hostile_archives(service, folder, scene, kind):
     assert ".part" not in found["detail"]
     assert str(service.folder) not in found["detail"]
     assert service.uploads() == []
+
+
+def test_files_that_nothing_needs_may_have_any_name(service, folder, scene, expected):
+    odd = {"Icon\r": b"", "x/" * 200 + "y": b"", "../notes.txt": b"", "._transforms.json": b"", "Lies mich \udcfc": b""}
+    buffer = io.BytesIO(tarred({**odd, **files_of(folder)}))
+    with tarfile.open(fileobj=buffer, mode="a") as archive:
+        for kind in (tarfile.SYMTYPE, tarfile.FIFOTYPE):
+            entry = tarfile.TarInfo("latest")
+            entry.type, entry.linkname = kind, "images"
+            archive.addfile(entry)
+    assert service.only_result(submitted(service, scene, buffer.getvalue())) == expected
+
+
+def test_cameras_without_photographs(service, folder, scene):
+    files = {name: data for name, data in files_of(folder).items() if not name.startswith("images/")}
+    status = service.ended(submitted(service, scene, zipped(files), {"preset": "fast", "evaluate": True}))
+    assert status["state"] == "succeeded"
+    assert "no photograph of the capture" in status["note"]
+    report = service.http.get(status["links"]["report"])
+    assert report.json()["evaluation"]["note"].startswith("the archive has no photographs")
+    assert str(service.folder) not in report.text
 
 
 def moved(files, name):
@@ -294,10 +362,29 @@ def test_a_killed_service_goes_on_and_leaves_nothing(start_process, folder, scen
     service.restart()
     assert service.only_result(job) == service.only_result(second) == expected
     assert sorted(path.name for path in (service.folder / "jobs").iterdir()) == sorted([job["id"], second["id"]])
-    capture = service.folder / "jobs" / second["id"] / "capture"
-    (capture / "images" / "0.png").unlink()
-    found = problem(by_reference(service, scene, {"capture": job["options"]["capture"]}), 422, "invalid-views")
-    assert "1 of 9 photographs is missing" in found["detail"]
+
+
+@pytest.mark.parametrize("lost", ["images", "images/0.png", "transforms.json", "unpacked.json"])
+def test_a_capture_that_has_lost_files_is_sent_again(service, folder, scene, lost):
+    archive = zipped({**files_of(folder), f"images/{lost.replace('/', ' ')}.png": lost.encode()})
+    job = submitted(service, scene, archive, {"preset": "fast"})
+    service.ended(job)
+    path = service.folder / "jobs" / job["id"] / "capture" / lost
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    found = problem(by_reference(service, scene, {"capture": job["options"]["capture"]}), 410, "gone")
+    assert "send its archive" in found["detail"]
+    assert service.uploads() == []
+
+
+def test_a_repeated_request_gives_its_job_without_the_capture(service, folder, scene):
+    archive, key = zipped({**files_of(folder), "images/key.png": b"of this test"}), {"Idempotency-Key": "capture"}
+    job = post(service, scene, archive, **key).json()
+    service.ended(job)
+    shutil.rmtree(service.folder / "jobs" / job["id"] / "capture")
+    options = {"options": json.dumps({**OPTIONS, "capture": job["options"]["capture"]})}
+    assert service.http.post("/v1/jobs", content=scene, params=options, headers=key).json()["id"] == job["id"]
+    assert post(service, scene, archive, **key).json()["id"] == job["id"]
+    problem(service.http.post("/v1/jobs", content=scene, headers=key), 422, "key-reused")
 
 
 @pytest.mark.quick(0)

@@ -121,7 +121,7 @@ def test_an_unknown_preset_is_refused_with_the_list_of_presets(preset):
     """A list once raised TypeError, because it cannot be looked up in a set."""
     with pytest.raises(UnsupportedError) as caught:
         Settings.from_preset(preset)
-    assert str(caught.value) == f"there is no preset {preset!r}; choose one of fast, balanced, small, paper"
+    assert str(caught.value) == f"there is no preset {preset!r}; choose one of fast, balanced, paper"
     with pytest.raises(ValidationError):
         Settings.model_validate({"preset": preset})
 

@@ -303,7 +303,8 @@ def read_colmap(folder: Path) -> Capture:
     if not posed_images:
         raise InvalidViewsError(f"{images_path} has no images; reconstruct the capture again")
     root = _root(folder)
-    files = {str(path.resolve().relative_to(root)): path for path in (cameras_path, images_path)}
+    within = folder.resolve().relative_to(root)  # the files themselves may be links to others
+    files = {str(within / path.name): path for path in (cameras_path, images_path)}
     return Capture(tuple(posed_images), root, f"COLMAP model {folder}", files)
 
 

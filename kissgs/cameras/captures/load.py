@@ -6,7 +6,7 @@ import io
 import zipfile
 from collections.abc import Sequence
 from os import PathLike
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image
@@ -20,6 +20,7 @@ from kissgs.cameras.captures.photos import (
     find_photos,
     is_absolute,
     open_file,
+    quoted,
     searched_folders,
     without_parents,
 )
@@ -35,6 +36,7 @@ from kissgs.cameras.views import View, Views, black
 from kissgs.core.array_types import Float32
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidViewsError
+from kissgs.formats import MAX_PACKED_NAME, PHOTOGRAPHS, is_packable
 from kissgs.io.files import atomic_file
 from kissgs.rendering.camera import Camera
 
@@ -95,7 +97,7 @@ def load_views(
             raise InvalidViewsError(f"{name} must be {least} or more, not {value}")
     if hold_out == 1:
         raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
-    path = Path(path)
+    path = archive = Path(path)
     try:
         path = _uppermost_with_cameras(path) if unpacked else path
         capture, folder = _read_capture(path), path if path.is_dir() else path.parent
@@ -114,12 +116,16 @@ def load_views(
         file = None if photo is None else photo.path
         views.append((_view(posed, file, nominal, _reduced(size, limit), background), posed.split))
     train, test = _split(views, hold_out)
+    source = capture.source
+    if unpacked:  # where it is unpacked is nobody's concern
+        source = source.replace(f"{archive}/", "").replace(f"{archive}", "the archive")
     if photos is not None:
-        source = f"{capture.source}, photographs of {_folders(photos)}"
+        source = f"{source}, photographs of {_folders(photos)}"
         return Views(train, test, background, source, similarities=moves)
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
-    return Views(train, test, background, f"{capture.source}, no photographs", note, moves)
+    note = "the archive has no photographs" if unpacked else note
+    return Views(train, test, background, f"{source}, no photographs", note, moves)
 
 
 def as_views(views: Views | str | PathLike[str] | None) -> Views | None:
@@ -153,11 +159,17 @@ def _read_capture(path: Path) -> Capture:
 
 
 def _uppermost_with_cameras(path: Path) -> Path:
-    """Return the first of ``path`` and the folders in it, the uppermost first, that has cameras; else ``path``."""
+    """Return the first of ``path`` and the folders in it, the uppermost first, that has cameras; else ``path``. Refuse
+    cameras in another folder that is not inside this one: a model is inside, a second capture beside."""
     below = sorted((each for each in path.rglob("*") if each.is_dir()), key=lambda each: (len(each.parts), each))
     jsons = ("transforms.json", "transforms_train.json")
-    has_cameras = (each for each in (path, *below) if find_colmap(each) or any((each / n).is_file() for n in jsons))
-    return next(has_cameras, path)
+    has_cameras = [each for each in (path, *below) if find_colmap(each) or any((each / n).is_file() for n in jsons)]
+    first = has_cameras[0] if has_cameras else path
+    second = next((each for each in has_cameras if not each.is_relative_to(first)), None)
+    if second is not None:
+        names = " and ".join(quoted(str(each.relative_to(path))) for each in (first, second))
+        raise InvalidViewsError(f"the archive has two captures, {names}; pack one of them")
+    return first
 
 
 def _view(
@@ -248,6 +260,11 @@ def pack_capture(path: Path, destination: Path, progress: Progress = silent) -> 
     packed = {_packed_name(posed, photo): (posed, photo) for posed, photo in zip(capture.images, photos, strict=False)}
     if len(packed) < len({photo.path for photo in photos}):
         raise InvalidViewsError(f"two photographs of {path} have the same name in different folders; rename one")
+    if (refused := next((name for name in packed if not is_packable(name)), None)) is not None:
+        longest = f"more than {MAX_PACKED_NAME} bytes"
+        raise InvalidViewsError(
+            f"the name {quoted(refused)} of a photograph is not printable or has {longest}; rename it"
+        )
     cameras, folder = dict(capture.files), path if path.is_dir() else path.parent
     if (dataparser := dataparser_file((folder, capture.root))) is not None:
         cameras[DATAPARSER_TRANSFORMS] = dataparser
@@ -261,13 +278,17 @@ def pack_capture(path: Path, destination: Path, progress: Progress = silent) -> 
 
 
 def _packed_name(posed: PosedImage, photo: FoundPhoto) -> str:
-    """Return the name under which :func:`find_photos` finds a photograph inside the root of an unpacked capture."""
+    """Return the name under which :func:`find_photos` finds a photograph inside the root of an unpacked capture. If the
+    camera file has none of the endings that a service unpacks, it gets that of the file, or any: content decides."""
     parts = without_parents(posed.photo).parts
     if is_absolute(posed.photo):
         parts = (IMAGES if photo.factor == 1 else f"{IMAGES}_{photo.factor}", *parts[1:])
     elif len(parts) > 1:
         parts = (photo.folder.name, *parts[1:])  # perhaps that of a scaled copy
-    return "/".join(parts)
+    name, suffix = "/".join(parts), photo.path.suffix
+    if PurePosixPath(name).suffix.lower() in PHOTOGRAPHS:
+        return name
+    return name + (suffix if suffix.lower() in PHOTOGRAPHS else ".png")
 
 
 def _packed_photo(posed: PosedImage, photo: FoundPhoto) -> bytes:

@@ -56,6 +56,16 @@ def test_quaternions_need_not_be_of_unit_length(tmp_path):
     assert_camera(load_views(tmp_path).train[0].camera, images[0], K, 120, 80)
 
 
+def test_links_to_files_elsewhere(tmp_path):
+    write_text(tmp_path / "elsewhere", {1: PINHOLE}, poses(NAMES))
+    model = tmp_path / "statue" / "sparse" / "0"
+    model.mkdir(parents=True)
+    for name in ("cameras.txt", "images.txt"):
+        (model / name).symlink_to(tmp_path / "elsewhere" / name)
+    capture = read_colmap(model)
+    assert (capture.root, set(capture.files)) == (tmp_path / "statue", {"sparse/0/cameras.txt", "sparse/0/images.txt"})
+
+
 def test_text_with_a_byte_order_mark(tmp_path):
     """Some editors add one: before a comment, or before a record."""
     images = poses(NAMES)

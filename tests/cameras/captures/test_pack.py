@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,6 +54,19 @@ def test_only_what_views_use_is_packed(tmp_path):
     assert (tmp_path / "again.zip").read_bytes() == first
 
 
+@pytest.mark.parametrize(("file", "name"), [("r_0.png", "r_0"), ("frame.0001.JPG", "frame.0001"), ("0001", "0001")])
+@pytest.mark.parametrize("folder", ["train", "images"])
+def test_photographs_that_are_named_without_an_ending_get_one(tmp_path, file, name, folder):
+    capture = write_capture(tmp_path / "statue")
+    (capture / folder).mkdir(exist_ok=True)
+    (capture / "images" / "a.png").rename(capture / folder / file)
+    renamed(capture, f"./{folder}/{name}")
+    unpacked, names = packed(capture, tmp_path)
+    ending = Path(file).suffix if file != name else ".png"
+    assert f"{folder}/{name}{ending}" in names
+    assert_same_views(load_views(unpacked, unpacked=True), load_views(capture))
+
+
 @pytest.mark.parametrize("place", ["absolute", "above", "scaled"])
 def test_photographs_anywhere_are_found_in_the_archive(tmp_path, place):
     capture = write_capture(tmp_path / "here" / "statue")
@@ -92,4 +106,8 @@ def test_what_cannot_be_packed(tmp_path):
         pack_capture(capture, tmp_path / "packed.zip")
     with pytest.raises(InvalidViewsError, match="has no cameras"):
         pack_capture(tmp_path / "images", tmp_path / "packed.zip")
+    (capture / "images" / "a.png").rename(capture / "images" / "a\n.png")
+    renamed(capture, "images/a\n.png")
+    with pytest.raises(InvalidViewsError, match=r"'images/a\\n.png' of a photograph is not printable"):
+        pack_capture(capture, tmp_path / "packed.zip")
     assert not (tmp_path / "packed.zip").exists()
