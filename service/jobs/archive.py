@@ -45,7 +45,7 @@ def unpack(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     views. Return the ``bytes`` of all files, and whether there are ``photographs`` to train on and to evaluate with;
     ``bytes`` is None of a capture that was unpacked earlier and has lost files."""
     folder, record = Path(task["work"]), Path(task["work"]) / RECORD
-    if not task["source"] and not (record.exists() and json.loads(record.read_bytes()) == _sizes(folder)):
+    if not task["source"] and not (record.exists() and record.read_bytes() == _as_json(_sizes(folder))):
         return {"bytes": None}
     skipped: list[PurePosixPath] = []
     try:
@@ -69,7 +69,7 @@ def unpack(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
         remedy = "pack photographs as .png, .jpg or .webp, or the cameras alone"
         raise _refusal(f"has no photographs that can be used, but {str(unused)[:80]!r}; {remedy}")
     if task["source"]:
-        write_file(record, json.dumps(_sizes(folder)).encode())
+        write_file(record, _as_json(_sizes(folder)))
     for path in (folder, *folder.rglob("*")):
         if path.is_dir():
             sync_folder(path)
@@ -80,6 +80,10 @@ def _sizes(folder: Path) -> dict[str, int]:
     """Return the bytes of each file of a capture."""
     files = (path for path in folder.rglob("*") if path.is_file() and path.name != RECORD)
     return {str(path.relative_to(folder)): path.stat().st_size for path in files}
+
+
+def _as_json(sizes: dict[str, int]) -> bytes:
+    return json.dumps(sizes, sort_keys=True).encode()
 
 
 def _write_files(

@@ -360,6 +360,7 @@ def test_a_killed_service_goes_on_and_leaves_nothing(start_process, folder, scen
     (half / "images").mkdir(parents=True)
     (half / "images" / "0.png").write_bytes(b"half")
     service.restart()
+    service.ended(second)
     assert service.only_result(job) == service.only_result(second) == expected
     assert sorted(path.name for path in (service.folder / "jobs").iterdir()) == sorted([job["id"], second["id"]])
 
