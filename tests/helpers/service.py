@@ -160,7 +160,7 @@ class Service:
         """Return the container of a job, which must succeed and leave no temporary files."""
         status = self.ended(job)
         assert status["state"] == "succeeded", status
-        assert self.leftovers() == []
+        assert self.leftovers() == [], self.leftovers()
         return self.http.get(status["links"]["result"]).content
 
     def running(self, job, stage=None, seconds=300):

@@ -130,9 +130,11 @@ def test_other_jobs_name_the_capture_until_the_last_is_removed(service, folder, 
     first = submitted(service, scene, archive)
     reference = {"capture": first["options"]["capture"]}
     second = by_reference(service, scene, reference).json()
+    service.ended(second)
     assert service.only_result(first) == expected
     assert service.http.delete(first["links"]["self"]).status_code == 204
     third = submitted(service, scene, archive, {**OPTIONS, **reference})  # the archive, with its name
+    service.ended(third)
     assert service.only_result(second) == service.only_result(third) == expected
     for job in (second, third):
         service.http.delete(job["links"]["self"])
