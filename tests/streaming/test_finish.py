@@ -122,7 +122,7 @@ def test_files_that_appear_meanwhile_are_kept(scene, tmp_path):
     target = tmp_path / "city" / "lod-meta.json"
 
     def put(stage, fraction, note=""):
-        if stage == "images" and fraction == 1:
+        if stage == "images" and fraction < 1:
             target.parent.mkdir(exist_ok=True)
             (target.parent / "mine.txt").write_text("mine")
 
@@ -140,7 +140,7 @@ def test_a_result_of_another_process_is_not_replaced(scene, tmp_path):
     expected = files_of(tmp_path / "other")
 
     def put(stage, fraction, note=""):
-        if stage == "images" and fraction == 1 and (tmp_path / "other").exists():
+        if stage == "images" and fraction < 1 and (tmp_path / "other").exists():
             (tmp_path / "other").rename(tmp_path / "city")
 
     with pytest.raises(OutputError, match="exists already"):
