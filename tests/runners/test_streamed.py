@@ -5,6 +5,7 @@ import json
 import pytest
 from helpers.command_line import run
 from helpers.running import processors, wait_until
+from helpers.stages import by_stages
 from helpers.streamed_scenes import FAST, files_of, saved_sample, small_sizes
 
 from kissgs import Settings
@@ -15,6 +16,7 @@ from kissgs.streaming.compress import compress_streamed
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     small_sizes(monkeypatch, chunk=1600, leaf=300, coarsest=1000)
+    by_stages(monkeypatch)
 
 
 @pytest.fixture(scope="module")
