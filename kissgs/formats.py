@@ -81,8 +81,15 @@ PHOTOGRAPHS = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bm
 
 CAMERA_FILES = frozenset(
     {
-        *("cameras.bin", "images.bin", "cameras.txt", "images.txt", "dataparser_transforms.json"),
-        *("transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json"),
+        "cameras.bin",
+        "images.bin",
+        "cameras.txt",
+        "images.txt",
+        "dataparser_transforms.json",
+        "transforms.json",
+        "transforms_train.json",
+        "transforms_test.json",
+        "transforms_val.json",
     }
 )
 """Names of the files of a capture that have its cameras."""

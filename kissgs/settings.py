@@ -237,7 +237,7 @@ class EncodeSettings(StageSettings):
         "patches of 32x32 pixels, where lettering is lost first; max_psnr_drop and max_ssim_drop replace those two.",
     )
     max_encodes: Annotated[int, Field(ge=1, le=100)] = setting(
-        10, "With a goal: largest number of containers made of one scene, beside fine-tuned ones."
+        10, "With a goal: largest number of containers made of one scene; at most 6 before fine-tuned ones."
     )
     prune_threshold_bits: Bits = of_preset(18.0, "Prune what is worth fewer bits, times 1 - view_uncertainty.")
     step_classes: Annotated[int, Field(ge=1, le=32)] = of_preset(3, "Classes of sensitivity, each with its own steps.")

@@ -279,8 +279,8 @@ def _check_camera(parts: Parts, camera: Camera) -> tuple[bool, Float64[np.ndarra
     pixels = frame.transmittance.size
     shown = np.flatnonzero(weights > 0)
     inside = mahalanobis_distances(parts.splats.select(shown), camera.position) < INSIDE_SIGMAS
-    single_one, around = weights.max() / pixels, weights[shown[inside]].sum() / pixels
-    accepted = single_one < MAX_SINGLE_SHARE and around < MAX_INSIDE_SHARE and cut < MAX_CUT_SHARE
+    largest, around = weights.max() / pixels, weights[shown[inside]].sum() / pixels
+    accepted = largest < MAX_SINGLE_SHARE and around < MAX_INSIDE_SHARE and cut < MAX_CUT_SHARE
     return bool(accepted), parts.shares(weights, pixels)
 
 

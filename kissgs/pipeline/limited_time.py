@@ -225,13 +225,8 @@ class Expected:
         if photographs:
             unit = fewer._images(STEP, compact.sparsify_steps / compact.prune_rounds, compact)
             path = [*[("sparsify", unit), fewer._scored(0.8)] * POINTS, ("sparsify", 3 * unit)]
-            steps = [
-                *self.stages("cameras"),
-                *pruned,
-                self._targets(compact),
-                *path,
-                *(fewer._measured() if by_size else []),
-            ]
+            steps = [*self.stages("cameras"), *pruned, self._targets(compact), *path]
+            steps += fewer._measured() if by_size else []
         elif compact.auto_count:
             steps = [*self.stages("cameras"), *steps, *pruned, self._targets(compact), *fewer._measured()]
         steps = [*steps, *trained, *self._evaluated() * by_size]

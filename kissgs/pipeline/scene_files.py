@@ -92,13 +92,11 @@ def scene_root(path: Path) -> Path:
 
 
 def is_container(source: Path | bytes) -> bool:
-    """Whether a source is a folder or a zip, rather than another file. A zip may have any name, and a prefix such as a
-    self-extractor. If the file cannot be opened, the ending ``.zip`` decides."""
+    """Whether a source that is no folder is a zip. A zip may have any name, and a prefix such as a self-extractor. If
+    the file cannot be opened, the ending ``.zip`` decides."""
     if isinstance(source, bytes):
         return sniff_format(io.BytesIO(source)) == "zip"
     with suppress(OSError, ValueError):
-        if source.is_dir():
-            return True
         if source.is_file():  # opening a named pipe would block
             with source.open("rb") as file:
                 return sniff_format(file) == "zip"

@@ -51,10 +51,10 @@ from kissgs.streaming.levels import (
     append_rows,
     chunk_levels,
     from_rows,
-    halvings,
     read_rows,
     row_bytes,
     sync,
+    times_to_halve,
     to_rows,
     write_rows,
 )
@@ -182,7 +182,7 @@ def partition(
     sample = sampled_rows(places_and_sizes(), count)
     environment = Environment.of(sample[:, :3], visible_count)
     sample = sample[~environment.contains(sample[:, :3])]
-    cuts = Cuts.of(sample[:, :3], halvings(count, CHUNK))
+    cuts = Cuts.of(sample[:, :3], times_to_halve(count, CHUNK))
     if container == "sog":  # which has a range of each axis
         cuts = cuts_without_coarse(sample, cuts, count)
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in range(cuts.chunks))):
@@ -204,7 +204,7 @@ def partition(
             append_rows(chunk_file(work, int(chunk)), some)
             counts[chunk] += len(some)
     total = int(counts.sum())
-    levels = 1 + halvings(total, COARSEST)
+    levels = 1 + times_to_halve(total, COARSEST)
     layout = Layout(
         container=container,
         source_count=count,

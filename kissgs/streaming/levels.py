@@ -81,7 +81,7 @@ def _explained(what: str, path: Path) -> Iterator[None]:
         raise OutputError(f"cannot {what} {path}: {reason_of(error)}") from error
 
 
-def halvings(count: int, most: int) -> int:
+def times_to_halve(count: int, most: int) -> int:
     """Return how often ``count`` Gaussians are halved until there are at most about ``most``."""
     return max(0, int(np.ceil(np.log2(max(count, 1) / most))))
 

@@ -28,9 +28,16 @@ RECORD = "unpacked.json"  # the bytes of each file of a capture, to notice when 
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
 
 DAMAGED = (
-    *(zipfile.BadZipFile, tarfile.TarError, zlib.error, LZMAError, EOFError, ValueError),
-    *(OverflowError, struct.error),  # of sizes and offsets
-    *(RuntimeError, NotImplementedError),  # of encrypted files, and of unknown compression
+    zipfile.BadZipFile,
+    tarfile.TarError,
+    zlib.error,
+    LZMAError,
+    EOFError,
+    ValueError,
+    OverflowError,  # of sizes and offsets
+    struct.error,
+    RuntimeError,  # of encrypted files
+    NotImplementedError,  # of unknown compression
     OSError,  # of bz2 and gzip, of offsets, and of names that occur twice; except for DISK_ERRORS
 )
 """Errors of the readers, and of the file system, for damaged and odd archives."""

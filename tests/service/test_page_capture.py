@@ -129,7 +129,8 @@ def test_a_scene_and_its_photographs_are_dropped_anywhere(page, scene, archive):
     page.locator("#file-title", has_text="scene.spz").wait_for()
 
 
-def test_a_repeated_job_names_the_photographs(page, service, scene, archive):
+def try_again(page, service, scene, archive):
+    """Compress a scene with photographs, and begin to repeat a job that has named them; return their reference."""
     page.get_by_label("Fast").check()
     page.set_input_files("#capture", archive)
     page.get_by_role("button", name="Compress").click()
@@ -139,6 +140,11 @@ def test_a_repeated_job_names_the_photographs(page, service, scene, archive):
     service.cancel(cancelled)
     page.goto(f"{service.url}/#{cancelled['id']}")
     page.get_by_role("button", name="Try again").click()
+    return reference
+
+
+def test_a_repeated_job_names_the_photographs(page, service, scene, archive):
+    reference = try_again(page, service, scene, archive)
     page.locator("#capture-title", has_text="The photographs of the earlier job").wait_for()
     page.set_input_files("#file", scene)
     page.get_by_label("Fast").check()
@@ -161,15 +167,7 @@ def test_photographs_are_those_of_one_scene(page, archive):
 
 
 def test_photographs_that_are_gone_are_asked_for_in_words_of_the_page(page, service, scene, archive):
-    page.get_by_label("Fast").check()
-    page.set_input_files("#capture", archive)
-    page.get_by_role("button", name="Compress").click()
-    page.locator("#job .ratio").wait_for()
-    reference = newest(service)["options"]["capture"]
-    cancelled = service.submit(scene["buffer"], json.dumps({**json.loads(SLOW), "capture": reference}))
-    service.cancel(cancelled)
-    page.goto(f"{service.url}/#{cancelled['id']}")
-    page.get_by_role("button", name="Try again").click()
+    try_again(page, service, scene, archive)
     page.set_input_files("#file", scene)
     gone = {"title": "Gone", "detail": "send its archive in the field 'capture'", "code": "gone", "status": 410}
     page.route("**/v1/jobs?**", lambda route: route.fulfill(status=410, json={**gone, "retryable": False}))

@@ -216,38 +216,6 @@ def test_the_command(service, scene, tmp_path):
     assert json.loads(as_json.stdout)["state"] == "succeeded"
 
 
-@pytest.mark.quick(1)
-@pytest.mark.parametrize("words", [(), ("--quiet",), ("--json",)])
-def test_the_command_says_once_that_the_service_refuses_and_why(scene, words):
-    """Oracle: a server that refuses twice for a while, as a service without its storage does, and then for good."""
-    answers = [("storage", "the storage is down", 503)] * 2 + [("gone", "the end", 410)]
-
-    class Handler(http.server.BaseHTTPRequestHandler):
-        def do_POST(self):
-            self.rfile.read(int(self.headers["Content-Length"]))
-            code, detail, status = answers.pop(0)
-            body = json.dumps({"code": code, "detail": detail}).encode()
-            self.send_response(status)
-            self.send_header("Retry-After", "1")
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, *arguments):
-            pass
-
-    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        url = f"http://127.0.0.1:{server.server_address[1]}"
-        done = kissgs_command("compress", scene, "--server", url, *words)
-        server.shutdown()
-        thread.join()
-    said = f"kissgs: {url}: not ready (the storage is down); trying again for 5 minutes\n"
-    assert done.stderr == ("" if words == ("--quiet",) else said) + "kissgs: the end\n"
-    assert (done.returncode, answers) == (2, [])
-
-
 class Answers:
     """A server that gives these answers, pairs of a status and a document or the lines of a stream, in order."""
 
@@ -285,6 +253,21 @@ class Answers:
         self.server.shutdown()
         self.thread.join()
         self.server.server_close()
+
+
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("words", [(), ("--quiet",), ("--json",)])
+def test_the_command_says_once_that_the_service_refuses_and_why(scene, words):
+    """Oracle: a server that refuses twice for a while, as a service without its storage does, and then for good."""
+    busy, end = (
+        (503, {"code": "storage", "detail": "the storage is down"}),
+        (410, {"code": "gone", "detail": "the end"}),
+    )
+    with Answers(busy, busy, end) as server:
+        done = kissgs_command("compress", scene, "--server", server.url, *words)
+    said = f"kissgs: {server.url}: not ready (the storage is down); trying again for 5 minutes\n"
+    assert done.stderr == ("" if words == ("--quiet",) else said) + "kissgs: the end\n"
+    assert (done.returncode, len(server.requests)) == (2, 3)
 
 
 def fractions_of(act):

@@ -18,7 +18,7 @@ from kissgs.settings import EncodeSettings
 from kissgs.streaming import layout
 from kissgs.streaming.build import measure_file
 from kissgs.streaming.compress import compress_streamed
-from kissgs.streaming.levels import SIZE, halvings, leaf_groups, level_errors
+from kissgs.streaming.levels import SIZE, leaf_groups, level_errors, times_to_halve
 
 BALANCED = Settings()
 PLAIN = EncodeSettings(view_uncertainty=0.0, sensitivity_view_size=96)
@@ -117,8 +117,8 @@ def test_a_sample_has_every_kth_position_whatever_the_blocks(sizes, monkeypatch)
 @pytest.mark.parametrize(
     ("count", "most", "times"), [(0, 100, 0), (100, 100, 0), (101, 100, 1), (800, 100, 3), (801, 100, 4)]
 )
-def test_halvings(count, most, times):
-    assert halvings(count, most) == times
+def test_coarser_levels(count, most, times):
+    assert times_to_halve(count, most) == times
 
 
 @pytest.mark.parametrize("count", [1, 7, 64, 65, 1000])

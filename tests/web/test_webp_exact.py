@@ -80,8 +80,16 @@ def palette_alpha(w, h, rng):
 
 
 CONTENTS = [
-    *(noise, gradient, photograph, single, few_colours, transparent, alpha_noise, quarters),
-    *(palette_alpha, *map(palette, (1, 2, 3, 5, 16, 17, 256, 257))),
+    noise,
+    gradient,
+    photograph,
+    single,
+    few_colours,
+    transparent,
+    alpha_noise,
+    quarters,
+    palette_alpha,
+    *map(palette, (1, 2, 3, 5, 16, 17, 256, 257)),
 ]
 
 

@@ -206,7 +206,8 @@ def is_absolute(name: str) -> bool:
 
 def without_parents(name: str) -> PurePosixPath:
     """Return a path without its parts "..", with forward slashes."""
-    return PurePosixPath(*(part for part in PurePosixPath(name.replace("\\", "/")).parts if part != ".."))
+    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part != ".."]
+    return PurePosixPath(*parts)
 
 
 class _FolderListing:
