@@ -250,15 +250,17 @@ class Remote:
                 size, digest, done = int(response.headers["Content-Length"]), hashlib.sha256(), 0
                 with atomic_file(destination, overwrite=overwrite) as file:
                     for block in response.iter_bytes(BLOCK_BYTES):
+                        progress("download", done / size)
                         file.write(block)
                         digest.update(block)
                         done += len(block)
-                        progress("download", done / size)
                     expected = f"sha-256=:{base64.b64encode(digest.digest()).decode()}:"
                     if response.headers.get("Repr-Digest") != expected:
                         raise RemoteError("the container was damaged during the download; try again")
 
         self._with_retries(fetch, progress)
+        with contextlib.suppress(Cancelled):  # the file is written
+            progress("download", 1.0)
 
     def status(self, job: str, *, wait: float = 0.0) -> dict[str, Any]:
         """Return the status of a job, after waiting up to ``wait`` seconds (at most 30) for its end.

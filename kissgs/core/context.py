@@ -189,7 +189,10 @@ class JobProgress:
 def with_seconds_left(progress: Progress) -> Callable[[str, float, str, float | None], None]:
     """Return a receiver of stage, fraction, note and seconds left for one that may do without the last."""
     call: Any = progress
-    takes_seconds = "seconds_left" in inspect.signature(progress).parameters
+    takes_seconds = False
+    with suppress(ValueError):  # some callables of C extensions have no signature
+        parameter = inspect.signature(progress).parameters.get("seconds_left")
+        takes_seconds = parameter is not None and parameter.kind is not parameter.POSITIONAL_ONLY
 
     def receive(stage: str, fraction: float, note: str, seconds_left: float | None) -> None:
         values = (stage, fraction, note) if note else (stage, fraction)  # receivers with two parameters work too
