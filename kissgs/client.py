@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import functools
 import hashlib
 import json
 import re
@@ -121,7 +120,6 @@ class Remote:
         target = Path(destination)
         kind = named_container(container, destination)
         refuse_existing(target, overwrite=overwrite)
-        share = functools.partial(Share, progress)
         status = self.submit(
             source,
             settings=settings,
@@ -130,11 +128,11 @@ class Remote:
             origin=origin,
             capture=capture,
             force_views=force_views,
-            progress=share(0.0, 0.1),
+            progress=Share(progress, 0.0, 0.1),
         )
         try:
-            status = self.follow(status["id"], share(0.1, 0.95))
-            self.download(status, target, overwrite=overwrite, progress=share(0.95, 1.0))
+            status = self.follow(status["id"], Share(progress, 0.1, 0.95))
+            self.download(status, target, overwrite=overwrite, progress=Share(progress, 0.95, 1.0))
         except BaseException as error:
             if not isinstance(error, KissgsError) or isinstance(error, Cancelled):
                 with contextlib.suppress(KissgsError):  # the original error matters more

@@ -26,7 +26,6 @@ from .job_process import Task, sync_folder, write_file
 
 RECORD = "unpacked.json"  # the bytes of each file of a capture, to notice when a later job finds less
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06", b"PK\x07\x08")
-UTF8_FLAG = 0x800  # of an entry of a zip; the names of others are read as code page 437
 
 DAMAGED = (
     zipfile.BadZipFile,
@@ -148,11 +147,11 @@ def _entries(source: Path, stack: ExitStack) -> Iterator[tuple[str, int, bool | 
     with source.open("rb") as file:
         is_zip = file.read(4) in ZIP_MAGICS
     if is_zip:
-        packed = stack.enter_context(zipfile.ZipFile(source))
+        packed = stack.enter_context(_open_zip(source))
         for info in packed.infolist():
             kind = stat.S_IFMT(info.external_attr >> 16)  # 0 of programs that write no mode
             is_file = None if kind not in (0, stat.S_IFREG, stat.S_IFDIR) else not info.is_dir()
-            yield _zip_name(info).replace("\\", "/"), info.file_size, is_file, partial(packed.open, info)
+            yield info.filename.replace("\\", "/"), info.file_size, is_file, partial(packed.open, info)
         return
     try:
         tar = stack.enter_context(tarfile.open(source))  # noqa: SIM115
@@ -171,12 +170,11 @@ def _entries(source: Path, stack: ExitStack) -> Iterator[tuple[str, int, bool | 
             pass
 
 
-def _zip_name(info: zipfile.ZipInfo) -> str:
-    """Return the name of an entry: macOS and Info-ZIP write UTF-8 without the flag that says so."""
-    with suppress(UnicodeError):
-        if not info.flag_bits & UTF8_FLAG:
-            return info.filename.encode("cp437").decode()
-    return info.filename
+def _open_zip(source: Path) -> zipfile.ZipFile:
+    """Open a zip: macOS and Info-ZIP write names in UTF-8 without the flag that says so, others in code page 437."""
+    with suppress(UnicodeDecodeError):
+        return zipfile.ZipFile(source, metadata_encoding="utf-8")
+    return zipfile.ZipFile(source)
 
 
 def _refusal(text: str) -> kissgs.InvalidViewsError:

@@ -254,7 +254,7 @@ HOSTILE = {
     ),
     "a missing photograph": (
         lambda files: zipped({name: data for name, data in files.items() if name != "images/3.png"}),
-        "1 of 9 photographs is missing; the first is 'images/3.png'",
+        "1 of 9 photographs is missing; the first is 'images/3.png', searched in images; add what is missing$",
     ),
     "no JSON": (lambda files: zipped({**files, "transforms.json": b"{"}), "transforms.json is not JSON"),
 }
