@@ -29,7 +29,7 @@ class Progress(Protocol):
         Args:
             stage: name of the current stage ("read", "order", "codebook", …).
             fraction: fraction of the whole call that is done, 0 to 1; it never falls. It is 1 in the last event only,
-                when the work is done and :class:`kissgs.Cancelled` has no effect any more.
+                when the work is done and :class:`kissgs.Cancelled` may have no effect any more.
             note: text for the user: the state of training (Gaussians, loss, PSNR) and of a search for a goal; empty in
                 other stages.
         """
