@@ -7,11 +7,12 @@ from importlib.util import find_spec
 
 import kissgs
 
-from .schemas import COMPACTED, FINETUNED, SEARCHED, PresetFacts, Presets
+from .schemas import COMPACTED, CONVERTED, FINETUNED, SEARCHED, PresetFacts, Presets
 
 MEASURED_ON = "fox, 79,451 Gaussians of SH degree 3, seven held-out photographs"
 MEASURED_BY = "kissgs compress fox.ply, kissgs evaluate fox.ply fox.zip --views fox"
 
+CONVERSION = 10.0  # CPU seconds per million Gaussians, about: to read a scene and write it in another format
 EVALUATION = 60.0  # CPU seconds per million Gaussians, about: to decode, choose 24 cameras, render twice from each
 
 
@@ -73,8 +74,11 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     is :attr:`service.core.schemas.JobOptions.kind`."""
     name, *stages = kind.split("+")
     facts, millions = _FACTS[kissgs.Preset(name)], gaussians / 1e6
-    encoding = (facts.cpu_seconds_per_million + evaluate * EVALUATION) * millions
-    compacts, tunes, searches = (suffix.removeprefix("+") in stages for suffix in (COMPACTED, FINETUNED, SEARCHED))
+    compacts, tunes, searches, converts = (
+        suffix.removeprefix("+") in stages for suffix in (COMPACTED, FINETUNED, SEARCHED, CONVERTED)
+    )
+    making = CONVERSION if converts else facts.cpu_seconds_per_million
+    encoding = (making + evaluate * EVALUATION) * millions
     training, tuning = (fixed + per_million * millions for fixed, per_million in (facts.training, facts.tuning))
     if compacts and tunes and searches:
         return START_SECONDS + (SEARCH_FACTOR * encoding + training + TUNED_CONTAINERS * tuning) / BUSY_CORES

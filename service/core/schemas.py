@@ -5,9 +5,10 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 import kissgs
+from kissgs.formats import CONTAINERS
 
 from .files import DEFAULT, Format
 from .models import NOTE_CHARS, State
@@ -17,7 +18,8 @@ COMPACTED = "+compact"
 FINETUNED = "+finetune"
 SEARCHED = "+search"
 CAPTURED = "+photos"
-TIMED = "+time"  # suffixes of the preset's name in kind
+TIMED = "+time"
+CONVERTED = "+convert"  # suffixes of the preset's name in kind
 
 REFERENCE = "^sha256:[0-9a-f]{64}$"  # of a capture
 
@@ -35,6 +37,7 @@ class JobOptions(kissgs.Settings):
                 {"finetune": {"enabled": True}},
                 {"encode": {"target_size": 3_000_000}, "time_limit": 120},
                 {"format": "sog"},
+                {"format": "spz"},
                 {"encode": {"max_psnr_drop": 0.1}, "capture": f"sha256:{'0' * 64}"},
             ]
         },
@@ -42,7 +45,9 @@ class JobOptions(kissgs.Settings):
 
     format: Format = Field(
         DEFAULT,
-        description="Format of the container: sogxt (.zip), or sog, which other viewers open (.sog, SOG version 2).",
+        description="Format of the result: the container sogxt (.zip) or sog (SOG version 2); or spz or "
+        "compressed.ply, of the scene as it is or compacted: their steps are fixed, so that they go with neither a "
+        "goal, a time limit nor fine-tuning.",
     )
     evaluate: bool = Field(
         False, description="Also render both scenes and compare the images (PSNR, SSIM, MS-SSIM), which takes longer."
@@ -62,6 +67,20 @@ class JobOptions(kissgs.Settings):
     )
     force_views: bool = Field(False, description="Accept a capture whose photographs do not show the scene.")
 
+    @model_validator(mode="after")
+    def _fixed_steps(self) -> Self:
+        if self.converts and (self.encode.has_goal or self.time_limit is not None or self.finetune.enabled):
+            raise ValueError(
+                f"format {self.format} has fixed steps: leave out goals, the time limit and fine-tuning, or choose "
+                "format sogxt or sog"
+            )
+        return self
+
+    @property
+    def converts(self) -> bool:
+        """Whether the result is no container."""
+        return self.format not in CONTAINERS
+
     @classmethod
     def stored(cls, options: dict[str, Any]) -> Self:
         """Return the options of a job in the database; older versions took values that belong to the preset now, and
@@ -79,6 +98,7 @@ class JobOptions(kissgs.Settings):
             SEARCHED: self.searches,
             CAPTURED: self.capture is not None,
             TIMED: self.time_limit is not None,
+            CONVERTED: self.converts,
         }
         return "".join([self.preset, *(suffix for suffix, wanted in stages.items() if wanted)])
 
@@ -161,6 +181,7 @@ class Links(ApiModel):
     cancel: str | None = None
     result: str | None = None
     files: str | None = Field(None, description="Template: replace {name} by a name from sizes.files.")
+    thumbnail: str | None = None
     decoded: str | None = None
     source: str | None = None
     report: str | None = None
@@ -220,7 +241,7 @@ class Limits(ApiModel):
     """Limits of the service; null means no limit."""
 
     formats: list[str] = Field(description="Supported formats of uploads.")
-    containers: list[Format] = Field(description="Formats of containers, for the option `format`.")
+    containers: list[Format] = Field(description="Formats of results, for the option `format`.")
     max_upload_bytes: int
     max_capture_bytes: int
     max_header_bytes: int

@@ -1,7 +1,9 @@
 """Formats of uploads and of containers; oracle: the library's own compression of the same file."""
 
+import dataclasses
 import json
 
+import numpy as np
 import pytest
 from helpers.format_scenes import made_scene
 from helpers.reference_gltf import attributes, data_uri, document, glb_bytes
@@ -96,7 +98,7 @@ def test_damage_behind_the_headers_fails_the_job(service):
 def test_the_limits_name_the_formats(service):
     limits = service.http.get("/v1/limits").json()
     assert limits["formats"] == ["ply", "sog", "spz", "splat", "ksplat", "glb", "compressed.ply", "spz.glb"]
-    assert limits["containers"] == ["sogxt", "sog"]
+    assert limits["containers"] == ["sogxt", "sog", "spz", "compressed.ply"]
 
 
 SOG = json.dumps({"preset": "fast", "format": "sog"})
@@ -118,3 +120,43 @@ def test_a_container_of_sog(service, tmp_path):
     assert 'filename="a scene.decoded.ply"' in answer.headers["content-disposition"]
     kissgs.decompress(local.to_zip(), tmp_path / "expected.ply")
     assert answer.content == (tmp_path / "expected.ply").read_bytes()
+
+
+LARGE = dataclasses.replace(kissgs.sample_scene(60, sh_degree=1), scales=np.full((60, 3), 7.0, np.float32))
+
+
+@pytest.mark.parametrize("kind", ["spz", "compressed.ply"])
+def test_a_scene_in_another_format(service, kind, tmp_path):
+    """Oracle: what kissgs convert writes and says, and kissgs evaluate of its file."""
+    losses = kissgs.save(LARGE, tmp_path / f"x.{kind}")
+    kissgs.save(LARGE, tmp_path / "x.ply")
+    data = (tmp_path / "x.ply").read_bytes()
+    job = service.ended(service.submit(data, json.dumps({"format": kind, "evaluate": True})))
+    answer = service.http.get(job["links"]["result"])
+    assert answer.content == (tmp_path / f"x.{kind}").read_bytes()
+    assert f'filename="a scene.{kind}"' in answer.headers["content-disposition"]
+    assert (job["kept"], job["sizes"]["container"], job["sizes"]["files"]) == (60, len(answer.content), {})
+    assert "files" not in job["links"]
+    assert job.get("note", "") == "; ".join(losses)
+    assert bool(losses) == (kind == "spz")
+    written = kissgs.load(tmp_path / f"x.{kind}")
+    expected = kissgs.evaluate(LARGE, written).mean.candidate_vs_reference
+    assert job["evaluation"]["psnr"] == pytest.approx(expected.psnr)
+    kissgs.save(written, tmp_path / "decoded.ply")
+    assert service.http.get(job["links"]["decoded"]).content == (tmp_path / "decoded.ply").read_bytes()
+
+
+def test_fewer_gaussians_in_another_format(service, tmp_path):
+    settings = {"preset": "fast", "compact": {"ratio": 0.5}}
+    kept = kissgs.compact(SMALL, settings=Settings.model_validate(settings)).splats
+    kissgs.save(kept, tmp_path / "x.spz")
+    job = service.ended(service.submit(options=json.dumps({**settings, "format": "spz"})))
+    assert (job["kept"], job["compacted"]) == (150, 150)
+    assert service.http.get(job["links"]["result"]).content == (tmp_path / "x.spz").read_bytes()
+
+
+@pytest.mark.parametrize("more", [{"encode": {"quality": "same"}}, {"time_limit": 9}, {"finetune": {"enabled": True}}])
+def test_what_formats_with_fixed_steps_cannot_do(service, more):
+    options = json.dumps({"format": "spz", **more})
+    answer = service.http.post("/v1/jobs", content=SMALL, params={"options": options})
+    assert "format spz has fixed steps" in problem(answer, 422, "invalid-request")["detail"]
