@@ -67,7 +67,7 @@ export const stateLabel = (state) => STATES[state] ?? state;
  * @param {import("./api.js").Goals} encode
  * @returns {Record<string, any>}
  */
-export const goalsOf = (encode) => given(encode, Object.keys(GOALS));
+const goalsOf = (encode) => given(encode, Object.keys(GOALS));
 
 /** @param {import("./api.js").Goals} encode */
 export const goalLabels = (encode) => Object.entries(goalsOf(encode)).map(([name, value]) => GOALS[name](value));
@@ -77,13 +77,13 @@ export const goalLabels = (encode) => Object.entries(goalsOf(encode)).map(([name
  * @param {import("./api.js").Budget} compact
  * @returns {Record<string, any> | null}
  */
-export function budgetOf(compact) {
+function budgetOf(compact) {
   const [entry] = Object.entries(given(compact, Object.keys(BUDGETS)));
   return entry && !(entry[0] === "ratio" && entry[1] >= 1) ? Object.fromEntries([entry]) : null;
 }
 
 /** @param {import("./api.js").Budget} compact */
-export function budgetLabel(compact) {
+function budgetLabel(compact) {
   const [entry] = Object.entries(budgetOf(compact) ?? {});
   return entry ? BUDGETS[entry[0]](entry[1]) : "";
 }
@@ -97,15 +97,18 @@ const given = (settings, names) =>
 
 /** Describe what a job was given. @param {Status} status */
 export function jobLabel({ gaussians, options }) {
-  const { preset, encode, compact, finetune, time_limit: limit } = options;
+  return [`${count(gaussians)} Gaussians`, ...optionLabels(options)].join(" · ");
+}
+
+/** @param {import("./api.js").JobOptions} options */
+export function optionLabels({ preset, format, encode, compact, finetune, time_limit: limit }) {
   const wishes = [
     ...goalLabels(encode),
     budgetLabel(compact),
     finetune.enabled ? "fine-tuning" : "",
     limit ? `at most ${duration(limit)}` : "",
   ];
-  const facts = [`${count(gaussians)} Gaussians`, `${preset} preset`, formatOf({ options }).title];
-  return [...facts, ...wishes.filter(Boolean)].join(" · ");
+  return [`${preset} preset`, formatOf({ options: { format } }).title, ...wishes.filter(Boolean)];
 }
 
 /**

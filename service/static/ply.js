@@ -10,6 +10,10 @@ import { bytes, count } from "./format.js";
 /** The service would refuse a file; the message is one sentence. */
 export class UnsuitableFile extends Error {}
 
+/** @param {string} name */
+const NO_SPLATS = (name) =>
+  `${name} is a mesh or a point cloud, not a Gaussian splatting scene: send the trained scene.`;
+
 /** Number of `f_rest_*` properties of each SH degree. */
 const REST_COUNTS = [0, 9, 24, 45];
 
@@ -67,12 +71,24 @@ function otherFormat(head, file, endings) {
   if (start.startsWith("ply")) return null;
   const mark = MARKS.find((each) => start.startsWith(each));
   if (mark === "NGSP") return { ...unknown, gaussians: numberAt(start, 8) };
+  if (mark === "glTF" && !declares(head, "KHR_gaussian_splatting")) throw new UnsuitableFile(NO_SPLATS(file.name));
   if (mark) return unknown;
   if (/\.splat$/i.test(file.name) && file.size % 32 === 0)
     return { gaussians: file.size / 32, shDegree: 0, packed: false };
   if (start.startsWith("\0\x01\0\0") && file.size >= 4096) return { ...unknown, gaussians: numberAt(start, 16) };
   const others = endings.filter((ending) => ending !== ".ply" && ending !== ".splat");
   return others.some((ending) => file.name.toLowerCase().endsWith(ending)) ? unknown : null;
+}
+
+/**
+ * Whether the JSON of a GLB has a name, or goes on behind what was read of it.
+ * @param {Uint8Array} head
+ * @param {string} name
+ */
+function declares(head, name) {
+  const text = String.fromCharCode(...head.subarray(12, 16));
+  const end = 20 + numberAt(text, 0);
+  return end > head.length || new TextDecoder("latin1").decode(head.subarray(20, end)).includes(name);
 }
 
 /**
@@ -98,6 +114,7 @@ function parse(text, name, endings) {
   if (!vertices) throw new UnsuitableFile(`${name} has no Gaussians: its header has no vertex element.`);
   if (Number(vertices[1]) === 0) throw new UnsuitableFile(`${name} has no Gaussians: it is empty.`);
   const packed = /^element[ \t]+chunk\b/m.test(header);
+  if (!packed && !/\s(opacity|scale_\d|rot_\d)\s/.test(header)) throw new UnsuitableFile(NO_SPLATS(name));
   const degree = REST_COUNTS.indexOf((header.match(/\bf_rest_\d+/g) ?? []).length);
-  return { gaussians: Number(vertices[1]), shDegree: packed || degree < 0 ? null : degree, packed };
+  return { gaussians: Number(vertices[1]), shDegree: degree < 0 ? null : degree, packed };
 }

@@ -26,7 +26,7 @@ export function resultView(status, keyed) {
     downloads(status, keyed),
     figures(status),
     status.note ? el("p", { class: "small muted" }, sentence(status.note)) : null,
-    planeTable(sizes),
+    Object.keys(sizes.files).length ? planeTable(sizes) : null,
     notes.length ? notesList(notes) : null,
   ].filter((child) => child !== null);
 }
@@ -42,7 +42,7 @@ function ratio(status) {
     { class: "ratio" },
     el("p", {}, el("strong", {}, `${short(sizes.ratio)}×`), " smaller"),
     el("div", { class: "beside", "aria-hidden": "true" }, filled),
-    el("p", { class: "spread" }, el("span", {}, el("b", {}, after), " container"), el("span", {}, `${before} upload`)),
+    el("p", { class: "spread" }, el("span", {}, el("b", {}, after), " result"), el("span", {}, `${before} upload`)),
   );
 }
 
@@ -145,7 +145,7 @@ function downloads(status, keyed) {
   const message = el("div");
   /** @type {[string, string, string, string][]} */
   const all = [
-    ["result", `Download container (${ending})`, `${name}${ending}`, "primary"],
+    ["result", `Download (${ending})`, `${name}${ending}`, "primary"],
     ["decoded", "Decoded .ply", `${name}.decoded.ply`, "quiet"],
     ["report", "Report", `${name}.report.json`, "quiet"],
   ];
