@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 import kissgs
 from kissgs.formats import CONTAINERS
@@ -18,8 +18,7 @@ COMPACTED = "+compact"
 FINETUNED = "+finetune"
 SEARCHED = "+search"
 CAPTURED = "+photos"
-TIMED = "+time"
-CONVERTED = "+convert"  # suffixes of the preset's name in kind
+TIMED = "+time"  # suffixes of the preset's name in kind
 
 REFERENCE = "^sha256:[0-9a-f]{64}$"  # of a capture
 
@@ -46,8 +45,7 @@ class JobOptions(kissgs.Settings):
     format: Format = Field(
         DEFAULT,
         description="Format of the result: the container sogxt (.zip) or sog (SOG version 2); or spz or "
-        "compressed.ply, of the scene as it is or compacted: their steps are fixed, so that they go with neither a "
-        "goal, a time limit nor fine-tuning.",
+        "compressed.ply, which hold the scene as it is: they go with no goal, time limit or training.",
     )
     evaluate: bool = Field(
         False, description="Also render both scenes and compare the images (PSNR, SSIM, MS-SSIM), which takes longer."
@@ -67,20 +65,6 @@ class JobOptions(kissgs.Settings):
     )
     force_views: bool = Field(False, description="Accept a capture whose photographs do not show the scene.")
 
-    @model_validator(mode="after")
-    def _fixed_steps(self) -> Self:
-        if self.converts and (self.encode.has_goal or self.time_limit is not None or self.finetune.enabled):
-            raise ValueError(
-                f"format {self.format} has fixed steps: leave out goals, the time limit and fine-tuning, or choose "
-                "format sogxt or sog"
-            )
-        return self
-
-    @property
-    def converts(self) -> bool:
-        """Whether the result is no container."""
-        return self.format not in CONTAINERS
-
     @classmethod
     def stored(cls, options: dict[str, Any]) -> Self:
         """Return the options of a job in the database; older versions took values that belong to the preset now, and
@@ -91,16 +75,17 @@ class JobOptions(kissgs.Settings):
 
     @property
     def kind(self) -> str:
-        """Preset, further stages and whether time is limited: with the scene, they determine the duration."""
+        """Preset, further stages and whether time is limited: with the scene, they determine the duration. A conversion
+        takes about as long as the preset fast."""
+        preset = self.preset if self.format in CONTAINERS else kissgs.Preset.FAST
         stages = {
             COMPACTED: self.compact.enabled,
             FINETUNED: bool(self.finetune.enabled),
             SEARCHED: self.searches,
             CAPTURED: self.capture is not None,
             TIMED: self.time_limit is not None,
-            CONVERTED: self.converts,
         }
-        return "".join([self.preset, *(suffix for suffix, wanted in stages.items() if wanted)])
+        return "".join([preset, *(suffix for suffix, wanted in stages.items() if wanted)])
 
     @property
     def retrains(self) -> bool:

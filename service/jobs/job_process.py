@@ -9,21 +9,15 @@ import io
 import json
 import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 import kissgs
 from kissgs.formats import CONTAINERS
 
 from ..core.files import THUMBNAIL, THUMBNAIL_SIZE
 
-if TYPE_CHECKING:
-    import numpy as np
-
 Task = dict[str, Any]
-Made = TypeVar("Made")
 
 REPORTED = ("count", "finetuning", "note", "invisible", "cleaned", "seconds", "cpu_seconds")
 """Entries of the library's report that the summary repeats."""
@@ -34,20 +28,22 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     folder = Path(task["work"]) / "result"
     folder.mkdir(parents=True)
     container = folder / task["container"]
-    views = None if task.get("views") is None else kissgs.load_views(Path(task["views"]), unpacked=True)
     if task["format"] in CONTAINERS:
-        report, stored = _compress(task, container, views, progress)
+        result = _run_compression(task, progress)
+        result.save(container)
+        result.save(folder / "files")
+        report, compacted, stored = result.report.as_dict(), result.report.compacted, result.report.file_bytes
+        sync_folder(folder / "files")
     else:
-        report, stored = _convert(task, container, views, progress), {}
+        report, compacted, stored = _convert(task, container, progress), 0, {}
     write_file(folder / "report.json", json.dumps(report, indent=2).encode())
-    compaction = report["compaction"]
     summary = {
         "container": _size_and_hash(container),
         "report": _size_and_hash(folder / "report.json"),
         "files": {name: {**_size_and_hash(folder / "files" / name), "stored": stored[name]} for name in sorted(stored)},
         "source_format": kissgs.recognise(Path(task["source"])),
-        "compacted": 0 if compaction is None else compaction["source_count"] - compaction["count"],
-        **{name: report[name] for name in REPORTED},
+        "compacted": compacted,
+        **{name: report.get(name) for name in REPORTED},
     }
     if report["evaluation"] is not None:
         evaluation = report["evaluation"]
@@ -66,101 +62,28 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     return summary
 
 
-def _compress(
-    task: Task, container: Path, views: kissgs.Views | None, progress: kissgs.Progress
-) -> tuple[dict[str, Any], dict[str, int]]:
-    """Write the container, and its files beside it; return the report, and the bytes of each file in the container."""
-    result = _resumed(
-        task,
-        lambda checkpoint: kissgs.compress(
-            Path(task["source"]),
-            settings=kissgs.Settings.model_validate(task["settings"]),
-            reading=kissgs.ReadOptions(origin=task.get("origin")),
-            container=task["format"],
-            evaluate=task["evaluate"],
-            views=views,
-            force_views=task.get("force_views", False),
-            checkpoint=checkpoint,
-            threads=task["threads"],
-            device=task["device"],
-            progress=progress,
-        ),
-    )
-    result.save(container)
-    result.save(container.parent / "files")
-    sync_folder(container.parent / "files")
-    return result.report.as_dict(), result.report.file_bytes
-
-
-def _convert(task: Task, target: Path, views: kissgs.Views | None, progress: kissgs.Progress) -> dict[str, Any]:
-    """Write the scene in a format that is no container, with fewer Gaussians if the settings say so; return a report
-    whose entries have the names of those of a compression."""
-    began = time.perf_counter(), time.process_time()
-    source, origin, threads = Path(task["source"]), task.get("origin"), task["threads"]
-    settings = kissgs.Settings.model_validate(task["settings"])
-    splats = original = kissgs.load(source, origin=origin, threads=threads, progress=_Part(progress, 0.0, 0.1))
-    notes, compaction = list(splats.notes), None
-    if settings.compact.enabled:
-        compacted = _resumed(
-            task,
-            lambda checkpoint: kissgs.compact(
-                splats,
-                settings=settings,
-                views=views,
-                force_views=task.get("force_views", False),
-                checkpoint=checkpoint,
-                threads=threads,
-                device=task["device"],
-                progress=_Part(progress, 0.1, 0.8),
-            ),
-        )
-        splats, compaction = compacted.splats, compacted.report.as_dict()
-        notes.append(compacted.report.note)
-    notes += kissgs.save(splats, target, progress=_Part(progress, 0.8, 0.9))
-    evaluation = None
-    if task["evaluate"]:
-        written = kissgs.load(target, origin=origin, threads=threads)
-        found = kissgs.evaluate(original, written, views, threads=threads, progress=_Part(progress, 0.9, 1.0))
-        evaluation = found.as_dict()
-    return {
-        "format": task["format"],
-        "source_count": len(original),
-        "count": len(splats),
-        "source_bytes": source.stat().st_size,
-        "container_bytes": target.stat().st_size,
-        "compaction": compaction,
-        "finetuning": None,
-        "invisible": 0,
-        "cleaned": None,
-        "note": "; ".join(filter(None, notes)),
-        "seconds": {"convert": time.perf_counter() - began[0]},
-        "cpu_seconds": time.process_time() - began[1],
-        "settings": task["settings"],
-        "evaluation": evaluation,
-    }
-
-
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """Receiver of a part of a job, from one fraction of the whole to another."""
-
-    progress: kissgs.Progress
-    first: float
-    last: float
-
-    def __call__(self, stage: str, fraction: float, note: str = "") -> None:
-        self.progress(stage, self.first + fraction * (self.last - self.first), note)
-
-
-def _resumed(task: Task, run: Callable[[Path | None], Made]) -> Made:
-    """Run a training, continuing from its checkpoint if there is one. Checkpoints are optional: an unusable one
+def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed:
+    """Compress the scene, continuing from its checkpoint if there is one. Checkpoints are optional: an unusable one
     (damaged, or of another version of kissgs) is replaced, and if none can be written, because the disk is full, the
     job runs without."""
+    views = None if task.get("views") is None else kissgs.load_views(Path(task["views"]), unpacked=True)
     checkpoint = None if task["checkpoint"] is None else Path(task["checkpoint"])
     while True:
         kept = [] if checkpoint is None else sorted(checkpoint.parent.glob(f"{checkpoint.stem}*{checkpoint.suffix}"))
         try:
-            return run(checkpoint)
+            return kissgs.compress(
+                Path(task["source"]),
+                settings=kissgs.Settings.model_validate(task["settings"]),
+                reading=kissgs.ReadOptions(origin=task.get("origin")),
+                container=task["format"],
+                evaluate=task["evaluate"],
+                views=views,
+                force_views=task.get("force_views", False),
+                checkpoint=checkpoint,
+                threads=task["threads"],
+                device=task["device"],
+                progress=progress,
+            )
         except kissgs.OutputError:  # of the checkpoint: nothing else has been written so far
             if checkpoint is None:
                 raise
@@ -170,41 +93,56 @@ def _resumed(task: Task, run: Callable[[Path | None], Made]) -> Made:
                 checkpoint = None
 
 
+def _convert(task: Task, target: Path, progress: kissgs.Progress) -> dict[str, Any]:
+    """Write the scene in a format that is no container; return a report."""
+    began, cpu_began, threads = time.perf_counter(), time.process_time(), task["threads"]
+    progress("read", 0.0)
+    original = kissgs.load(Path(task["source"]), origin=task["origin"], threads=threads)
+    progress("write", 0.4)
+    notes = [*original.notes, *kissgs.save(original, target)]
+    evaluation = None
+    if task["evaluate"]:
+        progress("evaluate", 0.6)
+        views = None if task["views"] is None else kissgs.load_views(Path(task["views"]), unpacked=True)
+        written = kissgs.load(target, origin=task["origin"], threads=threads)
+        evaluation = kissgs.evaluate(original, written, views, threads=threads).as_dict()
+    return {
+        "count": len(original),
+        "note": "; ".join(notes),
+        "evaluation": evaluation,
+        "seconds": {"convert": time.perf_counter() - began},
+        "cpu_seconds": time.process_time() - cpu_began,
+    }
+
+
 def _thumbnail(result: Path, threads: int) -> bytes | None:
-    """Draw a result from the camera that its container records, else from one that kissgs finds; return the image, or
-    None of a scene without Gaussians."""
+    """Draw a result from the view that its container records (docs/reference/format.md), else from one that kissgs
+    finds. Return the image, or None of a scene without Gaussians."""
     import numpy as np
     from PIL import Image
 
-    splats = kissgs.load(result, threads=threads)
+    splats, (width, height) = kissgs.load(result, threads=threads), THUMBNAIL_SIZE
     if len(splats) == 0:
         return None
     metadata = result.parent / "files" / "meta.json"
     recorded = json.loads(metadata.read_bytes()).get("kissgs", {}) if metadata.exists() else {}
-    if "view" in recorded:
-        camera = _recorded_camera(recorded["view"], np.subtract(recorded.get("origin", (0, 0, 0)), splats.origin))
+    if "view" not in recorded:
+        views = kissgs.virtual_views(splats, width=width, height=height, count=1, threads=threads)
+        camera = views.all[0].camera
     else:
-        width, height = THUMBNAIL_SIZE
-        camera = kissgs.virtual_views(splats, width=width, height=height, count=1, threads=threads).all[0].camera
+        view = {name: np.array(value) for name, value in recorded["view"].items()}
+        forward = view["target"] - view["eye"]
+        right = np.cross(forward, view["up"])
+        axes = [axis / np.linalg.norm(axis) for axis in (right, np.cross(forward, right), forward)]
+        eye = view["eye"] + recorded.get("origin", (0, 0, 0)) - np.array(splats.origin)
+        viewmat = np.vstack([np.column_stack([axes, -np.array(axes) @ eye]), [0, 0, 0, 1]])
+        focal = height / 2 / np.tan(np.radians(view["fov"]) / 2)
+        intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        camera = kissgs.Camera(viewmat, intrinsics, width, height)
     image, _ = kissgs.render(splats, camera, threads=threads)
     file = io.BytesIO()
     Image.fromarray(np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)).save(file, "WEBP", quality=80)
     return file.getvalue()
-
-
-def _recorded_camera(view: dict[str, Any], shift: np.ndarray) -> kissgs.Camera:
-    """Return the camera of a recorded view, see docs/reference/format.md, moved by ``shift``."""
-    import numpy as np
-
-    width, height = THUMBNAIL_SIZE
-    eye, target, up = (np.array(view[name]) for name in ("eye", "target", "up"))
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = right, np.cross(forward, right), forward
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (eye + shift)
-    focal = height / 2 / np.tan(np.radians(view["fov"]) / 2)
-    return kissgs.Camera(viewmat, np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height)
 
 
 def decode(task: Task, progress: kissgs.Progress) -> dict[str, Any]:

@@ -111,9 +111,10 @@ function optionFields(limits, presets) {
     byId("choice").disabled = fixed !== null;
     format.explain(fixed);
     const { preset, time_limit: limit } = choice.chosen();
-    finetune.disabled = !limits.training || fixed !== null || choice.isEarlier();
+    const given = fixed !== null || choice.isEarlier();
+    finetune.disabled = given || !limits.training;
     if (fixed) finetune.checked = false;
-    keep.disabled = choice.isEarlier() || (!fixed && (limit || (!limits.training && preset !== "fast")));
+    keep.disabled = given || limit || (!limits.training && preset !== "fast");
     if (keep.disabled) keep.value = "";
     choice.refresh(scene());
     byId("choice-note").textContent =
@@ -141,17 +142,15 @@ function optionFields(limits, presets) {
         origin: origin.checked ? "auto" : null,
         capture: typeof reference === "string" ? reference : null,
       };
-      const fixed = expectFixed(kind, scene()) !== null;
-      if (choice.isEarlier() && (!fixed || picked.format === kind)) return { ...picked, ...shared };
-      const kept = keep.value ? { compact: { ratio: Number(keep.value) } } : {};
-      if (fixed) return { preset: limits.training ? "balanced" : "fast", ...kept, ...shared };
+      if (expectFixed(kind, scene())) return shared;
+      if (choice.isEarlier()) return { ...picked, ...shared };
       const untrained = picked.encode && !scene().trains; // a goal alone would train
       return {
         preset: presets.default,
         ...picked,
         ...(untrained && { compact: { auto_count: false } }),
         ...((untrained || finetune.checked) && { finetune: { enabled: finetune.checked } }),
-        ...kept,
+        ...(keep.value && { compact: { ratio: Number(keep.value) } }),
         ...shared,
       };
     },

@@ -31,7 +31,7 @@ export function formatField() {
     /** Say what to expect of fixed steps, if the format has them. @param {{bytes: number, change: number} | null} fixed */
     explain: (fixed) =>
       (byId("format-note").textContent = fixed
-        ? `Its steps are fixed, so that the choice above does not apply: expect ${bytes(fixed.bytes)} and ${decibels(fixed.change)}.`
+        ? `It holds the scene as it is, in fixed steps: expect ${bytes(fixed.bytes)} and ${decibels(fixed.change)}.`
         : ""),
   };
 }

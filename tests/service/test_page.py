@@ -146,7 +146,7 @@ def test_what_to_expect_follows_the_scene(visit, service):
     page.get_by_text("SH degree 0").wait_for()
     assert figures(page, "Balanced")[0] == "70.1 kB"
     page.get_by_label("Opens in").select_option("spz")
-    page.get_by_text("expect 172 kB and −0.45 dB").wait_for()
+    page.get_by_text("in fixed steps: expect 172 kB and −0.45 dB").wait_for()
     assert page.get_by_label("Balanced").is_disabled()
 
 
@@ -175,7 +175,8 @@ def test_goals_and_a_time_limit(visit, busy):
     page.get_by_label("Move to the origin").check()
     page.get_by_label("Opens in").select_option("spz")
     assert page.get_by_label("Fine-tune").is_disabled()
-    assert sent_options(page, busy) == {"compact": {"ratio": 0.5}, "origin": "auto", "format": "spz"}
+    assert keep.is_disabled()
+    assert sent_options(page, busy) == {"origin": "auto", "format": "spz"}
 
 
 def sent_options(page, service):
