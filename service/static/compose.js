@@ -15,14 +15,6 @@ import { UnsuitableFile, endingsOf, inspect } from "./ply.js";
  */
 
 const MILLION = 1e6;
-const NOTHING = { gaussians: null, shDegree: null };
-const TUNED =
-  "Trains the levels on renderings or photographs: better at equal size, in minutes. With photographs, Small and Good do.";
-const KEPT = {
-  trained: "The others are trained to keep the images: a smaller file, after minutes.",
-  merged:
-    "Neighbours are merged, at a loss of quality; with training, which this server lacks, at less. For Quick alone.",
-};
 
 /**
  * Connect the controls of the form.
@@ -100,9 +92,9 @@ function optionFields(limits, presets) {
 
   /** Return what is known of the scene. @returns {import("./expected.js").Scene} */
   function scene() {
-    const [captured, { gaussians, shDegree }] = [capture.chosen() !== null, facts ?? NOTHING];
+    const captured = capture.chosen() !== null;
     const trains = limits.training && (captured || finetune.checked);
-    return { gaussians: gaussians ?? MILLION, degree: shDegree ?? 3, captured, trains };
+    return { gaussians: facts?.gaussians ?? MILLION, degree: facts?.shDegree ?? 3, captured, trains };
   }
 
   /** Enable the choices that can be combined, and say what to expect of each. */
@@ -120,10 +112,9 @@ function optionFields(limits, presets) {
     byId("choice-note").textContent =
       `Expected for ${facts?.gaussians ? "this scene" : "a million Gaussians"} on two cores; other scenes differ. ` +
       `Quality is the change of PSNR to photographs, all measured on ${presets.measured_on}.`;
-    byId("keep-note").textContent = limits.training ? KEPT.trained : KEPT.merged;
-    byId("finetune-note").textContent = limits.training ? TUNED : "This server has no torch, which training needs.";
   }
 
+  if (!limits.training) byId("finetune-note").textContent = "This server has no torch, which training needs.";
   byId("compose").addEventListener("change", refresh);
   refresh();
   return {

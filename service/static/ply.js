@@ -29,7 +29,7 @@ export async function inspect(file, limits) {
     const [size, most] = [bytes(file.size), bytes(limits.max_upload_bytes)];
     throw new UnsuitableFile(`${file.name} has ${size}; the limit of this service is ${most}.`);
   }
-  const start = await head(file, limits.max_header_bytes);
+  const start = await unpacked(await head(file, limits.max_header_bytes));
   const endings = endingsOf(limits);
   const facts = otherFormat(start, file, endings) ?? parse(new TextDecoder("latin1").decode(start), file.name, endings);
   if (facts.gaussians !== null && facts.gaussians > limits.max_gaussians) {
@@ -54,7 +54,16 @@ async function head(file, size) {
   }
 }
 
-/** Beginnings of formats other than .ply: zip (.sog), gzip and its plain successor (.spz), GLB. */
+/** Return the first bytes inside gzip, which .spz is up to version 3; others unchanged. @param {Uint8Array<ArrayBuffer>} head */
+async function unpacked(head) {
+  if (head[0] !== 0x1f) return head;
+  const reader = new Blob([head]).stream().pipeThrough(new DecompressionStream("gzip")).getReader();
+  const { value } = await reader.read().catch(() => ({ value: head })); // damaged: the service says so
+  reader.cancel().catch(() => {}); // the rest was cut off
+  return value ?? head;
+}
+
+/** Beginnings of formats other than .ply: zip (.sog), gzip that is damaged, .spz, GLB. */
 const MARKS = ["PK\x03\x04", "\x1f\x8b", "NGSP", "glTF"];
 
 /**
@@ -70,7 +79,7 @@ function otherFormat(head, file, endings) {
   const start = String.fromCharCode(...head.subarray(0, 24)); // not a TextDecoder: its latin1 is windows-1252
   if (start.startsWith("ply")) return null;
   const mark = MARKS.find((each) => start.startsWith(each));
-  if (mark === "NGSP") return { ...unknown, gaussians: numberAt(start, 8) };
+  if (mark === "NGSP") return { gaussians: numberAt(start, 8), shDegree: Math.min(head[12], 3), packed: false };
   if (mark === "glTF" && !declares(head, "KHR_gaussian_splatting")) throw new UnsuitableFile(NO_SPLATS(file.name));
   if (mark) return unknown;
   if (/\.splat$/i.test(file.name) && file.size % 32 === 0)

@@ -26,7 +26,7 @@ export function resultView(status, keyed) {
     downloads(status, keyed),
     figures(status),
     status.note ? el("p", { class: "small muted" }, sentence(status.note)) : null,
-    Object.keys(sizes.files).length ? planeTable(sizes) : null,
+    status.links.files ? planeTable(sizes) : null,
     notes.length ? notesList(notes) : null,
   ].filter((child) => child !== null);
 }
@@ -58,9 +58,9 @@ function figures(status) {
     ["Per Gaussian", `${short(sizes.bytes_per_gaussian)} bytes`],
     ["Gaussians", count(kept), kept === status.gaussians ? "all of them" : `of ${count(status.gaussians)}`],
     ["Time", duration(timings.run_seconds ?? 0), spent.join(", ")],
-    ["Preset", options.preset],
     ["Format", formatLabel(formatOf(status))],
   ];
+  if (status.links.files) pairs.push(["Preset", options.preset]); // what is no container holds the scene as it is
   if (goal) pairs.push(["Goal", capitalised(goal), goals.length ? `and ${goals.join(", ")}` : undefined]);
   if (finetuning) pairs.push(["Fine-tuning", gain(finetuning), "on held-out views"]);
   if (evaluation) {
