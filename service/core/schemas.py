@@ -67,10 +67,7 @@ class JobOptions(kissgs.Settings):
 
     @classmethod
     def stored(cls, options: dict[str, Any]) -> Self:
-        """Return the options of a job in the database; older versions took values that belong to the preset now, and
-        had a preset "small", a coarser "balanced"."""
-        if options.get("preset") == "small":
-            options = {**options, "preset": kissgs.Preset.BALANCED}
+        """Return the options of a job in the database; older versions took values that belong to the preset now."""
         return cls.model_validate({"for_research": True, **options})
 
     @property
@@ -78,14 +75,9 @@ class JobOptions(kissgs.Settings):
         """Preset, further stages and whether time is limited: with the scene, they determine the duration. A conversion
         takes about as long as the preset fast."""
         preset = self.preset if self.format in CONTAINERS else kissgs.Preset.FAST
-        stages = {
-            COMPACTED: self.compact.enabled,
-            FINETUNED: bool(self.finetune.enabled),
-            SEARCHED: self.searches,
-            CAPTURED: self.capture is not None,
-            TIMED: self.time_limit is not None,
-        }
-        return "".join([preset, *(suffix for suffix, wanted in stages.items() if wanted)])
+        compacted, tuned, searched = self.compact.enabled, bool(self.finetune.enabled), self.searches
+        kind = preset + COMPACTED * compacted + FINETUNED * tuned + SEARCHED * searched
+        return kind + CAPTURED * (self.capture is not None) + TIMED * (self.time_limit is not None)
 
     @property
     def retrains(self) -> bool:

@@ -277,7 +277,7 @@ def test_a_mesh_is_refused_before_the_estimate(visit, service):
 
 
 def test_recent_jobs_show_their_results(visit, start):
-    """Also where images need a key, which links cannot send. Oracle: the thumbnail over HTTP."""
+    """Images need a key here, which links cannot send. Oracle: the thumbnail over HTTP."""
     service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
     service.http.headers["Authorization"] = "Bearer secret"
     job = service.ended(service.submit())

@@ -20,7 +20,7 @@ from starlette.types import Message, Receive, Scope, Send
 from ...core.files import CONTAINER_FILES, THUMBNAIL, container_file
 from ...core.models import Job, State
 from ...core.problems import ProblemError
-from ...jobs.container import Service, ServiceContainer
+from ...jobs.container import Service
 from .common import RequestedJob, problems
 
 
@@ -147,9 +147,11 @@ def _route(path: str, summary: str, media_types: str, *codes: str) -> Callable[[
 
 
 @_route("/result", "Download the container", " ".join(CONTAINER_TYPES))
-async def get_result(context: Service, job: RequestedJob) -> Response:
+async def get_result(context: Service, job: RequestedJob) -> StoredFile:
     """The container, `.zip` (SOG-XT) or `.sog`, or the `.spz` or `.compressed.ply`, until the job expires."""
-    return await container(context, job)
+    sha256, kind = _result(job)["container"]["sha256"], container_file(job.options)
+    file, download = context.storage.result(job.id) / kind.name, f"{job.name}{kind.ending}"
+    return await _stored(file, sha256=sha256, media_type=kind.media_type, download=download, headers=_PRIVATE)
 
 
 @_route("/files/{name}", "Download one file of the container", " ".join(_MEDIA_TYPES.values()))
@@ -203,13 +205,6 @@ async def get_report(context: Service, job: RequestedJob) -> Response:
     sha256 = _result(job)["report"]["sha256"]
     file = context.storage.result(job.id) / "report.json"
     return await _stored(file, sha256=sha256, media_type="application/json", headers=_PRIVATE)
-
-
-async def container(context: ServiceContainer, job: Job) -> StoredFile:
-    """Return the response with the container of a succeeded job."""
-    sha256, kind = _result(job)["container"]["sha256"], container_file(job.options)
-    file, download = context.storage.result(job.id) / kind.name, f"{job.name}{kind.ending}"
-    return await _stored(file, sha256=sha256, media_type=kind.media_type, download=download, headers=_PRIVATE)
 
 
 async def _stored(path: Path, **values: Any) -> StoredFile:  # noqa: ANN401
