@@ -44,6 +44,7 @@ export function choiceField(limits, presets) {
     inputmode: "decimal",
     min: 0.001,
     step: "any",
+    required: true,
     "aria-label": "Megabytes",
   });
   /** @type {Choice | null} options of an earlier job */
@@ -58,7 +59,7 @@ export function choiceField(limits, presets) {
     row("quick", "Quick", [time], () => (time.value ? { time_limit: Number(time.value) } : { preset: "fast" })),
     row("earlier", "As before", [], () => earlier ?? {}),
   ];
-  const [balanced, , , , before] = rows;
+  const [balanced, small, , , before] = rows;
   balanced.radio.checked = true;
   before.element.hidden = before.figures.hidden = true;
   byId("choices").replaceChildren(...rows.map(({ element }) => element));
@@ -72,6 +73,7 @@ export function choiceField(limits, presets) {
     /** Show what to expect of a scene. @param {import("./expected.js").Scene} scene */
     refresh(scene) {
       const usual = expect({}, scene, named);
+      if (!small.radio.checked && !size.checkValidity()) sized = false; // else it would prevent the submission
       const share = scene.trains ? TRAINED_SHARE : ENCODED_SHARE;
       if (!sized && usual) size.value = String(Number(((share * usual.bytes) / MEGABYTE).toPrecision(2)));
       for (const each of rows) if (each !== before) each.show(expect(each.options(), scene, named));

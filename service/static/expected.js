@@ -45,7 +45,7 @@ const GOALS = {
 /** Containers of limited times with photographs: the time in encodings, and the figure. @type {[number, ...Figure][]} */
 const LIMITED = [
   [13, 3.09, -0.04],
-  [3.5, 3.59, -0.14],
+  [3.2, 3.59, -0.14],
 ];
 /** @type {Figure} of the preset with photographs */
 const CAPTURED = [8.45, -0.22];

@@ -62,30 +62,14 @@ const CLEANED = {
 /** @param {string} state */
 export const stateLabel = (state) => STATES[state] ?? state;
 
-/**
- * Return the goals among settings of the encoder.
- * @param {import("./api.js").Goals} encode
- * @returns {Record<string, any>}
- */
-const goalsOf = (encode) => given(encode, Object.keys(GOALS));
-
 /** @param {import("./api.js").Goals} encode */
-export const goalLabels = (encode) => Object.entries(goalsOf(encode)).map(([name, value]) => GOALS[name](value));
+export const goalLabels = (encode) =>
+  Object.entries(given(encode, Object.keys(GOALS))).map(([name, value]) => GOALS[name](value));
 
-/**
- * Return the budget among settings of compaction; null if all Gaussians are kept.
- * @param {import("./api.js").Budget} compact
- * @returns {Record<string, any> | null}
- */
-function budgetOf(compact) {
-  const [entry] = Object.entries(given(compact, Object.keys(BUDGETS)));
-  return entry && !(entry[0] === "ratio" && entry[1] >= 1) ? Object.fromEntries([entry]) : null;
-}
-
-/** @param {import("./api.js").Budget} compact */
+/** Describe how many Gaussians are kept; nothing if all are. @param {import("./api.js").Budget} compact */
 function budgetLabel(compact) {
-  const [entry] = Object.entries(budgetOf(compact) ?? {});
-  return entry ? BUDGETS[entry[0]](entry[1]) : "";
+  const [entry] = Object.entries(given(compact, Object.keys(BUDGETS)));
+  return entry && !(entry[0] === "ratio" && entry[1] >= 1) ? BUDGETS[entry[0]](entry[1]) : "";
 }
 
 /**

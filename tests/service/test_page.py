@@ -164,6 +164,9 @@ def test_goals_and_a_time_limit(visit, busy):
     assert page.get_by_label("Quick").is_checked()  # whoever uses a control means its row
     assert (keep.is_disabled(), keep.input_value()) == (True, "")
     assert sent_options(page, busy) == {"time_limit": 30}
+    page.get_by_label("Megabytes").fill("")
+    page.get_by_role("button", name="Compress").click()
+    assert page.get_by_label("Megabytes").evaluate("field => field.matches(':focus:invalid')")  # nothing was sent
     page.get_by_label("Megabytes").fill("0.008")
     goal = {"encode": {"target_size": 8000}}
     assert sent_options(page, busy) == {**goal, "compact": {"auto_count": False}, "finetune": {"enabled": False}}
