@@ -146,14 +146,14 @@ def _thumbnail(result: Path, threads: int) -> bytes | None:
 
 
 def decode(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
-    """Decode the result ``source`` to ``decoded.ply`` in ``work``, and return its size and SHA-256."""
+    """Decode the result ``source`` to ``decoded-SHA256.ply`` in ``work``; return its size and SHA-256."""
     source, target = Path(task["source"]), Path(task["work"]) / "decoded.ply"
     if source.suffix == ".ply":
         kissgs.save(kissgs.load(source, threads=task["threads"], progress=progress), target)
     else:
         kissgs.decompress(source, target, threads=task["threads"], progress=progress)
     described = _size_and_hash(target)
-    write_file(target.with_suffix(".json"), json.dumps(described).encode())
+    target.rename(target.with_stem(f"decoded-{described['sha256']}"))
     return described
 
 

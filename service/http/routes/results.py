@@ -183,9 +183,9 @@ async def get_thumbnail(context: Service, job: RequestedJob) -> Response:
 async def get_decoded(context: Service, job: RequestedJob) -> Response:
     """The result decoded to a `.ply`, on the first request."""
     _result(job)
-    file, entry = await context.decoder.scene(job)
-    download = f"{job.name}.decoded.ply"
-    return await _stored(file, sha256=entry["sha256"], media_type=BINARY, download=download, headers=_PRIVATE)
+    file = await context.decoder.scene(job)
+    sha256, download = file.stem.rpartition("-")[2], f"{job.name}.decoded.ply"
+    return await _stored(file, sha256=sha256, media_type=BINARY, download=download, headers=_PRIVATE)
 
 
 @_route("/source", "Download the upload", BINARY)
