@@ -158,7 +158,7 @@ def test_presets_of_the_service_have_the_figures_of_the_benchmarks():
 
 
 def test_the_page_expects_what_goals_with_photographs_have_reached():
-    """Of fox: bytes per Gaussian, and the change of PSNR to photographs."""
+    """These are bytes per Gaussian of fox, and the change of PSNR to its photographs."""
     text = (ROOT / "docs" / "method" / "rate-distortion.md").read_text(encoding="utf-8")
     section = text.partition("### With photographs")[2].partition("\n###")[0]
     row = r"^\| `--(?:quality|max-psnr-drop) ([\w.]+)` \| ([\d,]+) \| ([\d.]+) dB"
