@@ -112,7 +112,8 @@ def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     refits = captured and settings.color_refit_iterations > 0  # a refit to virtual cameras is worse than none
     if sensitivity is not None and not refits:
         return Measured(splats, sensitivity)
-    count, size = settings.sensitivity_views or default_view_count(len(splats)), settings.sensitivity_view_size
+    count = settings.sensitivity_views or default_view_count(len(splats), captured=captured)
+    size = settings.sensitivity_view_size
     cameras, first_view = sensitivity_cameras(splats, work.views, work.context, count=count, size=size)
     if sensitivity is None:
         uncertainty = VIEW_UNCERTAINTY[captured] if settings.view_uncertainty is None else settings.view_uncertainty

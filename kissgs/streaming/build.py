@@ -247,7 +247,7 @@ def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: 
     coarsest = concatenate([level, read_environment(work, layout)])
     total = sum(layout.counts) + layout.environment
     least = min(MOST_VIEWS, VIEWS_PER_CHUNK * len(layout.filled))
-    views = settings.sensitivity_views or max(default_view_count(total), least)
+    views = settings.sensitivity_views or max(default_view_count(total, captured=False), least)
     size = settings.sensitivity_view_size
     cameras, view = sensitivity_cameras(coarsest, None, Context(threads), count=views, size=size)
     write_json(work / VIEW, view)  # before the cameras, which mark this step as done

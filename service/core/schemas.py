@@ -67,7 +67,10 @@ class JobOptions(kissgs.Settings):
 
     @classmethod
     def stored(cls, options: dict[str, Any]) -> Self:
-        """Return the options of a job in the database; older versions took values that belong to the preset now."""
+        """Return the options of a job in the database; older versions took values that belong to the preset now, and
+        had a preset "small", a coarser "balanced"."""
+        if options.get("preset") == "small":
+            options = {**options, "preset": kissgs.Preset.BALANCED}
         return cls.model_validate({"for_research": True, **options})
 
     @property
