@@ -196,7 +196,7 @@ QUALITIES = {
 
 UNIFORM_ONLY = (
     *("shared_step_size", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),
-    "sh_weight_power",
+    *("quat_levels", "sh_weight_power"),
 )
 """Values of uniform planning; with rate_distortion, lambda and sensitivity decide instead."""
 
@@ -273,6 +273,9 @@ class EncodeSettings(StageSettings):
     scale_step: Step = of_preset(0.11, "Quantisation step of log-scales: 0.11 is an error of at most 5.5 %.")
     quat_step: Annotated[float, Field(ge=1e-4, le=0.5)] = of_preset(
         0.023, "Quantisation step of quaternion components: 0.02 is a mean error of 1 degree."
+    )
+    quat_levels: Annotated[int, Field(ge=2, le=256)] = of_preset(
+        100, "Levels of quaternion components without shared_step_size; the paper has 256 for the forms of the scene."
     )
     sh0_step: Step = of_preset(0.055, "Quantisation step of the base colour: 0.055 is an error of at most 2 of 255.")
     gaussians_per_codebook_entry: Annotated[float, Field(ge=1, le=4096)] = of_preset(
