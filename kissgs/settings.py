@@ -81,7 +81,13 @@ class TrainingViewSettings(StageSettings):
     views: Annotated[int, Field(ge=1, le=10_000)] = of_preset(
         384, "Virtual views without a capture, up to four times as many for several objects; an eighth is held out."
     )
-    view_size: Pixels = of_preset(640, "Longer side of training images, pixels; of virtual views three fifths of it.")
+    view_size: Pixels = of_preset(640, "Virtual training views have three fifths of so many pixels in a row.")
+    photo_size: Annotated[int, Field(ge=16, le=65_536)] = of_preset(
+        960, "Longer side, pixels, up to which photographs train whole; of larger ones every n-th pixel and row."
+    )
+    lr_offset: Steps | None = of_preset(
+        None, "Learning rates of 3DGS as they would be after so many of its steps; auto: those below."
+    )
     seed: Seed = of_preset(0, "Seed of the order of images and of virtual cameras: that of encode.")
 
 
@@ -114,6 +120,10 @@ class CompactSettings(TrainingViewSettings):
     min_keep_per_scoring: Annotated[float, Field(ge=0, le=0.99)] = of_preset(
         0.8, "Smallest share that pruning by one scoring may leave; deeper pruning scores again. 0: score once."
     )
+    score_floor: Share = of_preset(
+        1.0, "Factor on the lowest score: 0.3 of what a camera nearby would find, with a capture 0.05."
+    )
+    trains_all: bool = of_preset(False, "Train a scene of no more Gaussians than requested too.")
     initial_prune_fraction: Share = of_preset(0.43, "Share of the first pruning in the logarithm of all pruning.")
     sparsify_steps: Steps = of_preset(1500, "Training steps during gradual pruning; 0: prune all at once.")
     prune_rounds: Count = of_preset(5, "Prunings during sparsify_steps, by equal factors; the paper has one.")
@@ -121,7 +131,7 @@ class CompactSettings(TrainingViewSettings):
     admm_rho: Weight = of_preset(0.0, "Penalty of ADMM, which pulls opacities of candidates for pruning towards 0.")
     admm_interval: Annotated[int, Field(ge=1)] = of_preset(50, "Steps between two updates of ADMM.")
     erank_weight: Weight = of_preset(0.0, "Weight of the effective rank: keeps Gaussians from becoming needles.")
-    min_scale_weight: Weight = of_preset(0.0, "Weight of the smallest scales, in units of the cameras' extent.")
+    min_scale_weight: Weight = of_preset(0.0, "Weight of the smallest scales, world units.")
     means_lr_scale: Rate = of_preset(1.0, "Learning rate of positions, in units of the initial one of 3DGS.")
     final_means_lr_scale: Rate = of_preset(0.01, "The same at the end of refine_steps.")
     lr_scale: Rate = of_preset(2.0, "Other learning rates before refine_steps, in units of those of 3DGS.")
@@ -384,7 +394,7 @@ class Preset(StrEnum):
     PAPER = "paper"
 
 
-_PAPER_LOSS = {"ssim_weight": 0.2, "mse_weight": 0.0, "synthetic_view_share": 0.0}
+_PAPER_LOSS = {"ssim_weight": 0.2, "mse_weight": 0.0, "synthetic_view_share": 0.0, "photo_size": 65_536}
 
 PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
     Preset.FAST: {
@@ -406,6 +416,8 @@ PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
     Preset.PAPER: {
         "compact": {
             "min_keep_per_scoring": 0.0,
+            "score_floor": 0.0,
+            "trains_all": True,
             "sparsify_steps": 5000,
             "prune_rounds": 1,
             "refine_steps": 5000,
@@ -413,11 +425,7 @@ PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
             "erank_weight": 0.01,
             "min_scale_weight": 1.0,
             **_PAPER_LOSS,
-            "means_lr_scale": 0.01,
-            "final_means_lr_scale": 0.00215,
-            "lr_scale": 1.0,
-            "final_lr_scale": 1.0,
-            "synthetic_lr_scale": 1.0,
+            "lr_offset": 30_000,
         },
         "encode": {
             "rate_distortion": False,
