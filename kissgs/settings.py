@@ -360,6 +360,11 @@ class FinetuneSettings(TrainingViewSettings):
     codebook_lr: Rate = of_preset(0.2, "Initial learning rate of the SH codebook, in quantisation steps.")
     synthetic_lr_scale: Rate = of_preset(0.3, "Factor on both where targets are renderings, which leave less error.")
     final_lr_scale: Annotated[float, Field(gt=0, le=1)] = of_preset(0.05, "Factor on both at the last step.")
+    attraction: Weight = of_preset(1.0, "Weight of the attraction of values to their levels; the paper has none.")
+    pras_at: list[Share] = of_preset(
+        [], "Fractions of the steps at which PRAS chooses forms again, if rate_weight is 0."
+    )
+    keeps_better: bool = of_preset(True, "Keep the container from before, if it has less error plus lambda times bits.")
     rate_weight: Weight = of_preset(
         2.0, "Weight of the estimated rate, in units of rd_lambda, against the image error."
     )
@@ -444,7 +449,17 @@ PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
             "codebook_max_effort": False,
             "high_effort_pixels": 0,
         },
-        "finetune": {"steps": 4000, "batch": 8, **_PAPER_LOSS, "rate_weight": 0.0, "tv_weight": 1.0},
+        "finetune": {
+            "steps": 4000,
+            "batch": 8,
+            **_PAPER_LOSS,
+            "lr_offset": 40_000,
+            "attraction": 0.0,
+            "pras_at": [0.6, 0.8],
+            "keeps_better": False,
+            "rate_weight": 0.0,
+            "tv_weight": 1.0,
+        },
     },
 }
 """Differences from the defaults, by preset and group."""

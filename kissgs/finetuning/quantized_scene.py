@@ -14,12 +14,13 @@ from torch.autograd.function import once_differentiable
 from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.context import Device, Pace
 from kissgs.core.positions import signed_exp
+from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.finetuning.planes import Ctx, Plane, each_part, level_bits, planes_of, sum_by_label
 from kissgs.planning import rotation_forms
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import Grid
-from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel, Quantized
+from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel, Quantized, half_steps, quantize
 from kissgs.planning.rd_criterion import Costs
 from kissgs.planning.rd_fields import UNUSED_COUNT, decoded_quats
 from kissgs.planning.sh_codebook import COEFFICIENTS
@@ -119,16 +120,25 @@ class _LookUp(torch.autograd.Function):
 # curvature follows from the costs of errors (:class:`kissgs.planning.rd_criterion.Costs`).
 
 ATTRIBUTE_FIELDS = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}  # without transformation
+REFORMED = ("quaternions", "scales")  # fields that another form of a Gaussian changes
 
 
 class QuantizedScene:
     """An encoding plan whose levels :func:`kissgs.training.loop.train` can fit."""
 
     def __init__(
-        self, plan: EncodingPlan, sh_degree: int, device: Device = "cpu", container: ContainerModel = EVEN_LEVELS
+        self,
+        plan: EncodingPlan,
+        sh_degree: int,
+        device: Device = "cpu",
+        container: ContainerModel = EVEN_LEVELS,
+        *,
+        rates_of_attributes: bool = False,
     ) -> None:
-        """Start from a plan for ``container``; ``sh_degree`` is that of the decoded scene."""
-        self._plan, self._sh_degree = plan, sh_degree
+        """Start from a plan for ``container``; ``sh_degree`` is that of the decoded scene. Learning rates are in units
+        of latents or of attributes: world units for positions, at the slope that their logarithm has at the start."""
+        self._plan, self._sh_degree, self._in_attributes = plan, sh_degree, rates_of_attributes
+        self._device, self._reformed = device, dict[str, Quantized]()
         count = int(plan.grid.mask.sum())
         self.planes, self.trained_tables = planes_of(plan, sh_degree, container.tables, device)
         self.classes, self.grid = plan.classes.astype(np.int64), plan.grid
@@ -139,7 +149,9 @@ class QuantizedScene:
             self._omitted = torch.from_numpy(omitted).to(device)
         trained = {name: plane.min_latent for name, plane in self.planes.items()}
         trained |= {table_name(name): table.min_latent for name, table in self.trained_tables.items()}
-        self._adam = PrunableAdam({name: torch.zeros_like(latent) for name, latent in trained.items()})
+        zeros = {name: torch.zeros_like(latent) for name, latent in trained.items()}
+        factors = {name: self._factors(name) for name in zeros} if rates_of_attributes else {}
+        self._adam = PrunableAdam(zeros, factors=factors)
         self._weights: dict[str, Tensor] = {}
 
     @property
@@ -157,6 +169,47 @@ class QuantizedScene:
     def tables(self) -> dict[str, Tensor]:
         """Return the values of the trained tables by field, ``(L,)`` float64 each, differentiable."""
         return {name: self.trained_tables[name].values(latents) for name, latents in self.table_latents.items()}
+
+    def _factors(self, name: str) -> Tensor:
+        """Return latents per unit of the attribute, at the plan's levels; 0 for what cannot change."""
+        if name in self.planes:
+            plane = self.planes[name]
+            level = torch.zeros_like(plane.min_latent)
+            unit = plane.units(level)
+            if name == "means":
+                unit = unit * plane.values(level).abs().exp()
+        else:
+            unit = self.trained_tables[name.removesuffix(".table")].unit
+        return torch.where(unit > 0, 1 / unit, 0).float()
+
+    def choose_forms(self, decay: float, threads: int) -> None:
+        """Choose the forms of rotations and scales anew by PRAS, and round both in new ranges, as the paper does."""
+        grid, exact = self._plan.grid, dict[str, Float64[np.ndarray, "M C"]]()
+        for name in REFORMED:
+            plane, latents = self.planes[name], self.latents[name].detach()
+            place = plane.base_multiples + latents
+            beside = plane.units(latents) * (place - torch.round(place))
+            exact[name] = (plane.values(latents) + beside).cpu().numpy()
+        quats, scales = exact["quaternions"], exact["scales"].astype(np.float32)
+        quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+        with blas_workers(threads) as pool:
+            rows = grid.cell_to_gaussian
+            forms = rotation_forms.pras_forms(quats[rows], scales[rows], grid.side, pool, decay=decay)[grid.mask]
+        for name, values in zip(REFORMED, rotation_forms.apply_forms(quats, scales, forms), strict=True):
+            field = quantize(values, step=1, shared=False, max_top=self.planes[name].field.top)
+            extent = field.table[-1] - field.table[0]
+            places = (values - field.table[0]) * (field.top / np.where(extent > 0, extent, np.inf))
+            self._adopt(name, field, places)
+
+    def _adopt(self, name: str, field: Quantized, places: Float64[np.ndarray, "M C"]) -> None:
+        """Continue with other levels and ranges of a field; latents are at these places among the levels."""
+        self._reformed[name] = field
+        fields = {**self._plan.fields, name: field.take(self._plan.grid.cell_to_gaussian)}
+        self._plan = replace(self._plan, fields=fields, errors={**self._plan.errors, name: half_steps(field)})
+        plane = self.planes[name] = Plane.even(field, self._device)
+        latents = torch.from_numpy(places).to(self._device) - plane.base_multiples
+        latents = latents.float().clamp(plane.min_latent, plane.max_latent)
+        self._adam.replace(name, latents, self._factors(name) if self._in_attributes else None)
 
     def set_curvature(self, costs: Costs, loss_per_error: float) -> None:
         """Set the curvature of the quadratic attraction, 0 before, from the loss per mean squared image error."""
@@ -247,10 +300,15 @@ class QuantizedScene:
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the state of the training, see :meth:`restore`."""
-        return self._adam.state()
+        levels = {f"{name}.levels": field.levels for name, field in self._reformed.items()}
+        return {**self._adam.state(), **levels, **{f"{n}.values": each.table for n, each in self._reformed.items()}}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from a :meth:`state` of a scene with an equal plan."""
+        for name in REFORMED:
+            if f"{name}.levels" in state:
+                field = Quantized(state[f"{name}.levels"], state[f"{name}.values"])
+                self._adopt(name, field, field.levels.astype(np.float64))
         self._adam.restore(state)
 
 
