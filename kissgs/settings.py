@@ -86,7 +86,7 @@ class TrainingViewSettings(StageSettings):
         960, "Longer side, pixels, up to which photographs train whole; of larger ones every n-th pixel and row."
     )
     lr_offset: Steps | None = of_preset(
-        None, "Learning rates of 3DGS as they would be after so many of its steps; auto: those below."
+        None, "Learning rates of 3DGS as after so many of its steps; auto: others, which fall towards the end."
     )
     seed: Seed = of_preset(0, "Seed of the order of images and of virtual cameras: that of encode.")
 
@@ -132,11 +132,6 @@ class CompactSettings(TrainingViewSettings):
     admm_interval: Annotated[int, Field(ge=1)] = of_preset(50, "Steps between two updates of ADMM.")
     erank_weight: Weight = of_preset(0.0, "Weight of the effective rank: keeps Gaussians from becoming needles.")
     min_scale_weight: Weight = of_preset(0.0, "Weight of the smallest scales, world units.")
-    means_lr_scale: Rate = of_preset(1.0, "Learning rate of positions, in units of the initial one of 3DGS.")
-    final_means_lr_scale: Rate = of_preset(0.01, "The same at the end of refine_steps.")
-    lr_scale: Rate = of_preset(2.0, "Other learning rates before refine_steps, in units of those of 3DGS.")
-    final_lr_scale: Rate = of_preset(0.1, "The same at the end of refine_steps.")
-    synthetic_lr_scale: Rate = of_preset(0.5, "Factor on all where targets are renderings, which leave less error.")
 
     @property
     def enabled(self) -> bool:

@@ -39,6 +39,11 @@ if TYPE_CHECKING:
 # Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.2).
 
 
+# Learning rates before and at the end of refinement, in units of the initial ones of 3DGS; factor where targets are
+# renderings, which leave less error.
+MEANS_LR, OTHER_LR, RENDERINGS_LR = (1.0, 0.01), (2.0, 0.1), 0.5
+
+
 @dataclass(frozen=True, slots=True)
 class Phase:
     """Training steps, and the number of Gaussians that the pruning after them leaves."""
@@ -92,10 +97,9 @@ def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> 
 
     if settings.lr_offset is not None:
         return continued_lr(settings.lr_offset + phase.first, phase.steps)
-    scale = settings.synthetic_lr_scale if target_source == "renderings" else 1.0
+    scale = RENDERINGS_LR if target_source == "renderings" else 1.0
     base = {name: rate * scale for name, rate in BASE_LR.items()}
-    begin = {name: settings.means_lr_scale if name == "means" else settings.lr_scale for name in base}
-    end = {name: settings.final_means_lr_scale if name == "means" else settings.final_lr_scale for name in base}
+    begin, end = ({name: (MEANS_LR if name == "means" else OTHER_LR)[at] for name in base} for at in (0, 1))
     return exponential_lr(base, begin, end if phase.name == "refine" else begin)
 
 
@@ -322,8 +326,7 @@ class SceneTraining:
             return np.full(len(self), self._camera_extent(), np.float32)
         extents = self.compactor.load_targets().local_extents(source.means[self.index], self._camera_extent())
         sizes = np.exp(np.median(source.scales[self.index].astype(np.float64), axis=1))
-        most = BASE_LR["means"] * max(settings.means_lr_scale, settings.final_means_lr_scale)
-        return np.minimum(MOST_STEP_PER_SIZE / most * sizes, extents).astype(np.float32)
+        return np.minimum(MOST_STEP_PER_SIZE / (BASE_LR["means"] * MEANS_LR[0]) * sizes, extents).astype(np.float32)
 
 
 @dataclass(slots=True, eq=False)
