@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import functools
 import hashlib
 import json
 import re
@@ -121,7 +120,6 @@ class Remote:
         target = Path(destination)
         kind = named_container(container, destination)
         refuse_existing(target, overwrite=overwrite)
-        share = functools.partial(Share, progress)
         status = self.submit(
             source,
             settings=settings,
@@ -130,11 +128,11 @@ class Remote:
             origin=origin,
             capture=capture,
             force_views=force_views,
-            progress=share(0.0, 0.1),
+            progress=Share(progress, 0.0, 0.1),
         )
         try:
-            status = self.follow(status["id"], share(0.1, 0.95))
-            self.download(status, target, overwrite=overwrite, progress=share(0.95, 1.0))
+            status = self.follow(status["id"], Share(progress, 0.1, 0.95))
+            self.download(status, target, overwrite=overwrite, progress=Share(progress, 0.95, 1.0))
         except BaseException as error:
             if not isinstance(error, KissgsError) or isinstance(error, Cancelled):
                 with contextlib.suppress(KissgsError):  # the original error matters more
@@ -250,15 +248,17 @@ class Remote:
                 size, digest, done = int(response.headers["Content-Length"]), hashlib.sha256(), 0
                 with atomic_file(destination, overwrite=overwrite) as file:
                     for block in response.iter_bytes(BLOCK_BYTES):
+                        progress("download", done / size)
                         file.write(block)
                         digest.update(block)
                         done += len(block)
-                        progress("download", done / size)
                     expected = f"sha-256=:{base64.b64encode(digest.digest()).decode()}:"
                     if response.headers.get("Repr-Digest") != expected:
                         raise RemoteError("the container was damaged during the download; try again")
 
         self._with_retries(fetch, progress)
+        with contextlib.suppress(Cancelled):  # the file is written
+            progress("download", 1.0)
 
     def status(self, job: str, *, wait: float = 0.0) -> dict[str, Any]:
         """Return the status of a job, after waiting up to ``wait`` seconds (at most 30) for its end.

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -98,8 +99,8 @@ MAX_PACKED_NAME = 255  # bytes of the name of a file in the archive of a capture
 
 
 def is_packable(name: str) -> bool:
-    """Whether a needed file in the archive of a capture may have this name."""
-    return name.isprintable() and len(name.encode()) <= MAX_PACKED_NAME
+    """Whether a needed file in the archive of a capture may have this name; all kinds of spaces count as printable."""
+    return unicodedata.normalize("NFKC", name).isprintable() and len(name.encode()) <= MAX_PACKED_NAME
 
 
 _SLASHES = tuple({"/", os.sep})

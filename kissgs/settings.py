@@ -284,7 +284,7 @@ class EncodeSettings(StageSettings):
     )
     sh0_step: Step = of_preset(0.055, "Quantisation step of the base colour: 0.055 is an error of at most 2 of 255.")
     gaussians_per_codebook_entry: Annotated[float, Field(ge=1, le=4096)] = of_preset(
-        7.0, "Gaussians per codebook entry; with rate_distortion the smallest number, beyond 8,192 entries."
+        7.0, "Gaussians per codebook entry, without rate_distortion."
     )
     sh_codebook_size: Annotated[int, Field(ge=64, le=65_536)] = of_preset(65_536, "Largest number of codebook entries.")
     sh_tolerance: Share = of_preset(0.001, "Invisible RMS error of SH coefficients, below which no codebook grows.")

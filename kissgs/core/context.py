@@ -29,7 +29,7 @@ class Progress(Protocol):
         Args:
             stage: name of the current stage ("read", "order", "codebook", …).
             fraction: fraction of the whole call that is done, 0 to 1; it never falls. It is 1 in the last event only,
-                when the work is done and :class:`kissgs.Cancelled` has no effect any more.
+                when the work is done and :class:`kissgs.Cancelled` may have no effect any more.
             note: text for the user: the state of training (Gaussians, loss, PSNR) and of a search for a goal; empty in
                 other stages.
         """
@@ -189,7 +189,10 @@ class JobProgress:
 def with_seconds_left(progress: Progress) -> Callable[[str, float, str, float | None], None]:
     """Return a receiver of stage, fraction, note and seconds left for one that may do without the last."""
     call: Any = progress
-    takes_seconds = "seconds_left" in inspect.signature(progress).parameters
+    takes_seconds = False
+    with suppress(ValueError):  # some callables of C extensions have no signature
+        parameter = inspect.signature(progress).parameters.get("seconds_left")
+        takes_seconds = parameter is not None and parameter.kind is not parameter.POSITIONAL_ONLY
 
     def receive(stage: str, fraction: float, note: str, seconds_left: float | None) -> None:
         values = (stage, fraction, note) if note else (stage, fraction)  # receivers with two parameters work too

@@ -34,16 +34,10 @@ def at_lambda(settings: EncodeSettings, log2_lambda: float) -> EncodeSettings:
     return settings.model_copy(update={**dict.fromkeys(GOALS), "rd_lambda": 2.0**log2_lambda})
 
 
-def codebook_limited(settings: EncodeSettings, sh_degree: int) -> bool:
-    """Whether ``gaussians_per_codebook_entry`` may keep the codebook smaller than the goal allows."""
-    return settings.gaussians_per_codebook_entry > 1 and sh_degree > 0
-
-
 @dataclass(slots=True, eq=False)
 class LambdaCurve:
-    """Containers of one scene with several values of lambda. Lambda alone may not meet a goal: to save time, the
-    codebook has a limit, ``gaussians_per_codebook_entry``, and its side is a multiple of 8. So the goal may lie beyond
-    that limit, or between the containers of two sides."""
+    """Containers of one scene with several values of lambda. The side of the codebook is a multiple of 8, so a goal may
+    lie between the containers of two sides, where lambda alone does not meet it."""
 
     goal: Goal
     encode: Callable[[EncodeSettings], Attempt]
@@ -52,7 +46,6 @@ class LambdaCurve:
     # Fine-tuned: then a container less near the goal ends the search, the finest or coarsest one is not tried where all
     # others missed the goal, and the codebook stays.
     tuned: bool = False
-    sh_degree: int = 0
     found: dict[float, Attempt] = field(default_factory=dict)  # by log2(lambda), those that can be compared
     _made: int = field(init=False, default=0)
     _slope: float = field(init=False, default=0.0)
@@ -64,23 +57,15 @@ class LambdaCurve:
             return
         start, sized = math.log2(first.rd_lambda), self.goal.by_size and not self.tuned
         self.found[start], self._slope = first, self.goal.decisive(first).slope
-        limited = codebook_limited(self.settings, self.sh_degree) and not self.tuned
-        if sized and self.goal.margin(first) >= FAR_BELOW_LOG2 and self._made < self.most:
-            if limited:
-                self._with_codebook(gaussians_per_codebook_entry=1.0)
-                limited = False
-            if self._margin(LOG2_LAMBDA_RANGE[0]) >= 0:
-                return
+        far_below = sized and self.goal.margin(first) >= FAR_BELOW_LOG2 and self._made < self.most
+        if far_below and self._margin(LOG2_LAMBDA_RANGE[0]) >= 0:
+            return
         self._find_root(start)
-        if limited and self._short:
-            largest = max(attempt.made.encoded.codebook_side for attempt in self.found.values())
-            start = max(x for x, attempt in self.found.items() if attempt.made.encoded.codebook_side == largest)
-            self._with_codebook(below=largest, gaussians_per_codebook_entry=1.0)
-            self._find_root(start)
         inside, outside = self._around_a_jump() if sized else (0.0, 0.0)
         if inside != outside:
             side = min(self.found[x].made.encoded.codebook_side for x in (inside, outside))
-            self._with_codebook(below=side + 1, sh_codebook_size=side**2)
+            self.settings = self.settings.model_copy(update={"sh_codebook_size": side**2})
+            self.found = {x: each for x, each in self.found.items() if each.made.encoded.codebook_side <= side}
             self._find_root(min(inside, outside))
 
     def _find_root(self, start: float) -> None:
@@ -103,17 +88,6 @@ class LambdaCurve:
         if x not in self.found:
             self.found[x] = self._encode(at_lambda(self.settings, x))
         return self.goal.margin(self.found[x])
-
-    def _with_codebook(self, *, below: float = math.inf, **changes: float) -> None:
-        """Change the size of the codebook, and forget the containers that have a side of ``below`` or more."""
-        self.settings = self.settings.model_copy(update=changes)
-        self.found = {x: attempt for x, attempt in self.found.items() if attempt.made.encoded.codebook_side < below}
-
-    @property
-    def _short(self) -> bool:
-        """Whether all containers are well below the target size, or all miss the quality goal."""
-        margins = [self.goal.margin(attempt) for attempt in self.found.values()]
-        return min(margins) > self.goal.limits[0].near if self.goal.by_size else max(margins) < 0
 
     def _settled(self, inside: float, outside: float) -> bool:
         """Whether the size jumps between two values of log2(lambda), the last that fits and the next that does not.

@@ -430,9 +430,8 @@ class Search:
                 raise NoFurtherError
             return attempt
 
-        tuned, degree = tuner is not None, self.work.splats.sh_degree
         with suppress(NoFurtherError):
-            LambdaCurve(self.goal, encode_at, scene.settings, most, tuned=tuned, sh_degree=degree).search(rd_lambda)
+            LambdaCurve(self.goal, encode_at, scene.settings, most, tuned=tuner is not None).search(rd_lambda)
 
     def _along_path(self, path: TrainingPath, first: int, last: int) -> None:
         """Make trained containers of points of the path up to ``last``, the first one at point ``first``."""
@@ -572,8 +571,7 @@ class Search:
             return ESTIMATED_DROP
         margin, target = self.goal.margin(best), self.target_size
         finest = best.rd_lambda == 2.0 ** curves.LOG2_LAMBDA_RANGE[0]
-        limited = curves.codebook_limited(best.made.settings, self.work.splats.sh_degree)
-        if not target or not finest or limited or margin <= self.goal.limits[0].near:
+        if not target or not finest or margin <= self.goal.limits[0].near:
             return ""
         return f"target_size {target:,} bytes is above the finest container of this scene: {best.bytes:,} bytes"
 

@@ -48,7 +48,6 @@ class ErrorModel:
     costs: Costs
     sh_model: CodebookErrorModel
     prune_bits: float  # largest number of bits that the removal of a Gaussian may cost
-    ratio: float  # smallest number of Gaussians per codebook entry
     view_uncertainty: float
 
     def error_at(self, rd_lambda: float) -> float:
@@ -58,7 +57,7 @@ class ErrorModel:
         rounding = GROWTH * DIMENSIONS * (count - len(pruned)) * rd_lambda / (2 * np.log(2))
         other_views = 10 ** (OTHER_VIEWS_DB * self.view_uncertainty / 10)
         uncompensated = SH_UNCOMPENSATED + SH_UNCOMPENSATED_GROWTH * self.view_uncertainty
-        sh_error = self.sh_model.error(max(self.sh_model.best_size(rd_lambda, count, self.ratio), 1))
+        sh_error = self.sh_model.error(max(self.sh_model.best_size(rd_lambda, count), 1))
         return float(other_views * (rounding + GROWTH * pruned.sum()) + uncompensated * sh_error)
 
     def lambda_for(self, error: float) -> float:
@@ -156,7 +155,7 @@ def plan_rate_distortion(
     sh_model = sh_codebook.codebook_error_model(splats, kept, sensitivity, settings, pool)
     refits = settings.color_refit_iterations if recolor is not None else 0
     prune_bits = settings.prune_threshold_bits * (1 - uncertainty)
-    model = ErrorModel(costs, sh_model, prune_bits, settings.gaussians_per_codebook_entry, uncertainty)
+    model = ErrorModel(costs, sh_model, prune_bits, uncertainty)
     usual = default_error(costs, splats, kept, sh_model)
     rd_lambda, default_lambda = choose_lambda(usual, model, settings, refits)
     step_growth = max(1.0, float(np.sqrt(rd_lambda / default_lambda)))
@@ -185,7 +184,7 @@ def plan_rate_distortion(
 
     shapes, form_error = choose_forms(splats, grid.cells, grid.side, planning)
     shapes = shapes.take(grid.mask)
-    size = sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry, container.entry_bits)
+    size = sh_model.best_size(rd_lambda, len(order), container.entry_bits)
     size = sh_codebook.nearest_square(size) if container.tables is None else size
     metric = ShMetric.of(sensitivity, splats.sh_degree)
     codebook = sh_codebook.fit_codebook(

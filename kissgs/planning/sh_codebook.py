@@ -140,7 +140,6 @@ def sensitivity_weights(
 SH_SHRINK = 0.42  # error ~ entries^-this, measured on real scenes with 1,000 to 10,000 entries
 ENTRY_BITS = 112  # bits per entry in the codebook's image, measured at 45 dimensions
 LABEL_SHARE = 0.5  # bits per label for each bit of the codebook's size: frequent entries take fewer
-QUICK = 1 << 13  # number of codebook entries that k-means finds in a few seconds
 FEW = 64  # number of codebook entries that any scene may have: they take about 1 kB, and SOG-XT has no fewer
 SAMPLE, SAMPLE_ENTRIES = 1 << 15, 1024  # Gaussians and entries from which the codebook's error is estimated
 MAX_DISPLAYED_ERROR = 3.0  # largest squared error of a displayed colour, summed over RGB from 0 to 1
@@ -163,13 +162,12 @@ class CodebookErrorModel:
         """Return the squared image error of a codebook with that number of entries."""
         return self.weighted * (self.entries / entries) ** SH_SHRINK
 
-    def best_size(self, rd_lambda: float, count: int, ratio: float, entry_bits: float = ENTRY_BITS) -> int:
-        """Return the optimal number of entries, of ``entry_bits`` each, for ``count`` Gaussians. Beyond :data:`QUICK`
-        entries, which would take long to find, there are at least ``ratio`` Gaussians per entry. Where no error is
+    def best_size(self, rd_lambda: float, count: int, entry_bits: float = ENTRY_BITS) -> int:
+        """Return the optimal number of entries, of ``entry_bits`` each, for ``count`` Gaussians. Where no error is
         known, :data:`FEW` entries are right: k-means makes no more than the scene needs."""
         if self.weighted == 0:
             return FEW
-        low, high = 0.0, np.log(max(count / ratio, min(count / 2, QUICK), FEW))
+        low, high = 0.0, np.log(max(count, FEW))
         for _ in range(50):
             middle = 0.5 * (low + high)
             size = np.exp(middle)

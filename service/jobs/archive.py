@@ -13,7 +13,7 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from lzma import LZMAError
 from pathlib import Path, PurePosixPath
@@ -25,7 +25,7 @@ from kissgs.formats import CAMERA_FILES, PHOTOGRAPHS, is_packable
 from .job_process import Task, sync_folder, write_file
 
 RECORD = "unpacked.json"  # the bytes of each file of a capture, to notice when a later job finds less
-ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
+ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06", b"PK\x07\x08")
 
 DAMAGED = (
     zipfile.BadZipFile,
@@ -54,12 +54,12 @@ def unpack(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     folder, record = Path(task["work"]), Path(task["work"]) / RECORD
     if not task["source"] and not (record.exists() and record.read_bytes() == _as_json(_sizes(folder))):
         return {"bytes": None}
-    skipped: list[PurePosixPath] = []
+    others: list[PurePosixPath] = []
     try:
         with ExitStack() as stack:
             if task["source"]:
                 entries = _entries(Path(task["source"]), stack)
-                skipped = _write_files(entries, folder, task["most_bytes"], task["most_files"])
+                others = _write_files(entries, folder, task["most_bytes"], task["most_files"])
     except DAMAGED as error:
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
             reason = (error.strerror or str(error)).lower()
@@ -72,8 +72,8 @@ def unpack(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
         for path in (folder.resolve(), folder):
             text = text.replace(f"{path}/", "").replace(f"{path}", "the capture")
         raise type(error)(text) from error
-    if views.note and (unused := _photograph(skipped, views)):
-        remedy = "pack photographs as .png, .jpg or .webp, or the cameras alone"
+    if views.note and (unused := _photograph(others, views)):
+        remedy = "pack photographs as .png, .jpg or .webp where the cameras name them, in 'images' for COLMAP, or none"
         raise _refusal(f"has no photographs that can be used, but {str(unused)[:80]!r}; {remedy}")
     if task["source"]:
         write_file(record, _as_json(_sizes(folder)))
@@ -96,8 +96,8 @@ def _as_json(sizes: dict[str, int]) -> bytes:
 def _write_files(
     entries: Iterator[tuple[str, int, bool | None, Opener]], folder: Path, most_bytes: int, most_files: int
 ) -> list[PurePosixPath]:
-    """Write the camera files and the photographs of an archive; return the paths of all other files and links."""
-    left, skipped = most_bytes, []
+    """Write the camera files and the photographs of an archive; return the paths of all files and links but cameras."""
+    left, others = most_bytes, []
     folders: set[PurePosixPath] = set()
     for number, (name, size, is_file, opened) in enumerate(entries, 1):
         path = PurePosixPath(name)
@@ -105,8 +105,8 @@ def _write_files(
         if needed:
             _check_name(name, path, is_file)
             folders.update(path.parents[:-1])
-        elif is_file is not False:
-            skipped.append(path)
+        if is_file is not False and path.name not in CAMERA_FILES:
+            others.append(path)
         if number + len(folders) > most_files:
             raise _refusal(f"has more than {most_files:,} entries, which is the limit; pack only what is needed")
         if not needed:
@@ -121,16 +121,15 @@ def _write_files(
                 source.close()
             file.flush()
             os.fsync(file.fileno())
-    return skipped
+    return others
 
 
-def _photograph(skipped: list[PurePosixPath], views: kissgs.Views) -> PurePosixPath | None:
+def _photograph(paths: list[PurePosixPath], views: kissgs.Views) -> PurePosixPath | None:
     """Return the first file with the name of a view, perhaps with another ending, or link to their folder."""
-    names = {"images"}
-    for view in views.all:
-        path = PurePosixPath(view.name)
-        names |= {path.name, path.stem, *path.parts[:-1]}
-    return next((path for path in skipped if path.name in names or path.stem in names), None)
+    names = [PurePosixPath(view.name) for view in views.all]
+    folders = {"images", *(part for name in names for part in name.parts[:-1])}
+    files = {part for name in names for part in (name.name, name.stem)}
+    return next((path for path in paths if path.name in folders | files or path.stem in files), None)
 
 
 def _check_name(name: str, path: PurePosixPath, is_file: bool | None) -> None:
@@ -148,7 +147,7 @@ def _entries(source: Path, stack: ExitStack) -> Iterator[tuple[str, int, bool | 
     with source.open("rb") as file:
         is_zip = file.read(4) in ZIP_MAGICS
     if is_zip:
-        packed = stack.enter_context(zipfile.ZipFile(source))
+        packed = stack.enter_context(_open_zip(source))
         for info in packed.infolist():
             kind = stat.S_IFMT(info.external_attr >> 16)  # 0 of programs that write no mode
             is_file = None if kind not in (0, stat.S_IFREG, stat.S_IFDIR) else not info.is_dir()
@@ -169,6 +168,13 @@ def _entries(source: Path, stack: ExitStack) -> Iterator[tuple[str, int, bool | 
             raise tarfile.ReadError("not the end, but a damaged header, or nothing")  # where the loop ends, too
         while packed_tar.read(1 << 20):  # to the checksum
             pass
+
+
+def _open_zip(source: Path) -> zipfile.ZipFile:
+    """Open a zip: macOS and Info-ZIP write names in UTF-8 without the flag that says so, others in code page 437."""
+    with suppress(UnicodeDecodeError):
+        return zipfile.ZipFile(source, metadata_encoding="utf-8")
+    return zipfile.ZipFile(source)
 
 
 def _refusal(text: str) -> kissgs.InvalidViewsError:

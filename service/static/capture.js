@@ -3,7 +3,7 @@
 import { announce, byId, el } from "./dom.js";
 import { bytes } from "./format.js";
 
-const ARCHIVE = /\.(zip|tar|tgz|tar\.gz)$/i;
+const ARCHIVE = /\.(zip|tar|tgz|tar\.(gz|bz2|xz))$/i;
 
 /** Whether a file is that of a capture and not of a scene, by its name. @param {File} file */
 export const isArchive = (file) => ARCHIVE.test(file.name);

@@ -212,6 +212,14 @@ def test_the_fraction_never_falls_whatever_happens(plan, events, limit):
     assert all(left is None or left > 0 for _, left in found)
 
 
+def test_receivers_without_a_usable_parameter_get_no_seconds():
+    """Regression: a callable without a signature, as C extensions have them, was an error before the work began."""
+    got = []
+    for receiver in ("{} {}".format, lambda stage, fraction, note="", seconds_left=None, /: got.append(seconds_left)):
+        with_seconds_left(receiver)("order", 0.5, "", 3.0)
+    assert got == [None]
+
+
 def test_receivers_get_what_they_have_parameters_for():
     got = []
     receivers = [

@@ -237,7 +237,7 @@ def lambda_search(target, entry_bytes=40, most=7):
 
     def encode(settings):
         x = START if settings.rd_lambda is None else math.log2(settings.rd_lambda)
-        wanted = 4000 / settings.gaussians_per_codebook_entry * 2 ** (-0.3 * max(x - START, -3))
+        wanted = 600 * 2 ** (-0.3 * max(x - START, -3))
         side = min(8 * math.ceil(math.sqrt(wanted) / 8), math.isqrt(settings.sh_codebook_size))
         size = round(60_000 * 2 ** (-0.2 * max(x - START, -12))) + entry_bytes * side**2
         container = SimpleNamespace(encoded=SimpleNamespace(codebook_side=side))
@@ -245,7 +245,7 @@ def lambda_search(target, entry_bytes=40, most=7):
         return made[-1]
 
     settings = EncodeSettings(target_size=target)
-    LambdaCurve(Goal.of(settings), encode, settings, most, sh_degree=3).search()
+    LambdaCurve(Goal.of(settings), encode, settings, most).search()
     return made
 
 

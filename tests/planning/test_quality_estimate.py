@@ -15,14 +15,13 @@ from kissgs.planning.sh_codebook import CodebookErrorModel
 def test_lambda_for_gives_the_requested_error():
     splats = random_scene(4000, 3, seed=1)
     sh_model = CodebookErrorModel(1024, 1e-6, 2e-6)
-    model = ErrorModel(Costs.of(random_sensitivity(splats), splats), sh_model, 10, 7, 0.2)
+    model = ErrorModel(Costs.of(random_sensitivity(splats), splats), sh_model, 10, 0.2)
     least = model.error_at(1e-22)  # what the largest codebook leaves
     for error, wanted in ((1e-6, 1e-6), (1e-4, 1e-4), (least / 100, MIN_ERROR_RATIO * least)):
         np.testing.assert_allclose(model.error_at(model.lambda_for(error)), wanted, rtol=0.05)
-    sizes = [sh_model.best_size(rd_lambda, 100_000, 7) for rd_lambda in (1e-14, 1e-12, 1e-10)]
+    sizes = [sh_model.best_size(rd_lambda, 100_000) for rd_lambda in (1e-14, 1e-12, 1e-10)]
     assert sizes == sorted(sizes, reverse=True)
-    assert sizes[0] <= round(100_000 / 7)
-    assert sh_model.best_size(1e-20, 6000, 7) == 3000
+    assert sh_model.best_size(1e-20, 6000) == 6000  # an entry for each
 
 
 def spoiled(splats, name, far):

@@ -241,6 +241,10 @@ HOSTILE = {
         "more than 20,000 entries",
     ),
     "other endings": (lambda files: zipped(without_endings(files)), "no photographs that can be used, but 'images/."),
+    "another folder": (
+        lambda files: zipped({name.replace("images", "photos"): data for name, data in files.items()}),
+        "no photographs that can be used, but 'photos/",
+    ),
     "two captures": (lambda files: zipped(two(files)), "two captures, 'one' and 'two'; pack one of them"),
     "an image that is none": (lambda files: zipped({**files, **image()}), "images/0.png is damaged, truncated, or not"),
     "no cameras": (lambda files: zipped(image()), "the capture has no cameras: neither"),
@@ -250,7 +254,7 @@ HOSTILE = {
     ),
     "a missing photograph": (
         lambda files: zipped({name: data for name, data in files.items() if name != "images/3.png"}),
-        "1 of 9 photographs is missing; the first is 'images/3.png'",
+        "1 of 9 photographs is missing; the first is 'images/3.png', searched in images; add what is missing$",
     ),
     "no JSON": (lambda files: zipped({**files, "transforms.json": b"{"}), "transforms.json is not JSON"),
 }
@@ -279,9 +283,29 @@ def test_files_that_nothing_needs_may_have_any_name(service, folder, scene, expe
     assert service.only_result(submitted(service, scene, buffer.getvalue())) == expected
 
 
+def unmarked_zip(files):
+    """Return a zip as macOS and Info-ZIP write it: names in UTF-8 without the flag that says so."""
+    ascii_names = {name: "".join(f"{byte:c}" if byte < 128 else "x" for byte in name.encode()) for name in files}
+    data = zipped({ascii_names[name]: content for name, content in files.items()}, zipfile.ZIP_STORED)
+    for name, placeholder in ascii_names.items():
+        data = data.replace(placeholder.encode(), name.encode())
+    return data
+
+
+@pytest.mark.parametrize("pack", [zipped, unmarked_zip, tarred])
+def test_names_of_any_language(service, folder, scene, pack):
+    """Regression: zips of Info-ZIP, and spaces that are not ASCII, were refused."""
+    name = "images/写真\u3000é\u202f0.png"
+    files = moved(files_of(folder), name)
+    status = submitted(service, scene, pack({**files, name: files["images/0.png"]}), {"preset": "fast"})
+    assert service.ended(status)["state"] == "succeeded"
+    assert (service.folder / "jobs" / status["id"] / "capture" / name).is_file()
+
+
 def test_cameras_without_photographs(service, folder, scene):
     files = {name: data for name, data in files_of(folder).items() if not name.startswith("images/")}
-    status = service.ended(submitted(service, scene, zipped(files), {"preset": "fast", "evaluate": True}))
+    archive = zipped({**files, "images.db": b"not their folder"})
+    status = service.ended(submitted(service, scene, archive, {"preset": "fast", "evaluate": True}))
     assert status["state"] == "succeeded"
     assert "no photograph of the capture" in status["note"]
     report = service.http.get(status["links"]["report"])

@@ -123,9 +123,9 @@ def test_a_scene_and_its_photographs_are_dropped_anywhere(page, scene, archive):
             for (const name of names) data.items.add(new File([new Uint8Array(9)], name));
             window.dispatchEvent(new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true }));
         }""",
-        ["photos.tar.gz", "scene.spz"],
+        ["photos.tar.xz", "scene.spz"],
     )
-    page.locator("#capture-title", has_text="photos.tar.gz, 9 bytes").wait_for()
+    page.locator("#capture-title", has_text="photos.tar.xz, 9 bytes").wait_for()
     page.locator("#file-title", has_text="scene.spz").wait_for()
 
 

@@ -40,6 +40,8 @@ def test_remote_compression_equals_local_compression(service, scene, tmp_path):
 
     def progress(stage, fraction, note="", seconds_left=None):
         received.append((stage, fraction, seconds_left))
+        if fraction == 1:
+            raise kissgs.Cancelled  # too late: the work is done
 
     with kissgs.Remote(service.url) as remote:
         status = remote.compress(scene, tmp_path / "remote.zip", settings=FAST, progress=progress)
@@ -51,7 +53,7 @@ def test_remote_compression_equals_local_compression(service, scene, tmp_path):
     assert [stage for stage in stages if stage in in_order] == in_order
     fractions = [fraction for _, fraction, _ in received]
     assert fractions == sorted(fractions)
-    assert 0 <= fractions[0] <= fractions[-1] == 1
+    assert 0 <= fractions[0] <= fractions[-2] < fractions[-1] == 1
     assert any(left is not None for _, _, left in received)
 
 
@@ -177,7 +179,7 @@ def test_a_full_queue_is_retried(start, scene, tmp_path):
 
 
 def test_a_container_damaged_in_transit(service, scene, tmp_path, monkeypatch):
-    real = httpx.Response.iter_bytes
+    real, fractions = httpx.Response.iter_bytes, []
 
     def damaged(self, *arguments):
         for block in real(self, *arguments):
@@ -187,8 +189,9 @@ def test_a_container_damaged_in_transit(service, scene, tmp_path, monkeypatch):
         status = remote.follow(remote.submit(scene, settings=FAST)["id"])
         monkeypatch.setattr(httpx.Response, "iter_bytes", damaged)
         with pytest.raises(kissgs.RemoteError, match="damaged"):
-            remote.download(status, tmp_path / "x.zip")
+            remote.download(status, tmp_path / "x.zip", progress=lambda stage, fraction: fractions.append(fraction))
     assert list(tmp_path.glob("*zip*")) == []
+    assert max(fractions) < 1
 
 
 def kissgs_command(*arguments, group=("remote",), cwd=None, **settings):

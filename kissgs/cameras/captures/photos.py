@@ -178,10 +178,10 @@ def find_photos(
     if missing:
         folders = searched[missing[0]]
         folder = next((entry.folder for entry in folders if entry.has_photos), folders[0].folder)
+        elsewhere = ", or name the folder that has all of them (--images of kissgs evaluate and render)"
         raise InvalidViewsError(
             f"{len(missing)} of {len(names)} photographs {'is' if len(missing) == 1 else 'are'} missing; the first is "
-            f"{quoted(names[missing[0]])}, searched in {folder}; add what is missing, or name the folder that has all "
-            "of them (--images of kissgs evaluate and render)"
+            f"{quoted(names[missing[0]])}, searched in {folder}; add what is missing{'' if inside else elsewhere}"
         )
     return tuple(photo for photo in found if photo is not None)
 

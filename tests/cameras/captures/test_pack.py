@@ -55,7 +55,7 @@ def test_only_what_views_use_is_packed(tmp_path):
     assert (tmp_path / "again.zip").read_bytes() == first
 
 
-@pytest.mark.parametrize(("file", "name"), [("r_0.png", "r_0"), ("frame.0001.JPG", "frame.0001"), ("0001", "0001")])
+@pytest.mark.parametrize(("file", "name"), [("r_0.png", "r_0"), ("a.0001.JPG", "a.0001"), ("0\u30001", "0\u30001")])
 @pytest.mark.parametrize("folder", ["train", "images"])
 def test_photographs_that_are_named_without_an_ending_get_one(tmp_path, file, name, folder):
     capture = write_capture(tmp_path / "statue")
