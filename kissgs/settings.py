@@ -86,7 +86,7 @@ class TrainingViewSettings(StageSettings):
         960, "Longer side, pixels, up to which photographs train whole; of larger ones every n-th pixel and row."
     )
     lr_offset: Steps | None = of_preset(
-        None, "Learning rates of 3DGS as after so many of its steps; auto: others, which fall towards the end."
+        None, "Learning rates of 3DGS as after so many of its steps; auto: falling ones."
     )
     seed: Seed = of_preset(0, "Seed of the order of images and of virtual cameras: that of encode.")
 
@@ -120,9 +120,7 @@ class CompactSettings(TrainingViewSettings):
     min_keep_per_scoring: Annotated[float, Field(ge=0, le=0.99)] = of_preset(
         0.8, "Smallest share that pruning by one scoring may leave; deeper pruning scores again. 0: score once."
     )
-    score_floor: Share = of_preset(
-        1.0, "Factor on the lowest score: 0.3 of what a camera nearby would find, with a capture 0.05."
-    )
+    score_floor: Share = of_preset(1.0, "Factor on the lowest score (compaction.md).")
     trains_all: bool = of_preset(False, "Train a scene of no more Gaussians than requested too.")
     initial_prune_fraction: Share = of_preset(0.43, "Share of the first pruning in the logarithm of all pruning.")
     sparsify_steps: Steps = of_preset(1500, "Training steps during gradual pruning; 0: prune all at once.")
@@ -279,9 +277,7 @@ class EncodeSettings(StageSettings):
     quat_step: Annotated[float, Field(ge=1e-4, le=0.5)] = of_preset(
         0.023, "Quantisation step of quaternion components: 0.02 is a mean error of 1 degree."
     )
-    quat_levels: Annotated[int, Field(ge=2, le=256)] = of_preset(
-        100, "Levels of quaternion components without shared_step_size; the paper has 256 for the forms of the scene."
-    )
+    quat_levels: Annotated[int, Field(ge=2, le=256)] = of_preset(100, "Levels of quaternions without shared_step_size.")
     sh0_step: Step = of_preset(0.055, "Quantisation step of the base colour: 0.055 is an error of at most 2 of 255.")
     gaussians_per_codebook_entry: Annotated[float, Field(ge=1, le=4096)] = of_preset(
         7.0, "Gaussians per codebook entry, without rate_distortion."
@@ -355,11 +351,11 @@ class FinetuneSettings(TrainingViewSettings):
     codebook_lr: Rate = of_preset(0.2, "Initial learning rate of the SH codebook, in quantisation steps.")
     synthetic_lr_scale: Rate = of_preset(0.3, "Factor on both where targets are renderings, which leave less error.")
     final_lr_scale: Annotated[float, Field(gt=0, le=1)] = of_preset(0.05, "Factor on both at the last step.")
-    attraction: Weight = of_preset(1.0, "Weight of the attraction of values to their levels; the paper has none.")
+    attraction: Weight = of_preset(1.0, "Weight of the attraction to levels.")
     pras_at: list[Share] = of_preset(
-        [], "Fractions of the steps at which PRAS chooses forms again, if rate_weight is 0."
+        [], "Fractions of the steps at which PRAS chooses forms anew; needs rate_weight 0."
     )
-    keeps_better: bool = of_preset(True, "Keep the container from before, if it has less error plus lambda times bits.")
+    keeps_better: bool = of_preset(True, "Keep the container from before if it is better.")
     rate_weight: Weight = of_preset(
         2.0, "Weight of the estimated rate, in units of rd_lambda, against the image error."
     )
