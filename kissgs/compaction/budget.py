@@ -39,10 +39,9 @@ def compact_scene(
     evaluate: bool = False,
     checkpoint: Path | None = None,
 ) -> Compacted:
-    """Reduce the number of Gaussians to the budget of the settings. A scene of no more than that is returned unchanged,
-    or trained only. With a capture, its training views train and score, and its held-out views evaluate. Without one,
-    virtual views train and score with renderings of the scene as targets, and cameras drawn over the whole scene
-    evaluate."""
+    """Reduce the number of Gaussians to the budget of the settings; no more than that are unchanged, or only trained.
+    With a capture, its training views train and score, and its held-out views evaluate. Without one, virtual views
+    train and score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate."""
     if not settings.enabled:
         raise UnsupportedError("missing the number of Gaussians to keep: give count, ratio or max_psnr_drop")
     if settings.auto_count:

@@ -39,8 +39,7 @@ if TYPE_CHECKING:
 # Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.2).
 
 
-# Learning rates before and at the end of refinement, in units of the initial ones of 3DGS; factor where targets are
-# renderings, which leave less error.
+# Learning rates before and at the end of refinement, in units of those of 3DGS; factor for renderings as targets.
 MEANS_LR, OTHER_LR, RENDERINGS_LR = (1.0, 0.01), (2.0, 0.1), 0.5
 
 
@@ -96,7 +95,7 @@ def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> 
     from kissgs.training.loop import BASE_LR, continued_lr, exponential_lr
 
     if settings.lr_offset is not None:
-        return continued_lr(settings.lr_offset + phase.first, phase.steps)
+        return continued_lr(BASE_LR, settings.lr_offset + phase.first, phase.steps)
     scale = RENDERINGS_LR if target_source == "renderings" else 1.0
     base = {name: rate * scale for name, rate in BASE_LR.items()}
     begin, end = ({name: (MEANS_LR if name == "means" else OTHER_LR)[at] for name in base} for at in (0, 1))

@@ -55,12 +55,10 @@ class AdmmSparsifier(Regularizer):
 
     Zhang et al., "GaussianSpa: An Optimizing-Sparsifying Simplification Framework for Compact and High-Quality 3D
     Gaussian Splatting" (CVPR 2025), section 4, as scaled ADMM: with the opacities o, 0 to 1, their sparse copy z and
-    the dual variable u, every ``interval`` steps
+    the dual variable u, every ``interval`` steps, before the optimiser's, as in the published code,
 
     - the loss of the step has the penalty rho/2 · ‖o - z + u‖²,
     - z becomes o + u with all but its ``count`` largest entries set to 0, and u becomes u + o - z.
-
-    Opacities are those before the optimiser's step, as in the published code.
     """
 
     def __init__(self, opacities: Float[Tensor, " N"], count: int, rho: float, interval: int) -> None:

@@ -127,18 +127,11 @@ class QuantizedScene:
     """An encoding plan whose levels :func:`kissgs.training.loop.train` can fit."""
 
     def __init__(
-        self,
-        plan: EncodingPlan,
-        sh_degree: int,
-        device: Device = "cpu",
-        container: ContainerModel = EVEN_LEVELS,
-        *,
-        rates_of_attributes: bool = False,
+        self, plan: EncodingPlan, sh_degree: int, device: Device = "cpu", container: ContainerModel = EVEN_LEVELS
     ) -> None:
-        """Start from a plan for ``container``; ``sh_degree`` is that of the decoded scene. Learning rates are in units
-        of latents or of attributes: world units for positions, at the slope that their logarithm has at the start."""
-        self._plan, self._sh_degree, self._in_attributes = plan, sh_degree, rates_of_attributes
-        self._device, self._reformed = device, dict[str, Quantized]()
+        """Start from a plan for ``container``; ``sh_degree`` is that of the decoded scene."""
+        self._plan, self._sh_degree, self._device = plan, sh_degree, device
+        self._rates_of_attributes, self._reformed = False, dict[str, Quantized]()
         count = int(plan.grid.mask.sum())
         self.planes, self.trained_tables = planes_of(plan, sh_degree, container.tables, device)
         self.classes, self.grid = plan.classes.astype(np.int64), plan.grid
@@ -149,9 +142,7 @@ class QuantizedScene:
             self._omitted = torch.from_numpy(omitted).to(device)
         trained = {name: plane.min_latent for name, plane in self.planes.items()}
         trained |= {table_name(name): table.min_latent for name, table in self.trained_tables.items()}
-        zeros = {name: torch.zeros_like(latent) for name, latent in trained.items()}
-        factors = {name: self._factors(name) for name in zeros} if rates_of_attributes else {}
-        self._adam = PrunableAdam(zeros, factors=factors)
+        self._adam = PrunableAdam({name: torch.zeros_like(latent) for name, latent in trained.items()})
         self._weights: dict[str, Tensor] = {}
 
     @property
@@ -170,16 +161,19 @@ class QuantizedScene:
         """Return the values of the trained tables by field, ``(L,)`` float64 each, differentiable."""
         return {name: self.trained_tables[name].values(latents) for name, latents in self.table_latents.items()}
 
-    def _factors(self, name: str) -> Tensor:
-        """Return latents per unit of the attribute, at the plan's levels; 0 for what cannot change."""
-        if name in self.planes:
-            plane = self.planes[name]
-            level = torch.zeros_like(plane.min_latent)
-            unit = plane.units(level)
-            if name == "means":
-                unit = unit * plane.values(level).abs().exp()
-        else:
+    def take_rates_of_attributes(self) -> None:
+        """Take learning rates in units of attributes, those of positions at the slope of their logarithm now."""
+        self._rates_of_attributes = True
+        for name, latents in self._adam.parameters.items():
+            self._adam.replace(name, latents, self._per_unit(name))
+
+    def _per_unit(self, name: str) -> Tensor:
+        """Return the latents of one unit of the attribute, at the plan's levels; 0 for what cannot change."""
+        if name not in self.planes:
             unit = self.trained_tables[name.removesuffix(".table")].unit
+        else:
+            plane, level = self.planes[name], torch.zeros_like(self.planes[name].min_latent)
+            unit = plane.units(level) * (plane.values(level).abs().exp() if name == "means" else 1)
         return torch.where(unit > 0, 1 / unit, 0).float()
 
     def choose_forms(self, decay: float, threads: int) -> None:
@@ -196,20 +190,18 @@ class QuantizedScene:
             rows = grid.cell_to_gaussian
             forms = rotation_forms.pras_forms(quats[rows], scales[rows], grid.side, pool, decay=decay)[grid.mask]
         for name, values in zip(REFORMED, rotation_forms.apply_forms(quats, scales, forms), strict=True):
-            field = quantize(values, step=1, shared=False, max_top=self.planes[name].field.top)
-            extent = field.table[-1] - field.table[0]
-            places = (values - field.table[0]) * (field.top / np.where(extent > 0, extent, np.inf))
-            self._adopt(name, field, places)
+            self._adopt(name, quantize(values, step=1, shared=False, max_top=self.planes[name].field.top), values)
 
-    def _adopt(self, name: str, field: Quantized, places: Float64[np.ndarray, "M C"]) -> None:
-        """Continue with other levels and ranges of a field; latents are at these places among the levels."""
+    def _adopt(self, name: str, field: Quantized, values: Float[np.ndarray, "M C"]) -> None:
+        """Continue with other levels and ranges of a field, and with latents of these values, which it rounds."""
         self._reformed[name] = field
         fields = {**self._plan.fields, name: field.take(self._plan.grid.cell_to_gaussian)}
         self._plan = replace(self._plan, fields=fields, errors={**self._plan.errors, name: half_steps(field)})
         plane = self.planes[name] = Plane.even(field, self._device)
-        latents = torch.from_numpy(places).to(self._device) - plane.base_multiples
-        latents = latents.float().clamp(plane.min_latent, plane.max_latent)
-        self._adam.replace(name, latents, self._factors(name) if self._in_attributes else None)
+        per_unit, rounded = self._per_unit(name), plane.values(torch.zeros_like(plane.min_latent))
+        latents = ((torch.from_numpy(values).to(self._device) - rounded) * per_unit).float()
+        latents.clamp_(plane.min_latent, plane.max_latent)
+        self._adam.replace(name, latents, per_unit if self._rates_of_attributes else None)
 
     def set_curvature(self, costs: Costs, loss_per_error: float) -> None:
         """Set the curvature of the quadratic attraction, 0 before, from the loss per mean squared image error."""
@@ -308,7 +300,7 @@ class QuantizedScene:
         for name in REFORMED:
             if f"{name}.levels" in state:
                 field = Quantized(state[f"{name}.levels"], state[f"{name}.values"])
-                self._adopt(name, field, field.levels.astype(np.float64))
+                self._adopt(name, field, field.values())
         self._adam.restore(state)
 
 

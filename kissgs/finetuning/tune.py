@@ -33,6 +33,7 @@ from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import (
+    BASE_LR,
     LrSchedule,
     TrainingPlan,
     continued_lr,
@@ -151,8 +152,9 @@ class Tuner:
         self, plan: EncodingPlan, sh_degree: int, rd_lambda: float, pace: Pace, path: Path | None
     ) -> tuple[EncodingPlan, str]:
         """Return the fine-tuned plan, and a note if the checkpoint could not be saved."""
-        settings, in_attributes = self.settings, self.settings.lr_offset is not None
-        scene = QuantizedScene(plan, sh_degree, self.context.device, self.container, rates_of_attributes=in_attributes)
+        settings, scene = self.settings, QuantizedScene(plan, sh_degree, self.context.device, self.container)
+        if settings.lr_offset is not None:
+            scene.take_rates_of_attributes()
         checkpoint = Checkpoint(path, "" if path is None else self._key(plan, sh_degree))
         done, checkpoint_note = 0, ""
         loss_per_error = self._loss_per_error(scene)
@@ -251,31 +253,21 @@ class Tuner:
 
 def _lr_schedule(settings: FinetuneSettings, targets: TrainingTargets) -> LrSchedule:
     """Return learning rates, those of 3DGS or exponentially falling ones, and quadratic attraction that grows in the
-    second half."""
-    scale = 1.0 if targets.target_source == "photos" else settings.synthetic_lr_scale
-    base = {name: scale * (settings.codebook_lr if name == "f_rest_centroids" else settings.lr) for name in FIELDS}
-    base |= {table_name(name): TABLE_LR * scale * settings.lr for name in TABLES}
-    learning_rates = exponential_lr(base, dict.fromkeys(base, 1.0), dict.fromkeys(base, settings.final_lr_scale))
+    second half. A rate of 3DGS for SH is right for codebook entries: Adam makes equal steps of equal gradients, so the
+    mean of an entry's Gaussians moves as each of them."""
     if settings.lr_offset is not None:
-        learning_rates = _rates_of_3dgs(settings.lr_offset, settings.steps, targets.extent)
+        base = {name: BASE_LR[attribute] for name, attribute in zip(FIELDS, ATTRIBUTES_OF_FIELDS, strict=True)}
+        base |= {"means": targets.extent * base["means"], **{table_name(name): base[name] for name in TABLES}}
+        learning_rates = continued_lr(base, settings.lr_offset, settings.steps)
+    else:
+        scale = 1.0 if targets.target_source == "photos" else settings.synthetic_lr_scale
+        base = {name: scale * (settings.codebook_lr if name == "f_rest_centroids" else settings.lr) for name in FIELDS}
+        base |= {table_name(name): TABLE_LR * scale * settings.lr for name in TABLES}
+        learning_rates = exponential_lr(base, dict.fromkeys(base, 1.0), dict.fromkeys(base, settings.final_lr_scale))
 
     def rates(done: float) -> dict[str, float]:
         growing = max(done - ATTRACTION_START, 0.0) / (1 - ATTRACTION_START)
         return {**learning_rates(done), "attraction": settings.attraction * growing}
-
-    return rates
-
-
-def _rates_of_3dgs(first: int, steps: int, extent: float) -> LrSchedule:
-    """Return the learning rates of 3DGS after its step ``first`` by field and table, in units of attributes. An entry
-    of the codebook moves as the mean of its Gaussians would, since Adam makes their equal gradients equal steps."""
-    rates_of = continued_lr(first, steps)
-
-    def rates(done: float) -> dict[str, float]:
-        found = rates_of(done)
-        by_field = {name: found[attribute] for name, attribute in zip(FIELDS, ATTRIBUTES_OF_FIELDS, strict=True)}
-        by_field["means"] *= extent
-        return {**by_field, **{table_name(name): by_field[name] for name in TABLES}}
 
     return rates
 

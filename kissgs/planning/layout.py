@@ -207,8 +207,7 @@ def _plas_order(
     pool: Workers,
     report: Callable[[float], None],
 ) -> tuple[Int[np.ndarray, " cells"], Bool[np.ndarray, " cells"]]:
-    """Return order and mask of the cells sorted by PLAS on both position bytes, padding included: one Gaussian of the
-    scene, so that it widens no range. The paper has fixed defaults, without their values."""
+    """Return order and mask of the cells sorted by PLAS on both position bytes; all padding is the first Gaussian."""
     count = len(levels)
     rng = np.random.Generator(np.random.PCG64(settings.seed))
     index = np.concatenate([np.arange(count), np.zeros(side * side - count)]).astype(np.int32)

@@ -190,11 +190,11 @@ def exponential_lr(base: Mapping[str, float], begin: Mapping[str, float], end: M
     return rates
 
 
-def continued_lr(first: int, steps: int) -> LrSchedule:
-    """Return the learning rates that 3DGS would have in ``steps`` after its step ``first``: that of positions, in units
-    of the cameras' extent, falls to 1 % within 30,000 steps, and further after them; the others are constant."""
+def continued_lr(base: Mapping[str, float], first: int, steps: int) -> LrSchedule:
+    """Return the learning rates that 3DGS would have in ``steps`` after its step ``first``: that of positions falls to
+    1 % within 30,000 steps, and further after them; the others are constant."""
 
     def rates(done: float) -> dict[str, float]:
-        return {**BASE_LR, "means": BASE_LR["means"] * 0.01 ** ((first + done * steps) / 30_000)}
+        return {**base, "means": base["means"] * 0.01 ** ((first + done * steps) / 30_000)}
 
     return rates

@@ -118,7 +118,8 @@ def test_learning_rates_are_in_units_of_attributes(degree):
         "f_rest_centroids": 7e-4,
     }
     plan = chosen(cloud(70, degree), "paper")
-    work = QuantizedScene(plan, degree, rates_of_attributes=True)
+    work = QuantizedScene(plan, degree)
+    work.take_rates_of_attributes()
     before = {name: plane.field.values() for name, plane in work.planes.items()}
     for latents in work.latents.values():
         latents.grad = torch.full_like(latents, -1e-3)

@@ -15,7 +15,7 @@ from kissgs.rendering.differentiable import plain_photometric_loss, rasterize
 from kissgs.rendering.rasterizer import render, tensors_of
 from kissgs.training import checkpoint
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.loop import TrainingPlan, continued_lr, exponential_lr, image_loss, train
+from kissgs.training.loop import BASE_LR, TrainingPlan, continued_lr, exponential_lr, image_loss, train
 from kissgs.training.model import GaussianModel
 
 RATES = {"means": 2e-3, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 1e-2, "shN": 1e-3}
@@ -182,7 +182,7 @@ def test_learning_rates_fall_exponentially():
 
 def test_learning_rates_of_3dgs_continue():
     """Oracle: gsplat's trainer, which multiplies the rate of positions by 0.01 ** (1 / 30,000) after every step."""
-    rates, wanted = continued_lr(30_000, 10_000), 1.6e-4
+    rates, wanted = continued_lr(BASE_LR, 30_000, 10_000), 1.6e-4
     for step in range(40_000):
         if step in (30_000, 35_000):
             assert rates((step - 30_000) / 10_000)["means"] == pytest.approx(wanted, rel=1e-6)
