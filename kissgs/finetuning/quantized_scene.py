@@ -478,8 +478,8 @@ TV_RAMP = (0.35, 0.6)  # fractions of the steps between which these weights grow
 
 class TotalVariationLoss(Regularizer):
     """Regularizer: masked L1 total variation of the images, the paper's term for small files. For each image it is the
-    mean absolute difference of levels over all pairs of neighbouring cells that hold Gaussians and over channels. The
-    paper does not state the unit; here it is levels."""
+    mean absolute difference over all pairs of neighbouring cells that hold Gaussians and over channels, with levels as
+    numbers from 0 to 1. The paper does not state the unit; of levels, the term would outweigh the photographs."""
 
     def __init__(self, scene: QuantizedScene, weight: float, pace: Pace) -> None:
         self._scene, self._weight, self._pace = scene, weight, pace
@@ -494,9 +494,10 @@ class TotalVariationLoss(Regularizer):
             return None
         total = torch.zeros((), dtype=torch.float64, device=self._one.device)
         for name, factor in PAPER_TV_WEIGHTS.items():
-            levels = self._scene.planes[name].levels(self._scene.latents[name])
+            plane = self._scene.planes[name]
+            levels, top = plane.levels(self._scene.latents[name]), plane.field.top if name != "means" else 255
             for image in _bytes(levels) if name == "means" else (levels,):
-                total = total + factor * (image[self._one] - image[self._other]).abs().mean()
+                total = total + factor / top * (image[self._one] - image[self._other]).abs().mean()
         return weight * total
 
 
