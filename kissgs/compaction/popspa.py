@@ -253,8 +253,7 @@ class SceneTraining:
 
     def prune(self, count: int, context: Context) -> None:
         """Keep the ``count`` Gaussians that images would miss most; reports the stage "score"."""
-        views = self.compactor.supervision
-        settings = self.compactor.settings
+        views, settings = self.compactor.supervision, self.compactor.settings
         share, least = settings.min_keep_per_scoring, settings.score_floor * MIN_SCORE[views.captured]
         limits = {"min_keep_per_scoring": share, "min_score": least}
         kept = prune_by_score(self.splats(), views.score, views.background, count, context, **limits)
