@@ -169,7 +169,7 @@ def shown(preset, group, name):
 
 
 def test_the_page_on_the_paper_has_the_values_of_the_presets():
-    """And those of the paper, where they are given: ``paper`` has them. Every value that sets it apart is listed."""
+    """Values that the paper gives are those of ``paper``, and every value that sets this preset apart is listed."""
     page = (ROOT / "docs" / "method" / "paper.md").read_text(encoding="utf-8")
     listed = set()
     for row in re.findall(r"^\| `.*$", page, re.MULTILINE):
