@@ -185,3 +185,20 @@ def test_the_page_on_the_paper_has_the_values_of_the_presets():
                 listed.add(("finetune", name))
     own = {(group, name) for group, values in PRESETS[Preset.PAPER].items() for name in values}
     assert own <= listed, "add it to docs/method/paper.md"
+
+
+def test_the_page_expects_what_goals_with_photographs_have_reached():
+    """These are bytes per Gaussian of fox, and the change of PSNR to its photographs."""
+    text = (ROOT / "docs" / "method" / "rate-distortion.md").read_text(encoding="utf-8")
+    section = text.partition("### With photographs")[2].partition("\n###")[0]
+    row = r"^\| `--(?:quality|max-psnr-drop) ([\w.]+)` \| ([\d,]+) \| ([\d.]+) dB"
+    page = (ROOT / "service" / "static" / "expected.js").read_text(encoding="utf-8")
+    figures = re.findall(
+        r'\["([\w.]+)", ([\d.]+), (-?[\d.]+)\]', page.partition("photographs: [")[2].partition("\n  ],")[0]
+    )
+    expected = {goal: (float(size), float(change)) for goal, size, change in figures}
+    rows = re.findall(row, section, re.MULTILINE)
+    assert len(rows) == 4
+    for goal, size, psnr in rows:
+        found = int(size.replace(",", "")) / 79_451, float(psnr) - 32.09
+        assert expected[goal] == pytest.approx(found, abs=0.006), goal

@@ -22,7 +22,7 @@ from kissgs.cli.options import (
     with_option_groups,
 )
 from kissgs.core.errors import OutputError, UnsupportedError
-from kissgs.formats import ENDINGS, ending_of, named_container
+from kissgs.formats import ENDINGS, OUTPUT_FORMATS, WRITTEN, ending_of, named_container
 
 if TYPE_CHECKING:
     from kissgs.client import Remote
@@ -119,13 +119,16 @@ def get(
     from kissgs.client import Share
     from kissgs.io.files import refuse_existing
 
-    if output is not None and output.suffix.lower() not in ENDINGS:
+    if output is not None and not output.name.lower().endswith((*ENDINGS, *WRITTEN)):
         raise OutputError(f"{output!s:.100} is not the name of a container; end it in {' or '.join(ENDINGS)}")
     with _service(server) as remote, progress_bar(False) as bar:
         progress = _announcing(bar, server, False)
         known = remote.status(job)
-        kind = named_container(known["options"].get("format"), output)  # services of older versions state none
-        target = output or Path(f"{known['name']}{ending_of(kind)}")
+        kind = known["options"].get("format")  # services of older versions state none
+        ending = f".{kind}" if kind in OUTPUT_FORMATS else ending_of(named_container(kind, output))
+        target = output or Path(f"{known['name']}{ending}")
+        if not target.name.lower().endswith(ending):
+            raise OutputError(f"{target!s:.100} is not the name of this job's result; end it in {ending}")
         refuse_existing(target, overwrite=force)
         status = remote.follow(job, Share(progress, 0.0, 0.95))
         remote.download(status, target, overwrite=force, progress=Share(progress, 0.95, 1.0))

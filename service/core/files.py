@@ -9,18 +9,18 @@ from typing import Any, Literal
 import kissgs
 from kissgs.formats import UPLOADS
 
-Format = Literal["sogxt", "sog"]  # names of the library's containers
+Format = Literal["sogxt", "sog", "spz", "compressed.ply"]  # the library's containers, and formats that it converts to
 
 DEFAULT: Format = "sogxt"
 
 
 @dataclass(frozen=True, slots=True)
 class ContainerFile:
-    """Ending and media type of a container. A ``.sog`` is a zip as well, but some browsers unpack what is called a zip,
-    or change the ending of its name; SOG has no registered type of its own."""
+    """Ending and media type of a result. A ``.sog`` is a zip as well, but some browsers unpack what is called a zip, or
+    change the ending of its name; only zip has a registered type."""
 
     ending: str
-    media_type: str
+    media_type: str = "application/octet-stream"
 
     @property
     def name(self) -> str:
@@ -30,15 +30,19 @@ class ContainerFile:
 
 CONTAINER_FILES: dict[Format, ContainerFile] = {
     "sogxt": ContainerFile(".zip", "application/zip"),
-    "sog": ContainerFile(".sog", "application/octet-stream"),
+    "sog": ContainerFile(".sog"),
+    "spz": ContainerFile(".spz"),
+    "compressed.ply": ContainerFile(".compressed.ply"),
 }
+
+THUMBNAIL, THUMBNAIL_SIZE = "thumbnail.webp", (320, 240)  # name and pixels of the image of a result
 
 UPLOAD_FILES = tuple(f"scene{ending}" for ending in UPLOADS.values())
 """Names of a job's upload, of which it has one: the ending tells formats that are not recognised by their content."""
 
 
 def container_file(options: dict[str, Any]) -> ContainerFile:
-    """Return the container's file for the stored options of a job; jobs without a format made SOG-XT."""
+    """Return the result's file for the stored options of a job; jobs without a format made SOG-XT."""
     return CONTAINER_FILES[options.get("format", DEFAULT)]
 
 

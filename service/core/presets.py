@@ -64,8 +64,8 @@ def presets() -> Presets:
 
 START_SECONDS = 1.0  # fixed seconds of every job, to start a process and import the library
 BUSY_CORES = 1.8  # average number of busy cores on a two-core server
-SEARCH_FACTOR = 4.0  # factor on the total time of a job that searches for a goal, which encodes several times
-TUNED_CONTAINERS = 2.0  # containers that a search for the number of Gaussians fine-tunes
+SEARCH_ENCODINGS = 4.0  # of a search for a goal
+TUNED_CONTAINERS = 2.0  # containers that it fine-tunes
 
 
 def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
@@ -76,10 +76,8 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     encoding = (facts.cpu_seconds_per_million + evaluate * EVALUATION) * millions
     compacts, tunes, searches = (suffix.removeprefix("+") in stages for suffix in (COMPACTED, FINETUNED, SEARCHED))
     training, tuning = (fixed + per_million * millions for fixed, per_million in (facts.training, facts.tuning))
-    if compacts and tunes and searches:
-        return START_SECONDS + (SEARCH_FACTOR * encoding + training + TUNED_CONTAINERS * tuning) / BUSY_CORES
-    cpu = encoding + compacts * training + tunes * tuning
-    return START_SECONDS + cpu * (SEARCH_FACTOR if searches else 1.0) / BUSY_CORES
+    encodings, tunings = (SEARCH_ENCODINGS, TUNED_CONTAINERS) if searches else (1.0, 1.0)
+    return START_SECONDS + (encodings * encoding + compacts * training + tunes * tunings * tuning) / BUSY_CORES
 
 
 LONGEST_FINETUNING = 2.0  # factor on the time of a job that fine-tunes with a time limit: up to twice the steps

@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field
 
 import kissgs
+from kissgs.formats import CONTAINERS
 
 from .files import DEFAULT, Format
 from .models import NOTE_CHARS, State
@@ -35,6 +36,7 @@ class JobOptions(kissgs.Settings):
                 {"finetune": {"enabled": True}},
                 {"encode": {"target_size": 3_000_000}, "time_limit": 120},
                 {"format": "sog"},
+                {"format": "spz"},
                 {"encode": {"max_psnr_drop": 0.1}, "capture": f"sha256:{'0' * 64}"},
             ]
         },
@@ -42,7 +44,8 @@ class JobOptions(kissgs.Settings):
 
     format: Format = Field(
         DEFAULT,
-        description="Format of the container: sogxt (.zip), or sog, which other viewers open (.sog, SOG version 2).",
+        description="Format of the result: the container sogxt (.zip) or sog (SOG version 2); or spz or "
+        "compressed.ply, which hold the scene as it is: they go with no goal, time limit or training.",
     )
     evaluate: bool = Field(
         False, description="Also render both scenes and compare the images (PSNR, SSIM, MS-SSIM), which takes longer."
@@ -64,23 +67,17 @@ class JobOptions(kissgs.Settings):
 
     @classmethod
     def stored(cls, options: dict[str, Any]) -> Self:
-        """Return the options of a job in the database; older versions took values that belong to the preset now, and
-        had a preset "small", a coarser "balanced"."""
-        if options.get("preset") == "small":
-            options = {**options, "preset": kissgs.Preset.BALANCED}
+        """Return the options of a job in the database; older versions took values that belong to the preset now."""
         return cls.model_validate({"for_research": True, **options})
 
     @property
     def kind(self) -> str:
-        """Preset, further stages and whether time is limited: with the scene, they determine the duration."""
-        stages = {
-            COMPACTED: self.compact.enabled,
-            FINETUNED: bool(self.finetune.enabled),
-            SEARCHED: self.searches,
-            CAPTURED: self.capture is not None,
-            TIMED: self.time_limit is not None,
-        }
-        return "".join([self.preset, *(suffix for suffix, wanted in stages.items() if wanted)])
+        """Preset, further stages and whether time is limited: with the scene, they determine the duration. A conversion
+        takes about as long as the preset fast."""
+        preset = self.preset if self.format in CONTAINERS else kissgs.Preset.FAST
+        compacted, tuned, searched = self.compact.enabled, bool(self.finetune.enabled), self.searches
+        kind = preset + COMPACTED * compacted + FINETUNED * tuned + SEARCHED * searched
+        return kind + CAPTURED * (self.capture is not None) + TIMED * (self.time_limit is not None)
 
     @property
     def retrains(self) -> bool:
@@ -161,6 +158,7 @@ class Links(ApiModel):
     cancel: str | None = None
     result: str | None = None
     files: str | None = Field(None, description="Template: replace {name} by a name from sizes.files.")
+    thumbnail: str | None = None
     decoded: str | None = None
     source: str | None = None
     report: str | None = None
@@ -220,7 +218,7 @@ class Limits(ApiModel):
     """Limits of the service; null means no limit."""
 
     formats: list[str] = Field(description="Supported formats of uploads.")
-    containers: list[Format] = Field(description="Formats of containers, for the option `format`.")
+    containers: list[Format] = Field(description="Formats of results, for the option `format`.")
     max_upload_bytes: int
     max_capture_bytes: int
     max_header_bytes: int

@@ -50,7 +50,7 @@ SOG-XT container of a few megabytes.
 Errors are RFC 9457 problem documents. `code` is stable, `detail` has the remedy, and `/v1/problems` lists all codes.
 """
 
-_JOB_OPERATIONS = ("status", "events", "cancel", "delete", "result", "file", "decoded", "source", "report")
+_JOB_OPERATIONS = ("status", "events", "cancel", "delete", "result", "file", "thumbnail", "decoded", "source", "report")
 """Operations with the id of a job as a parameter."""
 
 ROUTERS = (jobs.router, results.router, facts.router, page.router)

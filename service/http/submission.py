@@ -8,13 +8,13 @@ import json
 import logging
 import uuid
 from collections.abc import AsyncIterator
-from dataclasses import dataclass
+from pathlib import Path
 
 from anyio.to_thread import run_sync
 from pydantic import ValidationError
 from starlette.requests import Request
 
-from kissgs.formats import UPLOADS, alternatives
+from kissgs.formats import CONTAINERS, UPLOADS, alternatives
 
 from ..core.files import checkpoint_bytes
 from ..core.models import Job
@@ -36,18 +36,6 @@ STOPPING = "stopping"  # subscription that only the closing of the notifier wake
 
 MAX_OPTIONS_BYTES = 64 << 10
 MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)  # maximum bytes of a form in addition to the scene
-
-
-@dataclass(frozen=True, slots=True)
-class Submission:
-    """Content of a request: upload, capture, options, name, idempotency key and fingerprint."""
-
-    received: Received
-    capture: CaptureUpload
-    options: JobOptions
-    name: str
-    key: str | None
-    fingerprint: str
 
 
 def _fingerprint(received: Received, options: JobOptions) -> str:
@@ -119,8 +107,29 @@ async def _checked(
         return known, False
     await capture.finish()
     options = parse_options(text, photographs=capture.photographs).model_copy(update=reference)
-    submission = Submission(received, capture, options, name, key, fingerprint)
-    return await run_sync(_queue, context, submission, owner)
+    job = Job(
+        id=uuid.uuid4().hex,
+        owner=owner,
+        name=name,
+        options=options.model_dump(mode="json"),
+        preset=options.kind,
+        evaluate=options.evaluate,
+        gaussians=received.info.count,
+        sh_degree=received.info.sh_degree,
+        upload_bytes=received.size,
+        disk_bytes=received.size + capture.bytes,
+        work_bytes=capture.bytes
+        + checkpoint_bytes(
+            received.info.count,
+            received.info.sh_degree,
+            compact=options.resumable and options.retrains,
+            finetune=options.resumable and bool(options.finetune.enabled),
+        ),
+        upload_sha256=received.sha256,
+        fingerprint=fingerprint,
+        idempotency_key=key,
+    )
+    return await run_sync(_queue, context, job, received, capture.folder)
 
 
 def parse_options(text: str | bytes, *, photographs: bool | None = None) -> JobOptions:
@@ -135,6 +144,12 @@ def parse_options(text: str | bytes, *, photographs: bool | None = None) -> JobO
             f"the options are invalid: {named}; JobOptions in /openapi.json lists all settings",
             errors=found,
         ) from error
+    changes = options.searches, options.compact.enabled, options.finetune.enabled, options.time_limit
+    if options.format not in CONTAINERS and any(changes):
+        raise invalid(
+            f"format {options.format} holds the scene as it is; leave out goals, the time limit, compaction and "
+            "fine-tuning, or choose format sogxt or sog"
+        )
     if options.trains and not can_train():
         raise invalid(
             "these options need torch, which this server does not have; use preset fast without fine-tuning, or "
@@ -232,35 +247,14 @@ async def _receive_form(
     return bytes(text) if "options" in seen else options or "{}", name
 
 
-def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tuple[Job, bool]:
-    key, fingerprint = submission.key, submission.fingerprint
+def _queue(context: ServiceContainer, job: Job, received: Received, capture: Path) -> tuple[Job, bool]:
+    """Queue a job with its upload and the folder of its capture; return it, or that of a request with the same key that
+    was faster, and whether it is new."""
+    owner, key, fingerprint = job.owner, job.idempotency_key, job.fingerprint
     if (known := _known(context, owner, key, fingerprint)) is not None:
-        return known, False  # a concurrent request with the same key was faster
-    received, capture, options = submission.received, submission.capture, submission.options
-    job = Job(
-        id=uuid.uuid4().hex,
-        owner=owner,
-        name=submission.name,
-        options=options.model_dump(mode="json"),
-        preset=options.kind,
-        evaluate=options.evaluate,
-        gaussians=received.info.count,
-        sh_degree=received.info.sh_degree,
-        upload_bytes=received.size,
-        disk_bytes=received.size + capture.bytes,
-        work_bytes=capture.bytes
-        + checkpoint_bytes(
-            received.info.count,
-            received.info.sh_degree,
-            compact=options.resumable and options.retrains,
-            finetune=options.resumable and bool(options.finetune.enabled),
-        ),
-        upload_sha256=received.sha256,
-        fingerprint=fingerprint,
-        idempotency_key=key,
-    )
+        return known, False
     try:
-        context.storage.adopt(received.path, job.id, f"scene{UPLOADS[received.info.format]}", capture.folder)
+        context.storage.adopt(received.path, job.id, f"scene{UPLOADS[received.info.format]}", capture)
         return context.admission.add(job), True
     except BaseException as error:
         context.storage.remove_job(job.id)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from anyio.to_thread import run_sync
 
@@ -31,21 +30,20 @@ class Decoder:
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     _processes: dict[str, JobProcess] = field(default_factory=dict)
 
-    async def scene(self, job: Job) -> tuple[Path, dict[str, Any]]:
-        """Return the path of the decoded ``.ply`` of a succeeded job, and its size and SHA-256 by name."""
+    async def scene(self, job: Job) -> Path:
+        """Return the path of the decoded ``.ply`` of a succeeded job, whose name ends in its SHA-256."""
         try:
-            described = await run_sync(self.storage.read_decoded, job.id)
-            if described is None:
+            found = await run_sync(self.storage.decoded, job.id)
+            if found is None:
                 async with self._lock:
-                    described = await run_sync(self.storage.read_decoded, job.id)
-                    if described is None:
+                    if await run_sync(self.storage.decoded, job.id) is None:
                         await self._decode(job)
-                        described = await run_sync(self.storage.read_decoded, job.id)
-            if described is not None:
-                return self.storage.decoded(job.id), described
+                    found = await run_sync(self.storage.decoded, job.id)
         except OSError as error:
             raise _gone() from error
-        raise _gone()
+        if found is None:
+            raise _gone()
+        return found
 
     async def _decode(self, job: Job) -> None:
         size = 2000 + BYTES_PER_GAUSSIAN[job.sh_degree] * job.gaussians

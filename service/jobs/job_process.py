@@ -5,13 +5,17 @@ files relative to the folder of the job, the current one of the process, and res
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    import kissgs
+import kissgs
+from kissgs.formats import CONTAINERS
+
+from ..core.files import THUMBNAIL, THUMBNAIL_SIZE
 
 Task = dict[str, Any]
 
@@ -20,31 +24,26 @@ REPORTED = ("count", "finetuning", "note", "invisible", "cleaned", "seconds", "c
 
 
 def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
-    """Compress the scene ``source`` into the folder ``result`` of ``work``, and return its summary."""
-    import kissgs
-
-    result = _run_compression(task, progress)
+    """Compress the scene ``source``, or convert it, into the folder ``result`` of ``work``, and return its summary."""
     folder = Path(task["work"]) / "result"
     folder.mkdir(parents=True)
     container = folder / task["container"]
-    result.save(container)
-    result.save(folder / "files")
-    for path in (folder / "files", folder):
-        sync_folder(path)
-    report = result.report.as_dict()
+    if task["format"] in CONTAINERS:
+        result = _run_compression(task, progress)
+        result.save(container)
+        result.save(folder / "files")
+        report, compacted, stored = result.report.as_dict(), result.report.compacted, result.report.file_bytes
+        sync_folder(folder / "files")
+    else:
+        report, compacted, stored = _convert(task, container, progress), 0, {}
     write_file(folder / "report.json", json.dumps(report, indent=2).encode())
-    stored = result.report.file_bytes
-    files = {
-        path.name: {**_size_and_hash(path), "stored": stored[path.name]}
-        for path in sorted((folder / "files").iterdir())
-    }
     summary = {
         "container": _size_and_hash(container),
         "report": _size_and_hash(folder / "report.json"),
-        "files": files,
+        "files": {name: {**_size_and_hash(folder / "files" / name), "stored": stored[name]} for name in sorted(stored)},
         "source_format": kissgs.recognise(Path(task["source"])),
-        "compacted": result.report.compacted,
-        **{name: report[name] for name in REPORTED},
+        "compacted": compacted,
+        **{name: report.get(name) for name in REPORTED},
     }
     if report["evaluation"] is not None:
         evaluation = report["evaluation"]
@@ -55,6 +54,10 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
             **of_photographs,
             **{name: evaluation[name] for name in ("worst", "fifth_percentile", "detail", "shown")},
         }
+    if (image := _thumbnail(container, task["threads"])) is not None:
+        write_file(folder / THUMBNAIL, image)
+        summary["thumbnail"] = _size_and_hash(folder / THUMBNAIL)
+    sync_folder(folder)
     write_file(folder / "summary.json", json.dumps(summary).encode())
     return summary
 
@@ -63,8 +66,6 @@ def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed
     """Compress the scene, continuing from its checkpoint if there is one. Checkpoints are optional: an unusable one
     (damaged, or of another version of kissgs) is replaced, and if none can be written, because the disk is full, the
     job runs without."""
-    import kissgs
-
     views = None if task.get("views") is None else kissgs.load_views(Path(task["views"]), unpacked=True)
     checkpoint = None if task["checkpoint"] is None else Path(task["checkpoint"])
     while True:
@@ -92,14 +93,67 @@ def _run_compression(task: Task, progress: kissgs.Progress) -> kissgs.Compressed
                 checkpoint = None
 
 
-def decode(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
-    """Decode the container ``source`` to ``decoded.ply`` in ``work``, and return its size and SHA-256."""
-    import kissgs
+def _convert(task: Task, target: Path, progress: kissgs.Progress) -> dict[str, Any]:
+    """Write the scene in a format that is no container; return a report."""
+    began, cpu_began, threads = time.perf_counter(), time.process_time(), task["threads"]
+    progress("read", 0.0)
+    original = kissgs.load(Path(task["source"]), origin=task["origin"], threads=threads)
+    progress("write", 0.4)
+    notes = [*original.notes, *kissgs.save(original, target)]
+    evaluation = None
+    if task["evaluate"]:
+        progress("evaluate", 0.6)
+        views = None if task["views"] is None else kissgs.load_views(Path(task["views"]), unpacked=True)
+        written = kissgs.load(target, origin=task["origin"], threads=threads)
+        evaluation = kissgs.evaluate(original, written, views, threads=threads).as_dict()
+    return {
+        "count": len(original),
+        "note": "; ".join(notes),
+        "evaluation": evaluation,
+        "seconds": {"convert": time.perf_counter() - began},
+        "cpu_seconds": time.process_time() - cpu_began,
+    }
 
-    target = Path(task["work"]) / "decoded.ply"
-    kissgs.decompress(Path(task["source"]), target, threads=task["threads"], progress=progress)
+
+def _thumbnail(result: Path, threads: int) -> bytes | None:
+    """Draw a result from the view that its container records (docs/reference/format.md), else from one that kissgs
+    finds. Return the image, or None of a scene without Gaussians."""
+    import numpy as np
+    from PIL import Image
+
+    splats, (width, height) = kissgs.load(result, threads=threads), THUMBNAIL_SIZE
+    if len(splats) == 0:
+        return None
+    metadata = result.parent / "files" / "meta.json"
+    recorded = json.loads(metadata.read_bytes()).get("kissgs", {}) if metadata.exists() else {}
+    if "view" not in recorded:
+        views = kissgs.virtual_views(splats, width=width, height=height, count=1, threads=threads)
+        camera = views.all[0].camera
+    else:
+        view = {name: np.array(value) for name, value in recorded["view"].items()}
+        forward = view["target"] - view["eye"]
+        right = np.cross(forward, view["up"])
+        axes = [axis / np.linalg.norm(axis) for axis in (right, np.cross(forward, right), forward)]
+        eye = view["eye"] + recorded.get("origin", (0, 0, 0)) - np.array(splats.origin)
+        viewmat = np.vstack([np.column_stack([axes, -np.array(axes) @ eye]), [0, 0, 0, 1]])
+        focal = height / 2 / np.tan(np.radians(view["fov"]) / 2)
+        intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        camera = kissgs.Camera(viewmat, intrinsics, width, height)
+    image, _ = kissgs.render(splats, camera, threads=threads)
+    file = io.BytesIO()
+    Image.fromarray(np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)).save(file, "WEBP", quality=80)
+    return file.getvalue()
+
+
+def decode(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
+    """Decode the result ``source`` to ``decoded-SHA256.ply`` in ``work``; return its size and SHA-256."""
+    source, target = Path(task["source"]), Path(task["work"]) / "decoded.ply"
+    if source.suffix == ".ply":
+        kissgs.save(kissgs.load(source, threads=task["threads"], progress=progress), target)
+    else:
+        kissgs.decompress(source, target, threads=task["threads"], progress=progress)
     described = _size_and_hash(target)
-    write_file(target.with_suffix(".json"), json.dumps(described).encode())
+    target.rename(target.with_stem(f"decoded-{described['sha256']}"))
     return described
 
 

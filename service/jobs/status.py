@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from anyio.to_thread import run_sync
 
 from ..core.clock import as_datetime
+from ..core.files import THUMBNAIL
 from ..core.models import ACTIVE, Event, Job, State
 from ..core.notifier import JobNotifier, wait
 from ..core.presets import can_train, limited_seconds, usual_seconds
@@ -169,7 +170,8 @@ def _links(job: Job) -> Links:
         events=f"{here}/events",
         cancel=f"{here}/cancel" if job.state in ACTIVE else None,
         result=f"{here}/result" if done else None,
-        files=f"{here}/files/{{name}}" if done else None,
+        files=f"{here}/files/{{name}}" if done and (job.result or {}).get("files") else None,
+        thumbnail=f"{here}/{THUMBNAIL}" if done and "thumbnail" in (job.result or {}) else None,
         decoded=f"{here}/decoded" if done else None,
         source=f"{here}/source" if done and job.upload_kept else None,
         report=f"{here}/report" if done else None,

@@ -3,18 +3,18 @@
 import { announce, byId, el } from "./dom.js";
 import { bytes, count } from "./format.js";
 import { captureField, isArchive } from "./capture.js";
+import { choiceField } from "./choice.js";
+import { expectFixed } from "./expected.js";
 import { formatField } from "./container_formats.js";
-import { goalField } from "./goal.js";
-import { keepField } from "./keep.js";
 import { UnsuitableFile, endingsOf, inspect } from "./ply.js";
-import { presetList } from "./presets.js";
-import { timeField } from "./time_limit.js";
 
 /**
- * @typedef {{preset: string, evaluate: boolean, format: string, origin?: string, time_limit?: number, encode?: import("./api.js").Goals,
- *   compact?: import("./api.js").Budget, finetune?: {enabled: boolean}, capture?: string}} Options options that differ from the preset
+ * @typedef {import("./choice.js").Choice & {format: string, evaluate: boolean, origin: string | null,
+ *   capture: string | null}} Options
  * @typedef {{file: File, capture: File | null, options: Options}} Submission
  */
+
+const MILLION = 1e6;
 
 /**
  * Connect the controls of the form.
@@ -42,13 +42,13 @@ export function composer(limits, presets, submit) {
       if (inspection !== inspections) return;
       chosen = file;
       show(file, facts);
-      fields.estimate(facts.gaussians);
+      fields.describe(facts);
     } catch (error) {
       if (inspection !== inspections) return;
       if (!(error instanceof UnsuitableFile)) throw error;
       chosen = null;
       clear();
-      fields.estimate(null);
+      fields.describe(null);
       showError(error.message);
     }
   }
@@ -84,69 +84,74 @@ export function composer(limits, presets, submit) {
  * @param {import("./api.js").Presets} presets
  */
 function optionFields(limits, presets) {
-  const [list, goal, format] = [presetList(presets), goalField(), formatField()];
-  const [time, keep] = [timeField(limits), keepField(limits.training)];
-  const [finetune, evaluate, origin] = [byId("finetune"), byId("evaluate"), byId("origin")];
-
+  const [choice, format] = [choiceField(limits, presets), formatField()];
+  const [keep, finetune, evaluate, origin] = ["keep", "finetune", "evaluate", "origin"].map(byId);
   const capture = captureField(limits, refresh);
-  let trains = false;
-  const decided = { finetune: false, keep: false }; // by the user, or by an earlier job
+  /** @type {import("./ply.js").PlyFacts | null} */
+  let facts = null;
 
-  finetune.disabled = !limits.training;
-  finetune.addEventListener("change", () => (decided.finetune = true));
-  byId("keep").addEventListener("change", () => (decided.keep = true));
-
-  /** Enable the choices that can be combined, and explain them. */
-  function refresh() {
+  /** Return what is known of the scene. @returns {import("./expected.js").Scene} */
+  function scene() {
     const captured = capture.chosen() !== null;
-    goal.refresh(list.plans(), captured);
-    const [preset, plans, aims] = [list.chosen(), list.plans(), goal.chosen() !== null];
-    if (trains !== (limits.training && captured && aims)) {
-      trains = !trains; // on photographs, which serves the goal best
-      if (!decided.finetune) finetune.checked = trains;
-      if (!decided.keep) keep.prefer(trains ? { auto_count: true } : {});
-    }
-    keep.refresh(aims, time.chosen() !== null);
-    time.refresh({ preset, plans, captured, goal: aims, tunes: finetune.checked, kept: keep.chosen() });
-    const targets = captured ? "its photographs" : "renderings";
-    byId("finetune-note").textContent = limits.training
-      ? `Trains the quantised scene with ${targets}: better quality at equal size, after one or two minutes.`
-      : "This server has no torch, which training needs.";
+    const trains = limits.training && (captured || finetune.checked);
+    return { gaussians: facts?.gaussians ?? MILLION, degree: facts?.shDegree ?? 3, captured, trains };
   }
 
+  /** Enable the choices that can be combined, and say what to expect of each. */
+  function refresh() {
+    const fixed = expectFixed(format.chosen(), scene());
+    byId("choice").disabled = fixed !== null;
+    format.explain(fixed);
+    const { preset, time_limit: limit } = choice.chosen();
+    const given = fixed !== null || choice.isEarlier();
+    finetune.disabled = given || !limits.training;
+    if (fixed) finetune.checked = false;
+    keep.disabled = given || limit || (!limits.training && preset !== "fast");
+    if (keep.disabled) keep.value = "";
+    choice.refresh(scene());
+    byId("choice-note").textContent =
+      `Expected for ${facts?.gaussians ? "this scene" : "a million Gaussians"} on two cores; other scenes differ. ` +
+      `Quality is the change of PSNR to photographs, all measured on ${presets.measured_on}.`;
+  }
+
+  if (!limits.training) byId("finetune-note").textContent = "This server has no torch, which training needs.";
   byId("compose").addEventListener("change", refresh);
   refresh();
   return {
     capture,
-    estimate: list.estimate,
+    /** @param {import("./ply.js").PlyFacts | null} found of the scene; null if none is chosen */
+    describe(found) {
+      facts = found;
+      refresh();
+    },
     /** @returns {Options} */
     chosen() {
-      const [encode, compact, limit] = [goal.chosen(), keep.chosen(), time.chosen()];
-      const reference = capture.chosen();
-      return {
-        preset: list.chosen(),
+      const [kind, picked, reference] = [format.chosen(), choice.chosen(), capture.chosen()];
+      const shared = {
+        format: kind,
         evaluate: evaluate.checked,
-        format: format.chosen(),
-        ...(origin.checked && { origin: "auto" }),
-        ...(limit && { time_limit: limit }),
-        ...(typeof reference === "string" && { capture: reference }),
-        ...(encode && { encode }),
-        ...(compact ? { compact } : encode && { compact: { auto_count: false } }), // else a goal would choose
-        ...((finetune.checked || encode) && { finetune: { enabled: finetune.checked } }), // a goal alone would train
+        origin: origin.checked ? "auto" : null,
+        capture: typeof reference === "string" ? reference : null,
+      };
+      if (expectFixed(kind, scene())) return shared;
+      if (choice.isEarlier()) return { ...picked, ...shared };
+      const untrained = picked.encode && !scene().trains; // a goal alone would train
+      return {
+        preset: presets.default,
+        ...picked,
+        ...(untrained && { compact: { auto_count: false } }),
+        ...((untrained || finetune.checked) && { finetune: { enabled: finetune.checked } }),
+        ...(keep.value && { compact: { ratio: Number(keep.value) } }),
+        ...shared,
       };
     },
     /** Set the options of an earlier job. @param {import("./api.js").JobOptions} earlier */
     prefer(earlier) {
-      decided.finetune = decided.keep = true;
-      list.choose(earlier.preset);
-      goal.prefer(earlier.encode);
+      choice.prefer(earlier);
       capture.prefer(earlier.capture);
-      time.prefer(earlier.time_limit);
-      keep.prefer(earlier.compact);
       format.prefer(earlier.format);
       evaluate.checked = earlier.evaluate;
       origin.checked = earlier.origin === "auto";
-      finetune.checked = limits.training && (earlier.finetune.enabled ?? false);
       refresh();
     },
   };

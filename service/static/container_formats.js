@@ -1,21 +1,16 @@
-/** The formats of a container: their names, endings and uses, and the choice between them. */
+/** The formats of a result: their names, endings and uses, and the choice between them. */
 
 import { byId } from "./dom.js";
+import { bytes, decibels } from "./format.js";
 
-/** @typedef {{title: string, ending: string, note: string}} Format */
+/** @typedef {{title: string, ending: string, opens: string}} Format `opens`: what opens it */
 
 /** Formats by the service's names of them, the default first. @type {Record<string, Format>} */
 const FORMATS = {
-  sogxt: {
-    title: "SOG-XT",
-    ending: ".zip",
-    note: "The container of kissgs, for its viewer and its decoder.",
-  },
-  sog: {
-    title: "SOG",
-    ending: ".sog",
-    note: "Opens in other viewers, such as SuperSplat, PlayCanvas and Spark.",
-  },
+  sogxt: { title: "SOG-XT", ending: ".zip", opens: "this viewer, Python" },
+  sog: { title: "SOG", ending: ".sog", opens: "SuperSplat, PlayCanvas, Spark, Babylon.js" },
+  spz: { title: "SPZ", ending: ".spz", opens: "Niantic's viewers, three.js, Spark" },
+  "compressed.ply": { title: "compressed PLY", ending: ".compressed.ply", opens: "editors such as SuperSplat" },
 };
 const [DEFAULT] = Object.keys(FORMATS);
 
@@ -28,16 +23,15 @@ export const formatLabel = ({ title, ending }) => `${title} (${ending})`;
 /** Connect the choice of the form. */
 export function formatField() {
   const choice = /** @type {HTMLSelectElement} */ (byId("format"));
-  for (const [name, format] of Object.entries(FORMATS)) choice.add(new Option(formatLabel(format), name));
-  const explain = () => (byId("format-note").textContent = FORMATS[choice.value].note);
-  choice.addEventListener("change", explain);
-  explain();
+  for (const [name, { opens, ending }] of Object.entries(FORMATS)) choice.add(new Option(`${ending}: ${opens}`, name));
   return {
     chosen: () => choice.value,
     /** @param {string} [format] */
-    prefer(format = DEFAULT) {
-      choice.value = format;
-      explain();
-    },
+    prefer: (format = DEFAULT) => (choice.value = format),
+    /** Say what to expect of fixed steps, if the format has them. @param {{bytes: number, change: number} | null} fixed */
+    explain: (fixed) =>
+      (byId("format-note").textContent = fixed
+        ? `It holds the scene as it is, in fixed steps: expect ${bytes(fixed.bytes)} and ${decibels(fixed.change)}.`
+        : ""),
   };
 }

@@ -41,17 +41,6 @@ export function facts(pairs) {
 }
 
 /**
- * Select the option with a value; add it if there is none.
- * @param {HTMLSelectElement} field
- * @param {string} value
- * @param {string} label of an option that is added
- */
-export function selectOption(field, value, label) {
-  if (![...field.options].some((option) => option.value === value)) field.add(new Option(label, value));
-  field.value = value;
-}
-
-/**
  * Create a `<time>` element with a readable text.
  * @param {string} iso
  * @param {string} text

@@ -62,30 +62,14 @@ const CLEANED = {
 /** @param {string} state */
 export const stateLabel = (state) => STATES[state] ?? state;
 
-/**
- * Return the goals among settings of the encoder.
- * @param {import("./api.js").Goals} encode
- * @returns {Record<string, any>}
- */
-export const goalsOf = (encode) => given(encode, Object.keys(GOALS));
-
 /** @param {import("./api.js").Goals} encode */
-export const goalLabels = (encode) => Object.entries(goalsOf(encode)).map(([name, value]) => GOALS[name](value));
+export const goalLabels = (encode) =>
+  Object.entries(given(encode, Object.keys(GOALS))).map(([name, value]) => GOALS[name](value));
 
-/**
- * Return the budget among settings of compaction; null if all Gaussians are kept.
- * @param {import("./api.js").Budget} compact
- * @returns {Record<string, any> | null}
- */
-export function budgetOf(compact) {
+/** Describe how many Gaussians are kept; nothing if all are. @param {import("./api.js").Budget} compact */
+function budgetLabel(compact) {
   const [entry] = Object.entries(given(compact, Object.keys(BUDGETS)));
-  return entry && !(entry[0] === "ratio" && entry[1] >= 1) ? Object.fromEntries([entry]) : null;
-}
-
-/** @param {import("./api.js").Budget} compact */
-export function budgetLabel(compact) {
-  const [entry] = Object.entries(budgetOf(compact) ?? {});
-  return entry ? BUDGETS[entry[0]](entry[1]) : "";
+  return entry && !(entry[0] === "ratio" && entry[1] >= 1) ? BUDGETS[entry[0]](entry[1]) : "";
 }
 
 /**
@@ -97,15 +81,18 @@ const given = (settings, names) =>
 
 /** Describe what a job was given. @param {Status} status */
 export function jobLabel({ gaussians, options }) {
-  const { preset, encode, compact, finetune, time_limit: limit } = options;
+  return [`${count(gaussians)} Gaussians`, ...optionLabels(options)].join(" · ");
+}
+
+/** @param {import("./api.js").JobOptions} options */
+export function optionLabels({ preset, format, encode, compact, finetune, time_limit: limit }) {
   const wishes = [
     ...goalLabels(encode),
     budgetLabel(compact),
     finetune.enabled ? "fine-tuning" : "",
     limit ? `at most ${duration(limit)}` : "",
   ];
-  const facts = [`${count(gaussians)} Gaussians`, `${preset} preset`, formatOf({ options }).title];
-  return [...facts, ...wishes.filter(Boolean)].join(" · ");
+  return [`${preset} preset`, formatOf({ options: { format } }).title, ...wishes.filter(Boolean)];
 }
 
 /**

@@ -1,6 +1,6 @@
 /** The list of recent jobs, which can be opened or deleted. */
 
-import { active, json, remove } from "./api.js";
+import { active, call, json, remove } from "./api.js";
 import { announce, byId, el, time } from "./dom.js";
 import { ago, short } from "./format.js";
 import { explain, sentence } from "./problems.js";
@@ -121,10 +121,11 @@ function row(ask) {
   /** @type {Status} */
   let job;
   const link = el("a", { class: "job-name" });
+  const image = el("img", { class: "job-image", alt: "", width: 64, height: 48 });
   const [state, ratio, age] = [el("span", { class: "badge" }), el("span", { class: "job-ratio" }), el("span")];
   age.className = "job-age muted";
   const button = el("button", { class: "plain", type: "button", onclick: () => ask(job) }, "Delete");
-  const element = el("li", {}, link, state, ratio, age, button);
+  const element = el("li", {}, image, link, state, ratio, age, button);
   return {
     element,
     job: () => job,
@@ -134,6 +135,7 @@ function row(ask) {
       job.id === open ? link.setAttribute("aria-current", "true") : link.removeAttribute("aria-current"),
     /** @param {Status} next */
     update(next) {
+      if (next.links.thumbnail && !job?.links.thumbnail) draw(image, next.links.thumbnail);
       job = next;
       link.textContent = job.name;
       link.href = `#${job.id}`;
@@ -144,6 +146,16 @@ function row(ask) {
       button.setAttribute("aria-label", `Delete ${job.name}`);
     },
   };
+}
+
+/**
+ * Show the image of a result, which a link cannot ask for where the service wants a key.
+ * @param {HTMLImageElement} image
+ * @param {string} path
+ */
+async function draw(image, path) {
+  const answer = await call(path).catch(() => null); // the list is useful without
+  if (answer) image.src = URL.createObjectURL(await answer.blob());
 }
 
 /**

@@ -26,7 +26,7 @@ export function resultView(status, keyed) {
     downloads(status, keyed),
     figures(status),
     status.note ? el("p", { class: "small muted" }, sentence(status.note)) : null,
-    planeTable(sizes),
+    status.links.files ? planeTable(sizes) : null,
     notes.length ? notesList(notes) : null,
   ].filter((child) => child !== null);
 }
@@ -42,7 +42,7 @@ function ratio(status) {
     { class: "ratio" },
     el("p", {}, el("strong", {}, `${short(sizes.ratio)}×`), " smaller"),
     el("div", { class: "beside", "aria-hidden": "true" }, filled),
-    el("p", { class: "spread" }, el("span", {}, el("b", {}, after), " container"), el("span", {}, `${before} upload`)),
+    el("p", { class: "spread" }, el("span", {}, el("b", {}, after), " result"), el("span", {}, `${before} upload`)),
   );
 }
 
@@ -58,9 +58,9 @@ function figures(status) {
     ["Per Gaussian", `${short(sizes.bytes_per_gaussian)} bytes`],
     ["Gaussians", count(kept), kept === status.gaussians ? "all of them" : `of ${count(status.gaussians)}`],
     ["Time", duration(timings.run_seconds ?? 0), spent.join(", ")],
-    ["Preset", options.preset],
     ["Format", formatLabel(formatOf(status))],
   ];
+  if (status.links.files) pairs.push(["Preset", options.preset]); // what is no container holds the scene as it is
   if (goal) pairs.push(["Goal", capitalised(goal), goals.length ? `and ${goals.join(", ")}` : undefined]);
   if (finetuning) pairs.push(["Fine-tuning", gain(finetuning), "on held-out views"]);
   if (evaluation) {
@@ -145,7 +145,7 @@ function downloads(status, keyed) {
   const message = el("div");
   /** @type {[string, string, string, string][]} */
   const all = [
-    ["result", `Download container (${ending})`, `${name}${ending}`, "primary"],
+    ["result", `Download (${ending})`, `${name}${ending}`, "primary"],
     ["decoded", "Decoded .ply", `${name}.decoded.ply`, "quiet"],
     ["report", "Report", `${name}.report.json`, "quiet"],
   ];

@@ -7,7 +7,7 @@
     jobs/ID/checkpoint*.npz      checkpoints of training, kept until the job ends
     jobs/ID/result/              the result, renamed to this when it is complete and on the disk
         scene.zip or scene.sog  report.json  files/NAME
-    jobs/ID/decoded.ply          the decoded scene, after the first request; decoded.json has its size and checksum
+    jobs/ID/decoded-SHA256.ply   the decoded scene, after the first request, and its checksum
     jobs/.orphaned/ID/           folders of jobs that the database does not know; never read or removed
     jobs.sqlite                  the database of jobs (:mod:`service.storage.job_records`)
     lock                         lock of the service
@@ -47,9 +47,10 @@ _UPLOAD = re.compile(r"[0-9a-f]{16}\.part")
 
 RESULT = "result"  # name of the folder of a job's result
 CAPTURE = "capture"  # name of the folder of its photographs and their cameras
+DECODED = "decoded-*.ply"
 UNFINISHED = ("work-*", ".*.part")  # in a job's folder: work folders, and checkpoints being written
 
-JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", CAPTURE, "checkpoint*.npz", "decoded.ply", "decoded.json")
+JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", CAPTURE, "checkpoint*.npz", "decoded*")
 """Patterns of all files that the service creates in a job's folder."""
 
 
@@ -126,9 +127,9 @@ class JobStorage:
         """Return the path of the job's result, a folder that exists only if the result is complete."""
         return self.jobs / job_id / RESULT
 
-    def decoded(self, job_id: str) -> Path:
-        """Return the path of the decoded scene, which exists after the first request."""
-        return self.jobs / job_id / "decoded.ply"
+    def decoded(self, job_id: str) -> Path | None:
+        """Return the path of the decoded scene; None before the first request."""
+        return next((self.jobs / job_id).glob(DECODED), None)
 
     def discard_checkpoints(self, job_id: str) -> None:
         """Remove the checkpoints of a job."""
@@ -147,7 +148,7 @@ class JobStorage:
     def reclaimable_files(self, job_id: str) -> list[Path]:
         """Return what an ended job can do without, if it exists: its upload, its capture and its decoded scene."""
         paths = self.upload(job_id), self.jobs / job_id / CAPTURE, self.decoded(job_id)
-        return [path for path in paths if path.exists()]
+        return [path for path in paths if path is not None and path.exists()]
 
     def reclaimable_bytes(self, job_id: str) -> int:
         """Return the bytes that an ended job can do without."""
@@ -192,16 +193,9 @@ class JobStorage:
 
     def keep_decoded(self, work: Path, job_id: str) -> None:
         """Move a decoded scene from a work folder to its final path."""
-        (work / "decoded.json").rename(self.decoded(job_id).with_suffix(".json"))
-        (work / "decoded.ply").rename(self.decoded(job_id))
+        for path in work.glob(DECODED):
+            path.rename(self.jobs / job_id / path.name)
         sync_folder(self.jobs / job_id)
-
-    def read_decoded(self, job_id: str) -> dict[str, Any] | None:
-        """Return the description of a job's decoded scene; None if it has not been decoded."""
-        if not self.decoded(job_id).exists():
-            return None
-        found: dict[str, Any] = json.loads(self.decoded(job_id).with_suffix(".json").read_text())
-        return found
 
     def job_bytes(self, job_id: str) -> int:
         """Return the size of all files of a job, bytes."""

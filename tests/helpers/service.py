@@ -44,6 +44,21 @@ def scene_bytes(gaussians=300, degree=1, seed=0):
 SMALL = scene_bytes()
 """Scene whose job takes hardly longer than its start."""
 
+MESH = b"""ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0
+1 0 0
+0 1 0
+3 0 1 2
+"""
+
 FAST = json.dumps({"preset": "fast"})
 SLOW = json.dumps(
     {

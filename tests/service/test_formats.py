@@ -1,7 +1,9 @@
 """Formats of uploads and of containers; oracle: the library's own compression of the same file."""
 
+import dataclasses
 import json
 
+import numpy as np
 import pytest
 from helpers.format_scenes import made_scene
 from helpers.reference_gltf import attributes, data_uri, document, glb_bytes
@@ -96,7 +98,7 @@ def test_damage_behind_the_headers_fails_the_job(service):
 def test_the_limits_name_the_formats(service):
     limits = service.http.get("/v1/limits").json()
     assert limits["formats"] == ["ply", "sog", "spz", "splat", "ksplat", "glb", "compressed.ply", "spz.glb"]
-    assert limits["containers"] == ["sogxt", "sog"]
+    assert limits["containers"] == ["sogxt", "sog", "spz", "compressed.ply"]
 
 
 SOG = json.dumps({"preset": "fast", "format": "sog"})
@@ -118,3 +120,42 @@ def test_a_container_of_sog(service, tmp_path):
     assert 'filename="a scene.decoded.ply"' in answer.headers["content-disposition"]
     kissgs.decompress(local.to_zip(), tmp_path / "expected.ply")
     assert answer.content == (tmp_path / "expected.ply").read_bytes()
+
+
+LARGE = dataclasses.replace(kissgs.sample_scene(60, sh_degree=1), scales=np.full((60, 3), 7.0, np.float32))
+
+
+@pytest.mark.parametrize("kind", ["spz", "compressed.ply"])
+def test_a_scene_in_another_format(service, kind, tmp_path):
+    """Oracle: what kissgs convert writes and says, and kissgs evaluate of its file."""
+    losses = kissgs.save(LARGE, tmp_path / f"x.{kind}")
+    kissgs.save(LARGE, tmp_path / "x.ply")
+    data = (tmp_path / "x.ply").read_bytes()
+    job = service.ended(service.submit(data, json.dumps({"format": kind, "evaluate": True})))
+    answer = service.http.get(job["links"]["result"])
+    assert answer.content == (tmp_path / f"x.{kind}").read_bytes()
+    assert f'filename="a scene.{kind}"' in answer.headers["content-disposition"]
+    assert (job["kept"], job["sizes"]["container"], job["sizes"]["files"]) == (60, len(answer.content), {})
+    assert "files" not in job["links"]
+    assert job.get("note", "") == "; ".join(losses)
+    assert bool(losses) == (kind == "spz")
+    written = kissgs.load(tmp_path / f"x.{kind}")
+    expected = kissgs.evaluate(LARGE, written).mean.candidate_vs_reference
+    assert job["evaluation"]["psnr"] == pytest.approx(expected.psnr)
+    kissgs.save(written, tmp_path / "decoded.ply")
+    assert service.http.get(job["links"]["decoded"]).content == (tmp_path / "decoded.ply").read_bytes()
+
+
+CHANGES = {
+    "a goal": {"encode": {"quality": "same"}},
+    "a time limit": {"time_limit": 9},
+    "fine-tuning": {"finetune": {"enabled": True}},
+    "compaction": {"compact": {"ratio": 0.5}},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_other_formats_hold_the_scene_as_it_is(service, change):
+    options = json.dumps({"format": "spz", **CHANGES[change]})
+    answer = service.http.post("/v1/jobs", content=SMALL, params={"options": options})
+    assert "format spz holds the scene as it is" in problem(answer, 422, "invalid-request")["detail"]

@@ -1,15 +1,22 @@
 """Files of succeeded jobs over HTTP; oracles: kissgs.compress of the scene, and the specifications of HTTP headers."""
 
 import base64
+import dataclasses
 import hashlib
 import io
 import json
 import zipfile
 
+import numpy as np
 import pytest
 from helpers.service import SMALL, problem
+from PIL import Image
 
 import kissgs
+from kissgs.io.ply import write_ply
+from kissgs.rendering.camera import look_at
+
+SCENE = kissgs.sample_scene(300, sh_degree=1)
 
 
 def test_the_status_equals_the_report(service, job, local):
@@ -132,3 +139,43 @@ def test_the_source_and_the_report(service, job, local):
     expected = json.loads(json.dumps(local.report.as_dict()))
     volatile = ("seconds", "cpu_seconds", "peak_memory")
     assert without(report, *volatile) == without(expected, *volatile)
+
+
+def file_of(splats):
+    file = io.BytesIO()
+    write_ply(file, splats)
+    return file.getvalue()
+
+
+def thumbnail_of(service, job):
+    answer = service.http.get(f"/v1/jobs/{job['id']}/thumbnail.webp")
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "image/webp")
+    assert job["links"]["thumbnail"].endswith("/thumbnail.webp")
+    return np.asarray(Image.open(io.BytesIO(answer.content)).convert("RGB"), np.float32) / 255
+
+
+@pytest.mark.parametrize("origin", [None, "auto"])
+def test_the_thumbnail_is_the_recorded_view(service, origin):
+    """Oracle: the decoded container, drawn from the view in its metadata as format.md defines it."""
+    few = {"sensitivity_views": 4, "sensitivity_view_size": 48}
+    options = {"encode": few, "origin": origin, "for_research": True}
+    far = dataclasses.replace(SCENE, means=SCENE.means + np.float32([4000, 0, 0]))
+    job = service.ended(service.submit(file_of(far), json.dumps(options)))
+    own = service.http.get(job["links"]["files"].replace("{name}", "meta.json")).json()["kissgs"]
+    assert ("origin" in own) == (origin is not None)
+    view = {name: np.array(value) for name, value in own["view"].items()}
+    angle = 2 * np.arctan(np.tan(np.radians(view["fov"]) / 2) * 4 / 3)  # from side to side
+    camera = look_at(view["eye"], view["target"], view["up"], fov=angle, width=320, height=240)
+    splats = kissgs.decompress(service.http.get(job["links"]["result"]).content)
+    near = dataclasses.replace(splats, means=splats.means - np.float32(own.get("origin", (0, 0, 0))))
+    expected = np.clip(kissgs.render(near, camera)[0], 0, 1)
+    assert expected.std() > 0.05
+    assert np.abs(thumbnail_of(service, job) - expected).mean() < 0.01
+
+
+def test_every_result_with_gaussians_has_a_thumbnail(service, job):
+    assert thumbnail_of(service, job).std() > 0.05  # the preset fast records no view
+    empty = dataclasses.replace(SCENE, opacities=np.full_like(SCENE.opacities, -30))
+    job = service.ended(service.submit(file_of(empty)))
+    assert (job["kept"], "thumbnail" in job["links"]) == (0, False)
+    problem(service.http.get(f"/v1/jobs/{job['id']}/thumbnail.webp"), 404, "not-found")

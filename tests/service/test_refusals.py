@@ -103,7 +103,7 @@ def test_too_large(service, chunked):
 INVALID_OPTIONS = [
     *("", "{", "[]", "null", "7", "{" * 5000, '{"x": 1}', '{"preset": "tiny"}', '{"evaluate": "perhaps"}'),
     *('{"encode": {"gaussians_per_codebook_entry": -1}}', '{"encode": {"nothing": 1}}'),
-    *('{"encode": {"seed": 1e400}}', '{"encode": null}', '{"format": "spz"}', '{"format": ["sog"]}'),
+    *('{"encode": {"seed": 1e400}}', '{"encode": null}', '{"format": "glb"}', '{"format": ["sog"]}'),
     *('{"compact": {"count": 5, "ratio": 0.1}}', '{"compact": {"auto_count": true}}'),
 ]
 

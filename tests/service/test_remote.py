@@ -357,6 +357,11 @@ def test_the_ending_chooses_the_container(service, scene, tmp_path):
     assert (tmp_path / "Schloß 1.sog").read_bytes() == expected
     refused = kissgs_command("get", job, "-o", tmp_path / "b.zip", KISSGS_SERVER=service.url)
     assert (refused.returncode, "end it in .sog" in refused.stderr) == (2, True)
+    other = service.ended(service.submit(options='{"format": "spz"}'))
+    refused = kissgs_command("get", other["id"], "-o", tmp_path / "b.zip", KISSGS_SERVER=service.url)
+    assert (refused.returncode, "end it in .spz" in refused.stderr) == (2, True)
+    assert kissgs_command("get", other["id"], "-o", folder[1] + "a.spz", KISSGS_SERVER=service.url).returncode == 0
+    assert (tmp_path / "out" / "a.spz").read_bytes() == service.http.get(other["links"]["result"]).content
     with kissgs.Remote(service.url) as remote:
         assert remote.compress(scene, tmp_path / "b.sog", settings=FAST)["options"]["format"] == "sog"
         with pytest.raises(kissgs.UnsupportedError, match=r"end it in \.zip"):

@@ -10,7 +10,7 @@ from helpers.reference_gltf import attributes, document, glb_bytes
 from helpers.reference_sog import sog_files, zip_of
 from helpers.reference_splat import ksplat_bytes, splat_bytes
 from helpers.reference_spz import spz_bytes
-from helpers.service import SMALL
+from helpers.service import MESH, SMALL
 from helpers.web_tools import node
 
 SCRIPT = """
@@ -26,15 +26,19 @@ for (const path of process.argv.slice(3)) {
 """
 
 SCENE = made_scene(40, 1, extremes=False)
+NO_SCENE = " is a mesh or a point cloud, not a Gaussian splatting scene: send the trained scene."
 MANY = made_scene(1001, 0, extremes=False)
 FILES = {
     "a.ply": (SMALL, {"gaussians": 300, "shDegree": 1, "packed": False}),
     "a.sog": (zip_of(sog_files(SCENE)), {"gaussians": None, "shDegree": None, "packed": False}),
-    "a3.spz": (spz_bytes(SCENE, 3), {"gaussians": None, "shDegree": None, "packed": False}),
-    "a4.spz": (spz_bytes(SCENE, 4), {"gaussians": 40, "shDegree": None, "packed": False}),
+    "a3.spz": (spz_bytes(SCENE, 3), {"gaussians": 40, "shDegree": 1, "packed": False}),
+    "cut.spz": (spz_bytes(SCENE, 3)[:9], {"gaussians": None, "shDegree": None, "packed": False}),
+    "a4.spz": (spz_bytes(SCENE, 4), {"gaussians": 40, "shDegree": 1, "packed": False}),
     "a.splat": (splat_bytes(SCENE), {"gaussians": 40, "shDegree": 0, "packed": False}),
     "a.ksplat": (ksplat_bytes([SCENE], 1), {"gaussians": 40, "shDegree": None, "packed": False}),
     "a.glb": (glb_bytes(*document(attributes(SCENE))), {"gaussians": None, "shDegree": None, "packed": False}),
+    "mesh.glb": (glb_bytes({"asset": {"version": "2.0"}, "meshes": []}, b""), f"mesh.glb{NO_SCENE}"),
+    "mesh.ply": (MESH, f"mesh.ply{NO_SCENE}"),
     "many.splat": (splat_bytes(MANY), "many.splat has 1,001 Gaussians; the limit of this service is 1,000."),
     "half.splat": (
         splat_bytes(SCENE)[:-1],

@@ -84,9 +84,10 @@ async function ofJob(id, signal) {
   const status = await (await get(job, { ...request, signal })).json();
   if (!status.sizes) throw new UserError(`This job has no container to show: it is ${status.state}.`);
   const type = (status.links.source && fileTypeOfFormat(status.source_format ?? "ply")) || null;
+  const file = status.links.files ? null : `${status.name}.${status.options.format}`; // no container
   return {
-    name: status.name,
-    container: new URL(`${job}/files/`, window.location.href).href,
+    name: file ?? status.name,
+    container: new URL(`${job}/${file ? "result" : "files/"}`, window.location.href).href,
     bytes: status.sizes.container,
     request,
     original: type && { url: `${job}/source`, bytes: status.upload_bytes, type },

@@ -15,7 +15,7 @@ from ...core.schemas import JobPage, JobStatus
 from ...jobs.container import Owner, Service, ServiceContainer
 from ..submission import RAW_TYPES, submit
 from .common import MAX_WAIT_SECONDS, NO_STORE, RequestedJob, accepts, problems, reload, statuses, wait_for_end
-from .results import CONTAINER_TYPES, container
+from .results import CONTAINER_TYPES, get_result
 
 log = logging.getLogger("kissgs.service")
 
@@ -163,7 +163,7 @@ async def compress_now(context: Service, request: Request, job: SubmittedJob) ->
     """
     job = await wait_for_end(context, job, context.settings.sync_seconds, request)
     if job.state == State.SUCCEEDED:
-        answer = await container(context, job)
+        answer = await get_result(context, job)
         answer.headers["Content-Location"] = f"/v1/jobs/{job.id}/result"
         answer.headers["Link"] = f'</v1/jobs/{job.id}>; rel="describedby"'
         return answer

@@ -17,10 +17,10 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import FileResponse
 from starlette.types import Message, Receive, Scope, Send
 
-from ...core.files import CONTAINER_FILES, container_file
+from ...core.files import CONTAINER_FILES, THUMBNAIL, container_file
 from ...core.models import Job, State
 from ...core.problems import ProblemError
-from ...jobs.container import Service, ServiceContainer
+from ...jobs.container import Service
 from .common import RequestedJob, problems
 
 
@@ -97,7 +97,7 @@ Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 BINARY = "application/octet-stream"
 _MEDIA_TYPES = {".webp": "image/webp", ".json": "application/json", ".yaml": "application/yaml"}
 
-CONTAINER_TYPES = tuple(file.media_type for file in CONTAINER_FILES.values())  # media types of containers
+CONTAINER_TYPES = tuple(dict.fromkeys(file.media_type for file in CONTAINER_FILES.values()))  # of results
 
 _PRIVATE = {"Cache-Control": "private, no-cache"}
 _FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}  # headers of container files, which never change
@@ -147,9 +147,11 @@ def _route(path: str, summary: str, media_types: str, *codes: str) -> Callable[[
 
 
 @_route("/result", "Download the container", " ".join(CONTAINER_TYPES))
-async def get_result(context: Service, job: RequestedJob) -> Response:
-    """The container, `.zip` (SOG-XT) or `.sog` as the options say, until the job expires."""
-    return await container(context, job)
+async def get_result(context: Service, job: RequestedJob) -> StoredFile:
+    """The container, `.zip` (SOG-XT) or `.sog`, or the `.spz` or `.compressed.ply`, until the job expires."""
+    sha256, kind = _result(job)["container"]["sha256"], container_file(job.options)
+    file, download = context.storage.result(job.id) / kind.name, f"{job.name}{kind.ending}"
+    return await _stored(file, sha256=sha256, media_type=kind.media_type, download=download, headers=_PRIVATE)
 
 
 @_route("/files/{name}", "Download one file of the container", " ".join(_MEDIA_TYPES.values()))
@@ -167,13 +169,23 @@ async def get_file(
     return await _stored(file, sha256=files[name]["sha256"], media_type=media_type, headers=_FOREVER)
 
 
+@_route("/thumbnail.webp", "Download an image of the result", "image/webp")
+async def get_thumbnail(context: Service, job: RequestedJob) -> Response:
+    """The result, drawn from the camera that its container records, with at most 320 pixels a side."""
+    entry = _result(job).get("thumbnail")
+    if entry is None:
+        raise ProblemError("not-found", "the result has no thumbnail: it shows nothing, or an older version made it")
+    file = context.storage.result(job.id) / THUMBNAIL
+    return await _stored(file, sha256=entry["sha256"], media_type="image/webp", headers=_FOREVER)
+
+
 @_route("/decoded", "Download the decoded scene", BINARY, "disk-full", "memory-limit", "crashed", "time-limit")
 async def get_decoded(context: Service, job: RequestedJob) -> Response:
-    """The container decoded to a `.ply`, on the first request."""
+    """The result decoded to a `.ply`, on the first request."""
     _result(job)
-    file, entry = await context.decoder.scene(job)
-    download = f"{job.name}.decoded.ply"
-    return await _stored(file, sha256=entry["sha256"], media_type=BINARY, download=download, headers=_PRIVATE)
+    file = await context.decoder.scene(job)
+    sha256, download = file.stem.rpartition("-")[2], f"{job.name}.decoded.ply"
+    return await _stored(file, sha256=sha256, media_type=BINARY, download=download, headers=_PRIVATE)
 
 
 @_route("/source", "Download the upload", BINARY)
@@ -193,13 +205,6 @@ async def get_report(context: Service, job: RequestedJob) -> Response:
     sha256 = _result(job)["report"]["sha256"]
     file = context.storage.result(job.id) / "report.json"
     return await _stored(file, sha256=sha256, media_type="application/json", headers=_PRIVATE)
-
-
-async def container(context: ServiceContainer, job: Job) -> StoredFile:
-    """Return the response with the container of a succeeded job."""
-    sha256, kind = _result(job)["container"]["sha256"], container_file(job.options)
-    file, download = context.storage.result(job.id) / kind.name, f"{job.name}{kind.ending}"
-    return await _stored(file, sha256=sha256, media_type=kind.media_type, download=download, headers=_PRIVATE)
 
 
 async def _stored(path: Path, **values: Any) -> StoredFile:  # noqa: ANN401
