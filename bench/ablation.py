@@ -2,7 +2,7 @@
 
     python bench/ablation.py fox.ply --views fox
 
-The first table repeats the one of KISS-GS (bicycle, 262,144 Gaussians), also where no valid container results; the
+The first table repeats the one of KISS-GS (bicycle, 256,000 Gaussians), also where no valid container results; the
 second changes settings of ``paper`` to the values of other presets, the third leaves out choices of ``balanced``.
 """
 
@@ -30,19 +30,19 @@ from kissgs.evaluation.results import Comparison
 PUBLISHED_BYTES = 3_877_944
 """Bytes of the paper's container of bicycle with all parts."""
 
-PARTS: tuple[tuple[str, paper_parts.LeaveOut, int, float | None], ...] = (
-    ("levels of the SH codebook", paper_parts.codebook_levels, 4_042_523, None),
-    ("SH codebook", paper_parts.sh_codebook, 3_434_816, 0.23),
-    ("WebP", paper_parts.webp, 3_030_148, None),
-    ("levels of rotations", paper_parts.as_floats("quats", "quaternions"), 2_548_718, None),
-    ("levels of base colours", paper_parts.as_floats("sh0", "f_dc"), 2_084_291, None),
-    ("levels of sizes", paper_parts.as_floats("scales", "scales"), 1_966_415, None),
-    ("levels of positions", paper_parts.as_floats("means", "means_bytes_0", "means_bytes_1"), 1_392_843, None),
-    ("order (PLAS)", paper_parts.scene_order, 614_851, None),
-    ("levels of opacities", paper_parts.as_floats("opacities", "opacities"), 609_117, None),
-    ("forms (PRAS), 256 levels", paper_parts.rotation_forms(255), 161_748, 0.01),
-    ("order of the codebook", paper_parts.codebook_order, 42_416, None),
-    ("labels as column and row", paper_parts.label_pairs, 12_142, None),
+PARTS: tuple[tuple[str, paper_parts.LeaveOut, int, float], ...] = (
+    ("levels of the SH codebook", paper_parts.codebook_levels, 4_042_523, 0.0097),
+    ("SH codebook", paper_parts.sh_codebook, 3_434_816, 0.232),
+    ("WebP", paper_parts.webp, 3_030_148, 0.0),
+    ("levels of rotations", paper_parts.as_floats("quats", "quaternions"), 2_548_718, 0.032),
+    ("levels of base colours", paper_parts.as_floats("sh0", "f_dc"), 2_084_291, 0.006),
+    ("levels of sizes", paper_parts.as_floats("scales", "scales"), 1_966_415, 0.004),
+    ("levels of positions", paper_parts.as_floats("means", "means_bytes_0", "means_bytes_1"), 1_392_843, 0.012),
+    ("order (PLAS)", paper_parts.scene_order, 614_851, 0.0059),
+    ("levels of opacities", paper_parts.as_floats("opacities", "opacities"), 609_117, 0.0006),
+    ("forms (PRAS), 256 levels", paper_parts.rotation_forms(255), 161_748, 0.010),
+    ("order of the codebook", paper_parts.codebook_order, 42_416, 0.0),
+    ("labels as column and row", paper_parts.label_pairs, 12_142, 0.0),
     ("mask: pruned to a square", paper_parts.mask, 3_344, -0.115),
     ("forms (PRAS), 100 levels", paper_parts.rotation_forms(99), -11_810, -0.110),
     ("logarithm of positions", paper_parts.signed_log, -519_272, -7.55),
@@ -87,8 +87,10 @@ CURVE_DB = 2.5
 
 def main() -> None:
     """Print the three tables; PSNR is the change of PSNR to photographs, or to the original without photographs."""
-    given = arguments(__doc__).parse_args()
-    published(given.scene, given.views)
+    parser = arguments(__doc__)
+    parser.add_argument("--lpips", action="store_true", help="also measure LPIPS in the first table")
+    given = parser.parse_args()
+    published(given.scene, given.views, lpips=given.lpips)
     variants(given.scene, given.views, Settings.from_preset("paper"), PAPER)
     settings, curve = Settings.from_preset("balanced"), []
     for step in (-CURVE_DB, CURVE_DB):
@@ -99,24 +101,30 @@ def main() -> None:
     variants(given.scene, given.views, settings, BALANCED, curve)
 
 
-def published(path: Path, views: Views | None) -> None:
+def published(path: Path, views: Views | None, *, lpips: bool) -> None:
     """Print the table of the paper, measured on this scene."""
     scene, settings = clean(load(path))[0], Settings.from_preset("paper").encode
     if not len(scene):
         raise InvalidSceneError(f"{path} has no usable Gaussian")
     whole = paper_parts.encode_parts(scene, settings, 0)
     size = whole.size(settings, 0)
-    mean = evaluate(scene, whole.decoded, views).mean
-    head("left out", "bytes", "change", "PSNR", "published: change", "PSNR")
-    row("nothing", size, "", f"{mean.candidate.psnr:.2f}", "", "")
+    mean = evaluate(scene, whole.decoded, views, lpips=lpips).mean.candidate
+    head("left out", "bytes", "change", "PSNR", "SSIM", "LPIPS", "published: change", "PSNR")
+    row("nothing", size, "", f"{mean.psnr:.2f}", f"{mean.ssim:.4f}", _or_empty(mean.lpips), "", "")
     for name, leave_out, more, psnr in PARTS:
         if name in OF_CODEBOOK and not scene.sh_degree:
             continue
         parts = leave_out(whole, settings, 0)
         own = parts.size(settings, 0)
-        change = evaluate(scene, parts.decoded, views).mean.candidate.psnr - mean.candidate.psnr
-        row(name, own, percent(own / size - 1), signed(change), percent(more / PUBLISHED_BYTES), signed(psnr))
+        found = evaluate(scene, parts.decoded, views, lpips=lpips).mean.candidate
+        lost = None if found.lpips is None or mean.lpips is None else found.lpips - mean.lpips
+        changes = signed(found.psnr - mean.psnr, 4), signed(found.ssim - mean.ssim, 5), signed(lost, 5)
+        row(name, own, percent(own / size - 1), *changes, percent(more / PUBLISHED_BYTES), signed(psnr, 4))
     write("")
+
+
+def _or_empty(value: float | None) -> str:
+    return "" if value is None else f"{value:.4f}"
 
 
 def variants(

@@ -19,8 +19,8 @@ from kissgs.core.splats import Splats
 from kissgs.io.images import compress_images
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.planner import plan_encoding
-from kissgs.planning.quantize import MEANS_TOP, quantize
-from kissgs.planning.rotation_forms import apply_forms
+from kissgs.planning.quantize import MEANS_TOP, Quantized, quantize
+from kissgs.planning.rotation_forms import apply_forms, pras_forms
 from kissgs.planning.sh_codebook import PAPER_TOP
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import zip_bytes
@@ -118,17 +118,29 @@ def sh_codebook(whole: EncodedParts, settings: EncodeSettings, threads: int) -> 
 
 
 def webp(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
-    """Store levels uncompressed, one byte each; labels take two bytes, although their image has three channels."""
-    images = {**whole.images, "f_rest_labels.webp": whole.images["f_rest_labels.webp"][:, :, :2]}
-    return replace(whole, images={}, other_files={**whole.other_files, **{n: i.tobytes() for n, i in images.items()}})
+    """Store levels uncompressed, one byte each; labels take three, as the published figure has it."""
+    levels = {name: image.tobytes() for name, image in whole.images.items()}
+    return replace(whole, images={}, other_files={**whole.other_files, **levels})
 
 
 def scene_order(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
-    """Leave the Gaussians in the order of the scene, with the padding among them."""
-    order = np.argsort(whole.plan.grid.cells, kind="stable")
-    planes = {name: image for name, image in whole.images.items() if name != "f_rest_centroids.webp"}
+    """Leave the Gaussians in the order of the scene, with the padding among them; PRAS finds their forms there."""
+    grid = whole.plan.grid
+    order = np.argsort(grid.cells, kind="stable")
+    scene = whole.splats.select(grid.cells[order])
+    quats = scene.quats.astype(np.float64)
+    with blas_workers(threads) as pool:
+        forms = pras_forms(quats, scene.scales, grid.side, pool, decay=settings.plas_radius_decay)
+    quats, scales = apply_forms(quats, scene.scales, forms)
+    place = np.argsort(order)  # render_planes has the grid's order
+    levels = {
+        "quaternions": quantize(quats, step=1, shared=False, max_top=settings.quat_levels - 1).take(place),
+        "scales": quantize(scales, step=1, shared=False).take(place),
+    }
+    parts = _with_levels(whole, levels)
+    planes = {name: image for name, image in parts.images.items() if name != "f_rest_centroids.webp"}
     moved = {name: image.reshape(len(order), -1)[order].reshape(image.shape) for name, image in planes.items()}
-    return replace(whole, images={**whole.images, **moved})
+    return replace(parts, images={**parts.images, **moved})
 
 
 def codebook_order(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
@@ -158,11 +170,16 @@ def rotation_forms(top: int) -> LeaveOut:
             "quaternions": quantize(scene.quats, step=1, shared=False, max_top=top),
             "scales": quantize(scene.scales, step=1, shared=False),
         }
-        plan = replace(whole.plan, fields={**whole.plan.fields, **levels})
-        quats, scales = (levels[name].values()[grid.mask].astype(np.float32) for name in ("quaternions", "scales"))
-        return replace(whole, images=render_planes(plan), decoded=replace(whole.decoded, quats=quats, scales=scales))
+        return _with_levels(whole, levels)
 
     return leave_out
+
+
+def _with_levels(whole: EncodedParts, levels: Mapping[str, Quantized]) -> EncodedParts:
+    """Return the parts with other levels of rotations and scales."""
+    plan, mask = replace(whole.plan, fields={**whole.plan.fields, **levels}), whole.plan.grid.mask
+    quats, scales = (levels[name].values()[mask].astype(np.float32) for name in ("quaternions", "scales"))
+    return replace(whole, images=render_planes(plan), decoded=replace(whole.decoded, quats=quats, scales=scales))
 
 
 def mask(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:

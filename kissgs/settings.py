@@ -81,7 +81,13 @@ class TrainingViewSettings(StageSettings):
     views: Annotated[int, Field(ge=1, le=10_000)] = of_preset(
         384, "Virtual views without a capture, up to four times as many for several objects; an eighth is held out."
     )
-    view_size: Pixels = of_preset(640, "Longer side of training images, pixels; of virtual views three fifths of it.")
+    view_size: Pixels = of_preset(640, "Virtual training views have three fifths of so many pixels in a row.")
+    photo_size: Annotated[int, Field(ge=16, le=65_536)] = of_preset(
+        960, "Longer side, pixels, up to which photographs train whole; of larger ones every n-th pixel and row."
+    )
+    lr_offset: Steps | None = of_preset(
+        None, "Learning rates of 3DGS as after so many of its steps; auto: falling ones."
+    )
     seed: Seed = of_preset(0, "Seed of the order of images and of virtual cameras: that of encode.")
 
 
@@ -114,6 +120,8 @@ class CompactSettings(TrainingViewSettings):
     min_keep_per_scoring: Annotated[float, Field(ge=0, le=0.99)] = of_preset(
         0.8, "Smallest share that pruning by one scoring may leave; deeper pruning scores again. 0: score once."
     )
+    score_floor: Share = of_preset(1.0, "Factor on the lowest score (compaction.md).")
+    trains_all: bool = of_preset(False, "Train a scene of no more Gaussians than requested too.")
     initial_prune_fraction: Share = of_preset(0.43, "Share of the first pruning in the logarithm of all pruning.")
     sparsify_steps: Steps = of_preset(1500, "Training steps during gradual pruning; 0: prune all at once.")
     prune_rounds: Count = of_preset(5, "Prunings during sparsify_steps, by equal factors; the paper has one.")
@@ -121,12 +129,7 @@ class CompactSettings(TrainingViewSettings):
     admm_rho: Weight = of_preset(0.0, "Penalty of ADMM, which pulls opacities of candidates for pruning towards 0.")
     admm_interval: Annotated[int, Field(ge=1)] = of_preset(50, "Steps between two updates of ADMM.")
     erank_weight: Weight = of_preset(0.0, "Weight of the effective rank: keeps Gaussians from becoming needles.")
-    min_scale_weight: Weight = of_preset(0.0, "Weight of the smallest scales, in units of the cameras' extent.")
-    means_lr_scale: Rate = of_preset(1.0, "Learning rate of positions, in units of the initial one of 3DGS.")
-    final_means_lr_scale: Rate = of_preset(0.01, "The same at the end of refine_steps.")
-    lr_scale: Rate = of_preset(2.0, "Other learning rates before refine_steps, in units of those of 3DGS.")
-    final_lr_scale: Rate = of_preset(0.1, "The same at the end of refine_steps.")
-    synthetic_lr_scale: Rate = of_preset(0.5, "Factor on all where targets are renderings, which leave less error.")
+    min_scale_weight: Weight = of_preset(0.0, "Weight of the smallest scales, world units.")
 
     @property
     def enabled(self) -> bool:
@@ -196,7 +199,7 @@ QUALITIES = {
 
 UNIFORM_ONLY = (
     *("shared_step_size", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),
-    "sh_weight_power",
+    *("quat_levels", "sh_weight_power"),
 )
 """Values of uniform planning; with rate_distortion, lambda and sensitivity decide instead."""
 
@@ -274,6 +277,7 @@ class EncodeSettings(StageSettings):
     quat_step: Annotated[float, Field(ge=1e-4, le=0.5)] = of_preset(
         0.023, "Quantisation step of quaternion components: 0.02 is a mean error of 1 degree."
     )
+    quat_levels: Annotated[int, Field(ge=2, le=256)] = of_preset(100, "Levels of quaternions without shared_step_size.")
     sh0_step: Step = of_preset(0.055, "Quantisation step of the base colour: 0.055 is an error of at most 2 of 255.")
     gaussians_per_codebook_entry: Annotated[float, Field(ge=1, le=4096)] = of_preset(
         7.0, "Gaussians per codebook entry, without rate_distortion."
@@ -347,6 +351,11 @@ class FinetuneSettings(TrainingViewSettings):
     codebook_lr: Rate = of_preset(0.2, "Initial learning rate of the SH codebook, in quantisation steps.")
     synthetic_lr_scale: Rate = of_preset(0.3, "Factor on both where targets are renderings, which leave less error.")
     final_lr_scale: Annotated[float, Field(gt=0, le=1)] = of_preset(0.05, "Factor on both at the last step.")
+    attraction: Weight = of_preset(1.0, "Weight of the attraction to levels.")
+    pras_at: list[Share] = of_preset(
+        [], "Fractions of the steps at which PRAS chooses forms anew; needs rate_weight 0."
+    )
+    keeps_better: bool = of_preset(True, "Keep the container from before if it is better.")
     rate_weight: Weight = of_preset(
         2.0, "Weight of the estimated rate, in units of rd_lambda, against the image error."
     )
@@ -381,7 +390,7 @@ class Preset(StrEnum):
     PAPER = "paper"
 
 
-_PAPER_LOSS = {"ssim_weight": 0.2, "mse_weight": 0.0, "synthetic_view_share": 0.0}
+_PAPER_LOSS = {"ssim_weight": 0.2, "mse_weight": 0.0, "synthetic_view_share": 0.0, "photo_size": 65_536}
 
 PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
     Preset.FAST: {
@@ -403,6 +412,8 @@ PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
     Preset.PAPER: {
         "compact": {
             "min_keep_per_scoring": 0.0,
+            "score_floor": 0.0,
+            "trains_all": True,
             "sparsify_steps": 5000,
             "prune_rounds": 1,
             "refine_steps": 5000,
@@ -410,11 +421,7 @@ PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
             "erank_weight": 0.01,
             "min_scale_weight": 1.0,
             **_PAPER_LOSS,
-            "means_lr_scale": 0.01,
-            "final_means_lr_scale": 0.00215,
-            "lr_scale": 1.0,
-            "final_lr_scale": 1.0,
-            "synthetic_lr_scale": 1.0,
+            "lr_offset": 30_000,
         },
         "encode": {
             "rate_distortion": False,
@@ -433,7 +440,17 @@ PRESETS: dict[Preset, dict[str, dict[str, Any]]] = {
             "codebook_max_effort": False,
             "high_effort_pixels": 0,
         },
-        "finetune": {"steps": 4000, "batch": 8, **_PAPER_LOSS, "rate_weight": 0.0, "tv_weight": 1.0},
+        "finetune": {
+            "steps": 4000,
+            "batch": 8,
+            **_PAPER_LOSS,
+            "lr_offset": 40_000,
+            "attraction": 0.0,
+            "pras_at": [0.6, 0.8],
+            "keeps_better": False,
+            "rate_weight": 0.0,
+            "tv_weight": 1.0,
+        },
     },
 }
 """Differences from the defaults, by preset and group."""

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from kissgs import Preset
+from kissgs import Preset, Settings
 from kissgs.cli.app import app
+from kissgs.settings import PRESETS, TrainingViewSettings
 from kissgs.sogxt.container import FILES
 from service.core.presets import presets
 
@@ -155,6 +156,35 @@ def test_presets_of_the_service_have_the_figures_of_the_benchmarks():
         (row,) = re.findall(rf"^\| `{facts.name}` \| (.*)$", text, re.MULTILINE)
         cells = [cell.strip() for cell in row.split("|")]
         assert (cells[1], cells[4]) == (f"{facts.bytes_per_gaussian:.2f}", f"{facts.psnr_change:.2f}")
+
+
+def shown(preset, group, name):
+    """The value of a setting as the page on the paper writes it."""
+    value = getattr(getattr(Settings.from_preset(preset), group), name)
+    if isinstance(value, list):
+        return " and ".join(f"{each:g}" for each in value) or "none"
+    if value is None or isinstance(value, bool):
+        return {True: "yes", False: "no", None: "auto"}[value]
+    return value if isinstance(value, str) else f"{value:.6g}"
+
+
+def test_the_page_on_the_paper_has_the_values_of_the_presets():
+    """Values that the paper gives are those of ``paper``, and every value that sets this preset apart is listed."""
+    page = (ROOT / "docs" / "method" / "paper.md").read_text(encoding="utf-8")
+    listed = set()
+    for row in re.findall(r"^\| `.*$", page, re.MULTILINE):
+        cells = [cell.strip() for cell in row.split("|")[1:-1]]
+        names, group = re.findall(r"`([^`]*)`", cells[0]), ""
+        for at, name in enumerate(names):
+            group, name = name.split(".") if "." in name else (group, name)
+            given, paper, balanced = (re.sub(r" \(.*\)", "", cell).split(", ")[at] for cell in cells[1:4])
+            assert (paper, balanced) == (shown("paper", group, name), shown("balanced", group, name)), name
+            assert given in ("-", paper), name
+            listed.add((group, name))
+            if name in TrainingViewSettings.model_fields and shown("paper", "finetune", name) == paper:
+                listed.add(("finetune", name))
+    own = {(group, name) for group, values in PRESETS[Preset.PAPER].items() for name in values}
+    assert own <= listed, "add it to docs/method/paper.md"
 
 
 def test_the_page_expects_what_goals_with_photographs_have_reached():

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.codec_scenes import covariances
 from helpers.viewers import CHROMIUM, PLAYCANVAS, SPARK
 from helpers.web_tools import DECODER, ROOT
 from PIL import Image
@@ -107,10 +108,14 @@ def test_parts_of_the_paper_that_only_save_bytes_change_nothing_else():
     scene, settings = kissgs.sample_scene(200, sh_degree=1), kissgs.Settings.from_preset("paper").encode
     whole = paper_parts.encode_parts(scene, settings, 1)
     assert whole.size(settings, 1) == len(zip_bytes(encode(scene, settings, Context(1)).files))
-    for leave_out in (paper_parts.webp, paper_parts.scene_order, paper_parts.codebook_order, paper_parts.label_pairs):
+    for leave_out in (paper_parts.webp, paper_parts.codebook_order, paper_parts.label_pairs):
         parts = leave_out(whole, settings, 1)
         assert parts.size(settings, 1) != whole.size(settings, 1)
         assert all(np.array_equal(getattr(whole.decoded, name), getattr(parts.decoded, name)) for name in ATTRIBUTES)
+    moved = paper_parts.scene_order(whole, settings, 1)
+    assert moved.size(settings, 1) != whole.size(settings, 1)
+    of_scene, of_grid = (covariances(each.quats, each.scales) for each in (moved.exact, moved.decoded))
+    assert np.abs(of_scene - of_grid).max() < 0.2 * np.abs(of_scene).max(), "in other forms, of coarse levels"
     floats = paper_parts.as_floats("scales", "scales")(whole, settings, 1)
     assert np.array_equal(floats.decoded.scales, whole.exact.scales)
     assert np.abs(whole.exact.scales - whole.decoded.scales).max() < 0.1

@@ -39,9 +39,9 @@ def compact_scene(
     evaluate: bool = False,
     checkpoint: Path | None = None,
 ) -> Compacted:
-    """Reduce the number of Gaussians to the budget of the settings; no more than that are returned unchanged. With a
-    capture, its training views train and score, and its held-out views evaluate. Without one, virtual views train and
-    score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate."""
+    """Reduce the number of Gaussians to the budget of the settings; no more than that are unchanged, or only trained.
+    With a capture, its training views train and score, and its held-out views evaluate. Without one, virtual views
+    train and score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate."""
     if not settings.enabled:
         raise UnsupportedError("missing the number of Gaussians to keep: give count, ratio or max_psnr_drop")
     if settings.auto_count:
@@ -51,11 +51,11 @@ def compact_scene(
     if settings.max_psnr_drop is not None and checkpoint is not None:
         raise UnsupportedError(NO_CHECKPOINT.format("drop of PSNR"))
     count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
-    if count >= len(splats):
+    if count >= len(splats) and not (settings.trains_all and settings.trains and len(splats)):
         return unchanged(splats, "no more than requested")
     compactor = Popspa(splats, settings, chosen_views(splats, settings, views, context), context)
     if settings.max_psnr_drop is None:
-        return _compacted(compactor, count, evaluate=evaluate, checkpoint=checkpoint)
+        return _compacted(compactor, min(count, len(splats)), evaluate=evaluate, checkpoint=checkpoint)
     compare = SearchEvaluation(splats, None if views is None else compactor.supervision.eval_views)
     return _search_drop(compactor, compare, settings.max_psnr_drop)
 

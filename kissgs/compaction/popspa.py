@@ -1,4 +1,4 @@
-"""``Popspa``: score and prune, train, refine (POPSpa, KISS-GS, section 3.1); ``TrainingPath``: falling counts."""
+"""``Popspa``: score and prune, train, refine (POPSpa, KISS-GS, section 3.2); ``TrainingPath``: falling counts."""
 
 from __future__ import annotations
 
@@ -36,9 +36,11 @@ if TYPE_CHECKING:
     from kissgs.training.model import GaussianModel
 
 
-# Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.1).
+# Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.2).
 
-BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}  # of 3DGS
+
+# Learning rates before and at the end of refinement, in units of those of 3DGS; factor for renderings as targets.
+MEANS_LR, OTHER_LR, RENDERINGS_LR = (1.0, 0.01), (2.0, 0.1), 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +50,7 @@ class Phase:
     name: Literal["sparsify", "refine"]
     steps: int
     count: int
+    first: int = 0  # number of steps before it
 
 
 def first_pruning_count(settings: CompactSettings, source_count: int, count: int) -> int:
@@ -65,9 +68,10 @@ def training_phases(settings: CompactSettings, source_count: int, count: int) ->
         first, fractions = first_pruning_count(settings, source_count, count), np.arange(1, rounds + 1) / rounds
         counts = np.rint(first * (count / first) ** fractions).astype(int)
         ends = np.rint(settings.sparsify_steps * np.concatenate([[0], fractions])).astype(int)
-        phases = [Phase("sparsify", int(steps), int(left)) for steps, left in zip(np.diff(ends), counts, strict=True)]
+        for begin, end, left in zip(ends[:-1].tolist(), ends[1:].tolist(), counts.tolist(), strict=True):
+            phases.append(Phase("sparsify", end - begin, left, begin))
     if settings.refine_steps:
-        phases.append(Phase("refine", settings.refine_steps, count))
+        phases.append(Phase("refine", settings.refine_steps, count, settings.sparsify_steps))
     return phases
 
 
@@ -86,14 +90,15 @@ def stage_progress(progress: Progress, phases: Sequence[Phase], number: int) -> 
 
 
 def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> LrSchedule:
-    """Return learning rates: constant while Gaussians are pruned, falling exponentially during refinement. 3DGS does
-    the latter for positions only. ``target_source`` is that of the training targets: "photos" or "renderings"."""
-    from kissgs.training.loop import exponential_lr
+    """Return learning rates: those of 3DGS continued, or constant ones while Gaussians are pruned that fall
+    exponentially during refinement. ``target_source`` is that of the training targets: "photos" or "renderings"."""
+    from kissgs.training.loop import BASE_LR, continued_lr, exponential_lr
 
-    scale = settings.synthetic_lr_scale if target_source == "renderings" else 1.0
+    if settings.lr_offset is not None:
+        return continued_lr(BASE_LR, settings.lr_offset + phase.first, phase.steps)
+    scale = RENDERINGS_LR if target_source == "renderings" else 1.0
     base = {name: rate * scale for name, rate in BASE_LR.items()}
-    begin = {name: settings.means_lr_scale if name == "means" else settings.lr_scale for name in base}
-    end = {name: settings.final_means_lr_scale if name == "means" else settings.final_lr_scale for name in base}
+    begin, end = ({name: (MEANS_LR if name == "means" else OTHER_LR)[at] for name in base} for at in (0, 1))
     return exponential_lr(base, begin, end if phase.name == "refine" else begin)
 
 
@@ -248,8 +253,8 @@ class SceneTraining:
 
     def prune(self, count: int, context: Context) -> None:
         """Keep the ``count`` Gaussians that images would miss most; reports the stage "score"."""
-        views = self.compactor.supervision
-        share, least = self.compactor.settings.min_keep_per_scoring, MIN_SCORE[views.captured]
+        views, settings = self.compactor.supervision, self.compactor.settings
+        share, least = settings.min_keep_per_scoring, settings.score_floor * MIN_SCORE[views.captured]
         limits = {"min_keep_per_scoring": share, "min_score": least}
         kept = prune_by_score(self.splats(), views.score, views.background, count, context, **limits)
         self.index = self.index[kept]
@@ -289,9 +294,8 @@ class SceneTraining:
         from kissgs.training.loop import TrainingPlan, train
 
         settings, targets = self.compactor.settings, self.compactor.load_targets()
-        if settings.erank_weight or settings.min_scale_weight:
-            shapes = ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent())
-            regularizers = (shapes, *regularizers)
+        if phase.name == "sparsify" and (settings.erank_weight or settings.min_scale_weight):
+            regularizers = (ShapeRegularizer(settings.erank_weight, settings.min_scale_weight), *regularizers)
         plan = TrainingPlan(
             stage=phase.name,
             pace=Pace(phase.steps, context.deadline),
@@ -311,12 +315,16 @@ class SceneTraining:
     def _position_extents(self) -> Float32[np.ndarray, " M"]:
         """Return the unit of the position learning rate of each Gaussian, from its position and size in the source. The
         rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size, and
-        positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes."""
+        positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes, unless they
+        continue those of 3DGS."""
+        from kissgs.training.loop import BASE_LR
+
         settings, source = self.compactor.settings, self.compactor.splats
+        if settings.lr_offset is not None:
+            return np.full(len(self), self._camera_extent(), np.float32)
         extents = self.compactor.load_targets().local_extents(source.means[self.index], self._camera_extent())
         sizes = np.exp(np.median(source.scales[self.index].astype(np.float64), axis=1))
-        most = BASE_LR["means"] * max(settings.means_lr_scale, settings.final_means_lr_scale)
-        return np.minimum(MOST_STEP_PER_SIZE / most * sizes, extents).astype(np.float32)
+        return np.minimum(MOST_STEP_PER_SIZE / (BASE_LR["means"] * MEANS_LR[0]) * sizes, extents).astype(np.float32)
 
 
 @dataclass(slots=True, eq=False)

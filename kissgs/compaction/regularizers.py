@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kissgs.core.array_types import Float
 from kissgs.rendering.differentiable import Parameters
-from kissgs.training.loop import Regularizer, TrainableScene
+from kissgs.training.loop import Regularizer
 
 # Regularization of the shapes of Gaussians during training: neither needles nor balls.
 
@@ -32,13 +32,11 @@ def erank_loss(scales: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
 
 
 class ShapeRegularizer(Regularizer):
-    """Regularizer: weighted mean of :func:`erank_loss`, plus weighted mean of each Gaussian's smallest scale. The
-    second term flattens Gaussians. It is in units of ``extent``, so that the loss does not depend on the size of the
-    scene."""
+    """Regularizer: weighted mean of :func:`erank_loss`, plus weighted mean of each Gaussian's smallest scale, world
+    units, which flattens Gaussians. Means as in the published code; the paper (equation 1) writes sums."""
 
-    def __init__(self, erank_weight: float, min_scale_weight: float, extent: float) -> None:
-        """Set the weights, 0 or more; ``extent`` is that of the cameras, world units, above 0."""
-        self._erank_weight, self._min_scale_weight = erank_weight, min_scale_weight / extent
+    def __init__(self, erank_weight: float, min_scale_weight: float) -> None:
+        self._erank_weight, self._min_scale_weight = erank_weight, min_scale_weight
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
         """Return the loss over all Gaussians, visible or not; None for an empty scene."""
@@ -57,10 +55,10 @@ class AdmmSparsifier(Regularizer):
 
     Zhang et al., "GaussianSpa: An Optimizing-Sparsifying Simplification Framework for Compact and High-Quality 3D
     Gaussian Splatting" (CVPR 2025), section 4, as scaled ADMM: with the opacities o, 0 to 1, their sparse copy z and
-    the dual variable u, every ``interval`` steps
+    the dual variable u, every ``interval`` steps, before the optimiser's, as in the published code,
 
     - the loss of the step has the penalty rho/2 · ‖o - z + u‖²,
-    - after the step, z becomes o + u with all but its ``count`` largest entries set to 0, and u becomes u + o - z.
+    - z becomes o + u with all but its ``count`` largest entries set to 0, and u becomes u + o - z.
     """
 
     def __init__(self, opacities: Float[Tensor, " N"], count: int, rho: float, interval: int) -> None:
@@ -70,19 +68,15 @@ class AdmmSparsifier(Regularizer):
         self.z, self.u = keep_largest(activated, count), torch.zeros_like(activated)
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
-        """Return the penalty in every ``interval``-th step, as in the published code; None in the others."""
+        """Return the penalty in every ``interval``-th step, and update z and u; None in the others."""
         if (step + 1) % self._interval:
             return None
-        return 0.5 * self._rho * (_sigmoid(parameters["opacities"]) - self.z + self.u).square().sum()
-
-    def update(self, step: int, scene: TrainableScene) -> None:
-        """Update z and u after every ``interval``-th step."""
-        if (step + 1) % self._interval:
-            return
-        with torch.no_grad():
-            activated = _sigmoid(scene.gaussians()["opacities"])
-            self.z = keep_largest(activated + self.u, self._count)
-            self.u += activated - self.z
+        activated = _sigmoid(parameters["opacities"])
+        penalty = 0.5 * self._rho * (activated - self.z + self.u).square().sum()
+        known = activated.detach()
+        self.z = keep_largest(known + self.u, self._count)
+        self.u = self.u + known - self.z
+        return penalty
 
     def state(self) -> dict[str, np.ndarray]:
         """Return z and u for a checkpoint, see :meth:`restore`."""

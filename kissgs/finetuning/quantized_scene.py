@@ -14,12 +14,13 @@ from torch.autograd.function import once_differentiable
 from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.context import Device, Pace
 from kissgs.core.positions import signed_exp
+from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.finetuning.planes import Ctx, Plane, each_part, level_bits, planes_of, sum_by_label
 from kissgs.planning import rotation_forms
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import Grid
-from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel, Quantized
+from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel, Quantized, half_steps, quantize
 from kissgs.planning.rd_criterion import Costs
 from kissgs.planning.rd_fields import UNUSED_COUNT, decoded_quats
 from kissgs.planning.sh_codebook import COEFFICIENTS
@@ -119,6 +120,7 @@ class _LookUp(torch.autograd.Function):
 # curvature follows from the costs of errors (:class:`kissgs.planning.rd_criterion.Costs`).
 
 ATTRIBUTE_FIELDS = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}  # without transformation
+REFORMED = ("quaternions", "scales")  # fields that another form of a Gaussian changes
 
 
 class QuantizedScene:
@@ -128,7 +130,8 @@ class QuantizedScene:
         self, plan: EncodingPlan, sh_degree: int, device: Device = "cpu", container: ContainerModel = EVEN_LEVELS
     ) -> None:
         """Start from a plan for ``container``; ``sh_degree`` is that of the decoded scene."""
-        self._plan, self._sh_degree = plan, sh_degree
+        self._plan, self._sh_degree, self._device = plan, sh_degree, device
+        self._rates_of_attributes, self._reformed = False, dict[str, Quantized]()
         count = int(plan.grid.mask.sum())
         self.planes, self.trained_tables = planes_of(plan, sh_degree, container.tables, device)
         self.classes, self.grid = plan.classes.astype(np.int64), plan.grid
@@ -157,6 +160,48 @@ class QuantizedScene:
     def tables(self) -> dict[str, Tensor]:
         """Return the values of the trained tables by field, ``(L,)`` float64 each, differentiable."""
         return {name: self.trained_tables[name].values(latents) for name, latents in self.table_latents.items()}
+
+    def take_rates_of_attributes(self) -> None:
+        """Take learning rates in units of attributes, those of positions at the slope of their logarithm now."""
+        self._rates_of_attributes = True
+        for name, latents in self._adam.parameters.items():
+            self._adam.replace(name, latents, self._per_unit(name))
+
+    def _per_unit(self, name: str) -> Tensor:
+        """Return the latents of one unit of the attribute, at the plan's levels; 0 for what cannot change."""
+        if name not in self.planes:
+            unit = self.trained_tables[name.removesuffix(".table")].unit
+        else:
+            plane, level = self.planes[name], torch.zeros_like(self.planes[name].min_latent)
+            unit = plane.units(level) * (plane.values(level).abs().exp() if name == "means" else 1)
+        return torch.where(unit > 0, 1 / unit, 0).float()
+
+    def choose_forms(self, decay: float, threads: int) -> None:
+        """Choose the forms of rotations and scales anew by PRAS, and round both in new ranges, as the paper does."""
+        grid, exact = self._plan.grid, dict[str, Float64[np.ndarray, "M C"]]()
+        for name in REFORMED:
+            plane, latents = self.planes[name], self.latents[name].detach()
+            place = plane.base_multiples + latents
+            beside = plane.units(latents) * (place - torch.round(place))
+            exact[name] = (plane.values(latents) + beside).cpu().numpy()
+        quats, scales = exact["quaternions"], exact["scales"].astype(np.float32)
+        quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+        with blas_workers(threads) as pool:
+            rows = grid.cell_to_gaussian
+            forms = rotation_forms.pras_forms(quats[rows], scales[rows], grid.side, pool, decay=decay)[grid.mask]
+        for name, values in zip(REFORMED, rotation_forms.apply_forms(quats, scales, forms), strict=True):
+            self._adopt(name, quantize(values, step=1, shared=False, max_top=self.planes[name].field.top), values)
+
+    def _adopt(self, name: str, field: Quantized, values: Float[np.ndarray, "M C"]) -> None:
+        """Continue with other levels and ranges of a field, and with latents of these values, which it rounds."""
+        self._reformed[name] = field
+        fields = {**self._plan.fields, name: field.take(self._plan.grid.cell_to_gaussian)}
+        self._plan = replace(self._plan, fields=fields, errors={**self._plan.errors, name: half_steps(field)})
+        plane = self.planes[name] = Plane.even(field, self._device)
+        per_unit, rounded = self._per_unit(name), plane.values(torch.zeros_like(plane.min_latent))
+        latents = ((torch.from_numpy(values).to(self._device) - rounded) * per_unit).float()
+        latents.clamp_(plane.min_latent, plane.max_latent)
+        self._adam.replace(name, latents, per_unit if self._rates_of_attributes else None)
 
     def set_curvature(self, costs: Costs, loss_per_error: float) -> None:
         """Set the curvature of the quadratic attraction, 0 before, from the loss per mean squared image error."""
@@ -247,10 +292,15 @@ class QuantizedScene:
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the state of the training, see :meth:`restore`."""
-        return self._adam.state()
+        levels = {f"{name}.levels": field.levels for name, field in self._reformed.items()}
+        return {**self._adam.state(), **levels, **{f"{n}.values": each.table for n, each in self._reformed.items()}}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from a :meth:`state` of a scene with an equal plan."""
+        for name in REFORMED:
+            if f"{name}.levels" in state:
+                field = Quantized(state[f"{name}.levels"], state[f"{name}.values"])
+                self._adopt(name, field, field.values())
         self._adam.restore(state)
 
 
@@ -428,8 +478,8 @@ TV_RAMP = (0.35, 0.6)  # fractions of the steps between which these weights grow
 
 class TotalVariationLoss(Regularizer):
     """Regularizer: masked L1 total variation of the images, the paper's term for small files. For each image it is the
-    mean absolute difference of levels over all pairs of neighbouring cells that hold Gaussians and over channels. The
-    paper does not state the unit; here it is levels."""
+    mean absolute difference over all pairs of neighbouring cells that hold Gaussians and over channels, with levels as
+    numbers from 0 to 1. The paper does not state the unit; of levels, the term would outweigh the photographs."""
 
     def __init__(self, scene: QuantizedScene, weight: float, pace: Pace) -> None:
         self._scene, self._weight, self._pace = scene, weight, pace
@@ -444,9 +494,10 @@ class TotalVariationLoss(Regularizer):
             return None
         total = torch.zeros((), dtype=torch.float64, device=self._one.device)
         for name, factor in PAPER_TV_WEIGHTS.items():
-            levels = self._scene.planes[name].levels(self._scene.latents[name])
+            plane = self._scene.planes[name]
+            levels, top = plane.levels(self._scene.latents[name]), plane.field.top if name != "means" else 255
             for image in _bytes(levels) if name == "means" else (levels,):
-                total = total + factor * (image[self._one] - image[self._other]).abs().mean()
+                total = total + factor / top * (image[self._one] - image[self._other]).abs().mean()
         return weight * total
 
 

@@ -32,13 +32,24 @@ from kissgs.settings import FinetuneSettings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
+from kissgs.training.loop import (
+    BASE_LR,
+    LrSchedule,
+    TrainingPlan,
+    continued_lr,
+    exponential_lr,
+    image_loss,
+    torch_threads,
+    train,
+)
 from kissgs.training.supervision import SupervisionViews, TrainingTargets
 
 SENSITIVITY_VIEWS = 64  # approximate number of training cameras from which costs are measured, if the plan has none
 VIEW_UNCERTAINTY = 0.1  # view uncertainty of these costs, see Sensitivity
 LOSS_VIEWS = 16  # largest number of targets from which the loss before training is estimated
 ATTRACTION_START = 0.5  # fraction of the steps after which attraction starts; it grows linearly to 1
+ATTRIBUTES_OF_FIELDS = ("means", "opacities", "scales", "quats", "sh0", "shN")  # in the order of FIELDS
+PRAS_DECAY = 0.95  # factor from one filter radius to the next where PRAS is repeated
 TABLE_LR = 1.0  # of tables, in units of that of levels: an error of a value is one of all that uses it
 
 NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
@@ -98,7 +109,7 @@ class Tuner:
         images_done = replace(self.context, progress=lambda *event: self.context.progress("images", 1.0))
         second = self._evaluate(after, images_done)
         self.ending_seconds = time.perf_counter() - trained
-        kept = first is None or second.cost(rd_lambda) < first.cost(rd_lambda)
+        kept = not self.settings.keeps_better or first is None or second.cost(rd_lambda) < first.cost(rd_lambda)
         notes = ["" if kept else NOT_KEPT, checkpoint_note]
         report = self._report(pace.steps, first, second, started, kept=kept, notes=notes)
         return (after if kept or before is None else before), report
@@ -142,10 +153,13 @@ class Tuner:
     ) -> tuple[EncodingPlan, str]:
         """Return the fine-tuned plan, and a note if the checkpoint could not be saved."""
         settings, scene = self.settings, QuantizedScene(plan, sh_degree, self.context.device, self.container)
+        if settings.lr_offset is not None:
+            scene.take_rates_of_attributes()
         checkpoint = Checkpoint(path, "" if path is None else self._key(plan, sh_degree))
         done, checkpoint_note = 0, ""
         loss_per_error = self._loss_per_error(scene)
-        scene.set_curvature(plan.costs or self._measure_costs(scene), loss_per_error)
+        if settings.attraction:
+            scene.set_curvature(plan.costs or self._measure_costs(scene), loss_per_error)
         rate_loss = RateLoss(scene, settings.rate_weight * rd_lambda * loss_per_error)
         state = checkpoint.load()
         if state is not None:
@@ -155,6 +169,9 @@ class Tuner:
 
         def after(step: int) -> None:
             nonlocal checkpoint_note
+            again = [] if settings.rate_weight else [round(share * pace.steps) for share in settings.pras_at]
+            if step in again and self.container.tables is None:
+                scene.choose_forms(PRAS_DECAY, self.context.threads)
             if checkpoint.due or (path is not None and step == pace.steps):
                 try:
                     checkpoint.save({**scene.state(), **rate_loss.state(), "done": np.asarray(step)})
@@ -235,14 +252,22 @@ class Tuner:
 
 
 def _lr_schedule(settings: FinetuneSettings, targets: TrainingTargets) -> LrSchedule:
-    """Return exponentially falling learning rates, and quadratic attraction that grows in the second half."""
-    scale = 1.0 if targets.target_source == "photos" else settings.synthetic_lr_scale
-    base = {name: scale * (settings.codebook_lr if name == "f_rest_centroids" else settings.lr) for name in FIELDS}
-    base |= {table_name(name): TABLE_LR * scale * settings.lr for name in TABLES}
-    learning_rates = exponential_lr(base, dict.fromkeys(base, 1.0), dict.fromkeys(base, settings.final_lr_scale))
+    """Return learning rates, those of 3DGS or exponentially falling ones, and quadratic attraction that grows in the
+    second half. A rate of 3DGS for SH is right for codebook entries: Adam makes equal steps of equal gradients, so the
+    mean of an entry's Gaussians moves as each of them."""
+    if settings.lr_offset is not None:
+        base = {name: BASE_LR[attribute] for name, attribute in zip(FIELDS, ATTRIBUTES_OF_FIELDS, strict=True)}
+        base |= {"means": targets.extent * base["means"], **{table_name(name): base[name] for name in TABLES}}
+        learning_rates = continued_lr(base, settings.lr_offset, settings.steps)
+    else:
+        scale = 1.0 if targets.target_source == "photos" else settings.synthetic_lr_scale
+        base = {name: scale * (settings.codebook_lr if name == "f_rest_centroids" else settings.lr) for name in FIELDS}
+        base |= {table_name(name): TABLE_LR * scale * settings.lr for name in TABLES}
+        learning_rates = exponential_lr(base, dict.fromkeys(base, 1.0), dict.fromkeys(base, settings.final_lr_scale))
 
     def rates(done: float) -> dict[str, float]:
-        return {**learning_rates(done), "attraction": max(done - ATTRACTION_START, 0.0) / (1 - ATTRACTION_START)}
+        growing = max(done - ATTRACTION_START, 0.0) / (1 - ATTRACTION_START)
+        return {**learning_rates(done), "attraction": settings.attraction * growing}
 
     return rates
 

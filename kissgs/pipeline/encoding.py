@@ -192,7 +192,7 @@ def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: 
     from kissgs.training.supervision import supervision_views, training_targets
 
     settings = settings or work.settings.finetune
-    names = ("synthetic_view_share", "views", "view_size", "seed")
+    names = ("synthetic_view_share", "views", "view_size", "photo_size", "seed")
     same_views = all(getattr(work.settings.compact, name) == getattr(work.settings.finetune, name) for name in names)
     if compactor is not None and compactor.settings.trains and same_views:
         supervision, targets = compactor.supervision, compactor.load_targets()

@@ -207,11 +207,10 @@ def _plas_order(
     pool: Workers,
     report: Callable[[float], None],
 ) -> tuple[Int[np.ndarray, " cells"], Bool[np.ndarray, " cells"]]:
-    """Return order and mask of the cells sorted by PLAS on both position bytes, padding included."""
+    """Return order and mask of the cells sorted by PLAS on both position bytes; all padding is the first Gaussian."""
     count = len(levels)
     rng = np.random.Generator(np.random.PCG64(settings.seed))
-    padding = rng.integers(0, count, side * side - count)
-    index = np.concatenate([np.arange(count), padding]).astype(np.int32)
+    index = np.concatenate([np.arange(count), np.zeros(side * side - count)]).astype(np.int32)
     radius = settings.plas_start_radius
     start = rng.permutation(side * side) if radius is None else hilbert_order(levels[index])
     index = index[start]

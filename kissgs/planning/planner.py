@@ -143,7 +143,6 @@ def _with_equal_positions_in_order(
 # Uniform planning: the steps of the settings for all Gaussians, without rendering the scene.
 
 FINEST = 1e-4  # step of values that may take all levels of a table
-PAPER_TOPS = {"opacities": 255, "scales": 255, "quaternions": 99, "f_dc": 255}  # largest levels in the paper
 
 
 def plan_uniform(
@@ -169,7 +168,7 @@ def plan_uniform(
     codebook = fit_codebook(source, chosen, weights, size, planning)
     return_free_memory()
     own = settings.opacity_step, settings.scale_step, settings.quat_step, settings.sh0_step
-    steps = dict(zip(PAPER_TOPS, own, strict=True))
+    steps = dict(zip(("opacities", "scales", "quaternions", "f_dc"), own, strict=True))
     if container.tables is not None:
         if not shared:
             steps = dict.fromkeys(steps, FINEST)
@@ -180,7 +179,7 @@ def plan_uniform(
         rows["f_dc"] = selected(sh0, cells)
         fields = {"means": quantize.quantize_means(selected(source.means, cells), bits=bits, pool=pool)}
         for name, step in steps.items():
-            top = 255 if shared else PAPER_TOPS[name]
+            top = settings.quat_levels - 1 if name == "quaternions" and not shared else 255
             fields[name] = quantize.quantize(rows[name], step=step, shared=shared, max_top=top, pool=pool)
         errors = {name: quantize.half_steps(field) for name, field in fields.items()}
         errors["means"] = quantize.half_steps(fields["means"], 1 << (16 - bits))

@@ -71,7 +71,7 @@ def whole(
 # Choice among the 48 equivalent (rotation, scales) forms of a Gaussian, which all have the same covariance.
 #
 # The axes of an ellipsoid can be ordered in 6 and directed in 4 right-handed ways, and q and -q are one rotation:
-# 6 × 4 × 2 = 48. PRAS is the paper's name (section on permutation-rotation sorting) for choosing among them.
+# 6 × 4 × 2 = 48. The paper (section 3.4) chooses among them by Parallel Representative Assignment Smoothing, PRAS.
 
 # Quaternion g of each form, w x y z, the rotations of the cube: the new rotation is the Hamilton product q g.
 _A, _H = 0.5**0.5, 0.5
@@ -142,6 +142,8 @@ def choose_forms(
     else:
         quats, scales = unit_quats(splats, cells), splats.scales.take(cells, axis=0)
         forms = pras_forms(quats, scales, side, pool, decay=settings.plas_radius_decay, report=report)
+        _, first, index = np.unique(cells, return_index=True, return_inverse=True)
+        forms = forms[first][index]  # all padding is equal: one Gaussian in one form
     w_is_one = planning.container.tables is None and settings.rotation_form == "canonical"
     shapes = StoredShapes(splats, cells, forms, w_is_one)
 

@@ -25,6 +25,7 @@ except ModuleNotFoundError as error:
     raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
 
 SMOOTHING = 0.98  # weight of the former value in the running means of loss and squared error
+BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}  # of 3DGS
 LrSchedule = Callable[[float], Mapping[str, float]]  # learning rates by parameter, from the fraction of steps
 
 
@@ -53,11 +54,7 @@ class Regularizer(Protocol):
     """A loss term beside the photometric loss."""
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
-        """Return the term to add to the loss of ``step``, a scalar; None for nothing."""
-
-    def update(self, step: int, scene: TrainableScene) -> None:
-        """Update the state after ``step``; most have none."""
-        return
+        """Return the term to add to the loss of ``step``, a scalar; None for nothing. It is asked once for each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +111,6 @@ def train(
                 loss = loss if penalty is None else loss + penalty
             loss.backward()  # type: ignore[no-untyped-call]
             scene.step(plan.rates(step / pace.steps))
-            for regularizer in plan.regularizers:
-                regularizer.update(step, scene)
             step += 1
             after(step)
             pace.update(step)
@@ -191,5 +186,15 @@ def exponential_lr(base: Mapping[str, float], begin: Mapping[str, float], end: M
 
     def rates(done: float) -> dict[str, float]:
         return {name: rate * begin[name] * (end[name] / begin[name]) ** done for name, rate in base.items()}
+
+    return rates
+
+
+def continued_lr(base: Mapping[str, float], first: int, steps: int) -> LrSchedule:
+    """Return the learning rates that 3DGS would have in ``steps`` after its step ``first``: that of positions falls to
+    1 % within 30,000 steps, and further after them; the others are constant."""
+
+    def rates(done: float) -> dict[str, float]:
+        return {**base, "means": base["means"] * 0.01 ** ((first + done * steps) / 30_000)}
 
     return rates

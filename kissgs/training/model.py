@@ -142,6 +142,10 @@ class PrunableAdam:
         self._bounds, factors = bounds or {}, factors or {}
         self._leaves = {name: _leaf(value.detach().clone(), factors.get(name)) for name, value in values.items()}
 
+    def replace(self, name: str, value: Tensor, factors: Tensor | None) -> None:
+        """Replace a parameter and the factors of its learning rate; its moments start anew."""
+        self._leaves[name] = _leaf(value.detach().clone(), factors)
+
     @property
     def parameters(self) -> dict[str, Tensor]:
         """Current parameters by name; :meth:`keep` replaces them."""
@@ -198,7 +202,8 @@ class PrunableAdam:
 
 def _leaf(value: Tensor, factors: Tensor | None) -> _Leaf:
     if factors is not None:
-        factors = factors.to(value.device).reshape(-1, *[1] * (value.ndim - 1)).expand_as(value).contiguous()
+        of_rows = factors.shape + (1,) * (value.ndim - factors.ndim)
+        factors = factors.to(value.device).reshape(of_rows).expand_as(value).contiguous()
     value = value.contiguous()
     return _Leaf(value.requires_grad_(), torch.zeros_like(value), torch.zeros_like(value), 0, factors)
 

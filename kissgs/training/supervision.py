@@ -23,7 +23,6 @@ CLOSE_UPS, CLOSE_UP_SHRINK = 4, 4  # per virtual scoring camera, and by how much
 BACKGROUNDS = (0.0, 0.5, 1.0)  # grey levels, in turn, of virtual cameras that score or stand beside a capture
 MIN_SYNTHETIC_VIEWS = 64  # smallest number of synthetic views beside those of a capture; fewer are overfitted
 SCORING_SHARE = 0.25  # number of these that score Gaussians, as a share of the number of the capture's training views
-MAX_SIDE_RATIO = 1.5  # largest longer side of the training images of a capture, in units of the setting view_size
 MAX_EVAL_VIEWS = 16  # largest number of evaluation views
 
 
@@ -69,7 +68,7 @@ def supervision_views(
         if views is None or not views.test:
             return virtual
         return replace(virtual, test=_evaluation_views(views), background=views.background)
-    train = tuple(_thinned(view, number, settings.view_size) for number, view in enumerate(views.train))
+    train = tuple(_thinned(view, number, settings.photo_size) for number, view in enumerate(views.train))
     synthetic, per_epoch = _synthetic_views(splats, views.train, settings, context)
     side = settings.view_size * 3 // 5  # of virtual cameras
     scoring = math.ceil(SCORING_SHARE * len(train)) if scoring_stride else 0
@@ -159,12 +158,12 @@ def _scoring_views(splats: Splats, views: Sequence[View], side: int, seed: int) 
 
 
 def _thinned(view: View, number: int, size: int) -> View:
-    """Return every n-th pixel and row of a view, so that the longer side has at most 1.5 times ``size`` pixels. Views
-    of different numbers begin at different pixels. A scene that is trained on reduced photographs renders worse at
+    """Return every n-th pixel and row of a view, so that the longer side has at most ``size`` pixels. Views of
+    different numbers begin at different pixels. A scene that is trained on reduced photographs renders worse at
     their own size, because footprints are dilated to a pixel (docs/method/research-log.md, "Size of the training
     images")."""
     width, height = view.camera.width, view.camera.height
-    stride = math.ceil(max(width, height) / (MAX_SIDE_RATIO * size))
+    stride = math.ceil(max(width, height) / size)
     if stride == 1:
         return view
     return view.sampled(stride, (min(number % stride, width - 1), min(number // stride % stride, height - 1)))

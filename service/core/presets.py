@@ -36,7 +36,7 @@ _FACTS: dict[kissgs.Preset, _Facts] = {
         "Balanced", "The best quality for its size. The default.", 11.90, -0.28, 205, (300, 600), (50, 1300)
     ),
     kissgs.Preset.PAPER: _Facts(
-        "Paper", "KISS-GS as published, for comparison.", 17.20, -0.36, 260, (700, 2000), (1000, 40_000)
+        "Paper", "The method of the KISS-GS paper, for comparison.", 16.72, -0.39, 260, (700, 2000), (1000, 40_000)
     ),
 }
 

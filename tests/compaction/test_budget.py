@@ -8,7 +8,7 @@ from helpers.evaluations import evaluation_of
 from helpers.training_scenes import around, cloud, same
 
 import kissgs
-from kissgs import CompactSettings, UnsupportedError
+from kissgs import CompactSettings, Settings, UnsupportedError
 from kissgs.cameras.views import Views, black
 from kissgs.compaction.budget import compact_scene
 from kissgs.evaluation.evaluate import compare_images
@@ -38,6 +38,19 @@ def test_a_scene_within_the_budget_is_unchanged_and_the_note_says_so(budget):
     assert (result.index == np.arange(80)).all()
     assert result.report.note == "the scene has 80 Gaussians, no more than requested: it is unchanged"
     assert result.report.steps == ()
+
+
+@pytest.mark.parametrize("budget", [{"count": 99}, {"ratio": 1.0}])
+def test_preset_paper_trains_a_scene_within_the_budget(budget):
+    scene, steps = cloud(80), {"sparsify_steps": 2, "refine_steps": 2}
+    chosen = Settings.research("paper", compact={**steps, **budget}).compact
+    found = compact_scene(scene, chosen, views())
+    assert [(step.name, step.count) for step in found.report.steps[-2:]] == [("sparsify", 80), ("refine", 80)]
+    assert (found.index == np.arange(80)).all()
+    assert not same(found.splats, scene)
+    none = compact_scene(scene.select(slice(0)), chosen, views())
+    assert len(none.splats) == 0
+    assert "it is unchanged" in none.report.note
 
 
 @pytest.mark.parametrize("count", [0, 1])

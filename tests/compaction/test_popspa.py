@@ -10,7 +10,7 @@ from helpers.tuning_scenes import Interrupted, stopping_after
 from PIL import Image
 
 import kissgs
-from kissgs import CompactSettings, OutputError, UnsupportedError
+from kissgs import CompactSettings, OutputError, Settings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
 from kissgs.cameras.virtual.samples import scene_views
 from kissgs.compaction.budget import compact_scene
@@ -80,6 +80,39 @@ def test_without_training_the_scene_is_only_pruned(captured, min_score):
     assert (result.index == kept).all()
     assert same(result.splats, scene.select(kept))
     assert result.report.target_source == "nothing"
+
+
+def test_preset_paper_prunes_what_no_view_shows_first():
+    """Oracle: scores of 0, which the lowest score of other presets replaces."""
+    scene = cloud(60)
+    means = scene.means.copy()
+    means[:20] += 500
+    compact = Settings.from_preset("paper").compact
+    for floor in (1.0, compact.score_floor):
+        result = Popspa(replace(scene, means=means), settings(score_floor=floor, **NO_TRAINING), five_views())(40)
+        assert (result.index.min() >= 20) == (floor == 0)
+
+
+def test_preset_paper_trains_as_3dgs_would_go_on(monkeypatch):
+    """Effective rank is a term while opacities are sparsified; rates of positions are those of steps 30,000 to 40,000
+    in units of the extent of all cameras."""
+    plans, models = [], []
+
+    def spied(scene, targets, plan, context, **others):
+        plans.append(plan)
+        models.append(scene)
+
+    monkeypatch.setattr("kissgs.training.loop.train", spied)
+    views = five_views()
+    Popspa(cloud(60), Settings.from_preset("paper").compact, views)(20)
+    terms = [[type(term).__name__ for term in plan.regularizers] for plan in plans]
+    assert terms == [["ShapeRegularizer", "AdmmSparsifier"], []]
+    rates = [plan.rates(done)["means"] for plan in plans for done in (0.0, 1.0)]
+    wanted = [1.6e-4 * 0.01 ** (step / 30_000) for step in (30_000, 35_000, 35_000, 40_000)]
+    assert rates == pytest.approx(wanted)
+    assert plans[1].rates(0.5)["opacities"] == 5e-2
+    extent = targets_of(cloud(60), views.train).extent
+    assert models[0]._adam._leaves["means"].factors.numpy() == pytest.approx(extent)
 
 
 def test_training_reduces_the_error_of_pruning():
@@ -278,6 +311,14 @@ def test_synthetic_views_are_of_two_kinds_in_random_order():
     assert {(view.camera.width, view.camera.dilation) for view in small.score[40:]} == {(12, 0.3)}
 
 
+def test_preset_paper_trains_on_whole_photographs():
+    scene, compact, finetune = cloud(60), Settings.from_preset("paper").compact, Settings.from_preset("paper").finetune
+    capture = Views(around(3, 4000), around(1, 4000), black(), "")
+    for chosen in (compact, finetune):
+        found = supervision_views(scene, capture, chosen)
+        assert [view.camera.width for view in (*found.train, *found.score)] == [4000] * 6
+
+
 @pytest.mark.parametrize(("size", "stride"), [((60, 2), 1), ((61, 50), 2), ((1, 130), 3)])
 def test_training_views_are_samples_of_larger_photographs(tmp_path, size, stride):
     """Oracle: the photographs' pixels; consecutive views begin at different ones."""
@@ -289,7 +330,9 @@ def test_training_views_are_samples_of_larger_photographs(tmp_path, size, stride
             np.array([0, 0, -3.0]), np.zeros(3), np.array([0, -1.0, 0]), fov=0.8, width=size[0], height=size[1]
         )
         views.append(View(f"{n}", camera, tmp_path / f"{n}.png"))
-    found = supervision_views(cloud(60), Views(tuple(views[1:]), tuple(views[:1]), black(), ""), settings(view_size=40))
+    found = supervision_views(
+        cloud(60), Views(tuple(views[1:]), tuple(views[:1]), black(), ""), settings(photo_size=60)
+    )
     assert found.test == (views[0],), "evaluation takes the whole photograph"
     targets, starts = training_targets(cloud(60), found), set()
     for n in range(9):

@@ -205,8 +205,9 @@ def test_total_variation_equals_that_of_the_images(count, preset):
     grid, total = scene.grid, 0.0
     mask = grid.mask.reshape(grid.side, grid.side)
     for name, weight in PAPER_TV_WEIGHTS.items():
-        levels = scene.planes[name].levels(scene.latents[name]).detach().numpy()
-        parts = [levels % 256, levels // 256] if name == "means" else [levels]
+        plane = scene.planes[name]
+        levels = plane.levels(scene.latents[name]).detach().numpy()
+        parts = [levels % 256 / 255, levels // 256 / 255] if name == "means" else [levels / plane.field.top]
         for part in parts:
             image = np.zeros((grid.side**2, part.shape[1]))
             image[grid.mask] = part

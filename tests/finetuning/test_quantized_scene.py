@@ -8,6 +8,7 @@ from helpers.codec_scenes import replaced
 from helpers.reference_sog import read_files
 from helpers.training_scenes import cloud, same
 from helpers.tuning_scenes import FIELDS, choices, chosen, shuffled
+from scipy.spatial.transform import Rotation
 
 from kissgs import Settings, Splats, decompress
 from kissgs.core.context import Context
@@ -103,6 +104,78 @@ def test_an_untrained_plan_is_unchanged(preset, container):
         assert (np.abs(change) <= stride / 2).all()
         if name == "means":
             assert not change.any()
+
+
+@pytest.mark.parametrize("degree", [1, 0])
+def test_learning_rates_are_in_units_of_attributes(degree):
+    """Adam's first step has the length of the learning rate: here in each attribute, rounding left out."""
+    rates = {
+        "means": 2e-5,
+        "opacities": 3e-2,
+        "scales": 4e-3,
+        "quaternions": 5e-4,
+        "f_dc": 6e-3,
+        "f_rest_centroids": 7e-4,
+    }
+    plan = chosen(cloud(70, degree), "paper")
+    work = QuantizedScene(plan, degree)
+    work.take_rates_of_attributes()
+    before = {name: plane.field.values() for name, plane in work.planes.items()}
+    for latents in work.latents.values():
+        latents.grad = torch.full_like(latents, -1e-3)
+    work.step({**rates, "attraction": 0.0})
+    for name, plane in work.planes.items():
+        top, extent = plane.field.top, np.ptp(plane.field.table, axis=0)
+        moved = work.latents[name].detach().numpy() * extent / top
+        inside = (plane.max_latent.numpy() >= 1) & (extent > 0)
+        if name == "means":
+            moved = moved * (1 + np.abs(np.sign(before[name]) * np.expm1(np.abs(before[name]))))
+        if inside.any():
+            np.testing.assert_allclose(moved[inside], rates[name], rtol=2e-3, err_msg=name)
+
+
+def covariances_of(quats, scales):
+    turns = Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix()
+    return turns @ (np.exp(2 * scales.astype(np.float64))[:, :, None] * turns.transpose(0, 2, 1))
+
+
+def test_forms_are_chosen_anew_in_new_ranges():
+    """Oracle: covariances, which forms leave as they are; ranges of the values; all padding repeats one Gaussian."""
+    plan = chosen(cloud(70, 1), "paper")
+    work = QuantizedScene(plan, 1)
+    for name in ("quaternions", "scales"):
+        work.latents[name].data += torch.from_numpy(np.random.default_rng(0).uniform(-9, 9, (70, 1))).float()
+        work.latents[name].data.clamp_(work.planes[name].min_latent, work.planes[name].max_latent)
+
+    def exact():
+        step = {name: np.ptp(work.planes[name].field.table, axis=0) / work.planes[name].field.top for name in IMAGES}
+        return [
+            work.planes[name].field.table[0] + step[name] * (plane_of(work, name)) for name in ("quaternions", "scales")
+        ]
+
+    before = exact()
+    work.choose_forms(0.95, 1)
+    after = exact()
+    assert (np.abs(after[1] - before[1]).max(axis=1) > 0.1).any(), "some have another form"
+    np.testing.assert_allclose(covariances_of(*after), covariances_of(*before), rtol=1e-4, atol=1e-6)
+    found = work.plan()
+    for name, values in zip(("quaternions", "scales"), after, strict=True):
+        np.testing.assert_allclose(
+            found.fields[name].table[[0, -1]], [values.min(axis=0), values.max(axis=0)], atol=1e-6
+        )
+        assert len(np.unique(found.fields[name].levels[~plan.grid.mask], axis=0)) == 1
+        assert np.abs(found.fields[name].take(plan.grid.mask).values() - values).max() <= max(found.errors[name]) + 1e-6
+    assert found.fields["quaternions"].top == 99
+    other = QuantizedScene(plan, 1)
+    other.restore(work.state())
+    for one, two in zip(work.plan().fields.values(), other.plan().fields.values(), strict=True):
+        assert (one.levels == two.levels).all()
+        assert (one.table == two.table).all()
+
+
+def plane_of(work, name):
+    """Return the places among the levels, not rounded."""
+    return work.planes[name].base_multiples.numpy() + work.latents[name].detach().numpy()
 
 
 def test_errors_count_entries_that_gaussians_use_only():

@@ -22,9 +22,11 @@ from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.tune import Tuner, _Result
 from kissgs.pipeline.containers import DECODERS, MODELS, write_files
 from kissgs.pipeline.scene_files import describe
+from kissgs.planning import rotation_forms
 from kissgs.rendering.sensitivity import measure_sensitivity
 from kissgs.sogxt.container import YAML_NAME, zip_bytes
 from kissgs.training.checkpoint import Checkpoint
+from kissgs.training.loop import train
 from kissgs.training.supervision import supervision_views, training_targets
 
 SHORT = {"enabled": True, "steps": 12, "lr": 0.2, "codebook_lr": 0.3, "synthetic_lr_scale": 1.0}
@@ -135,6 +137,36 @@ def test_a_worse_container_is_not_kept(container):
     assert encoded.files == written(settings, container)(plan, 0, Context(1)).files
 
 
+def test_preset_paper_repeats_pras_twice_and_keeps_the_result(monkeypatch):
+    """It has no attraction, and its learning rates are those of 3DGS after 40,000 steps."""
+    made, plans, usual = [], [], rotation_forms.pras_forms
+    monkeypatch.setattr(rotation_forms, "pras_forms", lambda *given, **named: made.append(1) or usual(*given, **named))
+    monkeypatch.setattr(
+        "kissgs.finetuning.tune.train", lambda *given, **named: plans.append(given[2]) or train(*given, **named)
+    )
+    published = Settings.from_preset("paper").finetune
+    own = {name: getattr(published, name) for name in ("lr_offset", "attraction", "pras_at", "keeps_better")}
+    work = tuner(cloud(70), **own, rate_weight=0.0, steps=10)
+    scores = iter([_Result(10, 40.0, 1e-4), _Result(99, 20.0, 1e-2)])
+    monkeypatch.setattr(Tuner, "_evaluate", lambda *given: next(scores))
+    done = []
+    work = replace(work, context=replace(work.context, progress=lambda *event: done.append((len(made), *event))))
+    _, report = tuned(cloud(70), work=work, preset="paper", encode={})
+    assert report.kept
+    assert len(made) == 3
+    notes = [event for event in done if event[1] == "finetune" and len(event) > 3]
+    before = {round(10 * event[2]): event[0] for event in notes}
+    assert [before[step] for step in range(10)] == [1, 1, 1, 1, 1, 1, 2, 2, 3, 3]
+    (plan,) = plans
+    extent = work.targets.extent
+    for done_part, step in ((0.0, 40_000), (1.0, 40_010)):
+        rates = plan.rates(done_part)
+        assert rates.pop("attraction") == 0
+        assert rates["means"] == pytest.approx(extent * 1.6e-4 * 0.01 ** (step / 30_000))
+        others = {"opacities": 5e-2, "scales": 5e-3, "quaternions": 1e-3, "f_dc": 2.5e-3, "f_rest_centroids": 1.25e-4}
+        assert {name: rates[name] for name in others} == others
+
+
 @pytest.mark.parametrize(("container", "batch"), [("sogxt", 3), ("sog", 1)])
 def test_the_result_depends_on_the_seed_but_not_on_threads(container, batch):
     scene, found, before = cloud(200, 1), [], torch.get_num_threads()
@@ -151,16 +183,19 @@ def test_the_result_depends_on_the_seed_but_not_on_threads(container, batch):
 @pytest.mark.parametrize(("steps", "container"), [(5, "sogxt"), (5, "sog"), (0, "sogxt"), (1, "sog"), (12, "sogxt")])
 @pytest.mark.quick(2)
 def test_interrupted_work_resumes_to_the_same_bytes(tmp_path, monkeypatch, steps, container):
+    """The third and the last SOG-XT choose forms anew, before the interruption and after it."""
     monkeypatch.setattr(Checkpoint, "due", True)
     scene, path = cloud(150, 1), tmp_path / "c.npz"
-    whole = tuned(scene, container)[0]
+    forms = (
+        {"lr_offset": 40_000, "pras_at": (0.3, 0.6), "rate_weight": 0.0} if (steps, container) != (0, "sogxt") else {}
+    )
+    work = partial(tuned, scene, container, **forms)
+    whole = work()[0]
     with pytest.raises(Interrupted):
-        tuned(scene, container, checkpoint=path, progress=stopping_after(steps, "finetune"))
+        work(checkpoint=path, progress=stopping_after(steps, "finetune"))
     assert path.exists() == (steps > 0)
     done = []
-    again = tuned(scene, container, checkpoint=path, progress=lambda stage, fraction, note="": done.append(bool(note)))[
-        0
-    ]
+    again = work(checkpoint=path, progress=lambda stage, fraction, note="": done.append(bool(note)))[0]
     assert again.files == whole.files
     assert done.count(True) == 12 - steps + 1
 

@@ -76,6 +76,8 @@ def test_the_loss_of_trainings_follows_the_goal(preset):
 
 
 OTHER = {
+    "pras_at": [0.5],
+    "lr_offset": 9,
     "order": "hilbert",
     "rotation_form": "pras",
     "codebook_order": "axes",

@@ -41,13 +41,13 @@ def encoded(splats, preset="fast", **changes):
     ("count", "preset"), [(1, "balanced"), (9, "paper"), (65, "balanced"), (300, "fast"), (300, "paper")]
 )
 def test_round_trip_levels_and_padding(count, preset):
-    """Errors are within the half steps that are reported, levels span images, and padding repeats active cells."""
+    """Errors are within the half steps that are reported, levels span images, and all padding repeats one cell."""
     splats = random_scene(count, 1, seed=count)
     result = encoded(splats, preset, prune_threshold_bits=0)
     assert_round_trip(splats, result)
     assert sorted(result.order) == list(range(count))
     assert_levels_span_their_images(result.files, preset)
-    assert_padding_repeats_active_cells(result.files, preset, count)
+    assert_all_padding_repeats_one_active_cell(result.files, count)
 
 
 @examples(25)
@@ -160,15 +160,23 @@ def assert_levels_span_their_images(files, preset):
             assert levels.min() == levels.max()
 
 
-def assert_padding_repeats_active_cells(files, preset, count):
-    """PRAS may give padding another form of its Gaussian, to be similar to its neighbours."""
-    free = ("scales", "quaternions") if preset == "paper" else ()
-    cells = [reference_decoder.pixels(files, f"{name}.webp") for name in PLANES[1:8] if name not in free]
+def assert_all_padding_repeats_one_active_cell(files, count):
+    cells = [reference_decoder.pixels(files, f"{name}.webp") for name in PLANES[1:8]]
     cells = np.concatenate([image.reshape(len(image) ** 2, -1) for image in cells], axis=1)
     active = reference_decoder.pixels(files, "active_mask.webp")[:, :, 0].reshape(-1) > 0
     assert active.sum() == count
-    known = {tuple(cell) for cell in cells[active]}
-    assert {tuple(cell) for cell in cells[~active]} <= known
+    padding = {tuple(cell) for cell in cells[~active]}
+    assert len(padding) <= 1
+    assert padding <= {tuple(cell) for cell in cells[active]}
+
+
+@pytest.mark.parametrize("count", [256, 20])
+def test_quaternions_have_the_levels_that_are_asked_for(count):
+    scene = random_scene(500, 0)
+    found = encoded(scene, "paper", quat_levels=count)
+    levels = reference_decoder.pixels(found.files, "quaternions.webp")
+    assert (levels.min(), levels.max()) == (0, count - 1)
+    assert_round_trip(scene, found)
 
 
 @pytest.mark.parametrize("count", [1, 100])

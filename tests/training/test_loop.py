@@ -15,7 +15,7 @@ from kissgs.rendering.differentiable import plain_photometric_loss, rasterize
 from kissgs.rendering.rasterizer import render, tensors_of
 from kissgs.training import checkpoint
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.loop import TrainingPlan, exponential_lr, image_loss, train
+from kissgs.training.loop import BASE_LR, TrainingPlan, continued_lr, exponential_lr, image_loss, train
 from kissgs.training.model import GaussianModel
 
 RATES = {"means": 2e-3, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 1e-2, "shN": 1e-3}
@@ -138,22 +138,19 @@ class PullToOrigin:
     """Regularizer of the squared positions."""
 
     def __init__(self):
-        self.penalized, self.updated = [], []
+        self.penalized = []
 
     def penalty(self, step, parameters):
         self.penalized.append(step)
         return parameters["means"].square().sum() if step % 2 else None
-
-    def update(self, step, scene):
-        self.updated.append((step, float(scene.gaussians()["means"].detach().square().sum())))
 
 
 def test_regularizers_are_called_in_every_step():
     scene, pull = cloud(40), PullToOrigin()
     model = GaussianModel(scene)
     train(model, targets_of(scene), plan(40, regularizers=(pull,)), first=3)
-    assert pull.penalized == [step for step, _ in pull.updated] == list(range(3, 40))
-    assert pull.updated[-1][1] < 0.9 * float((scene.means**2).sum())
+    assert pull.penalized == list(range(3, 40))
+    assert (model.splats().means ** 2).sum() < 0.9 * (scene.means**2).sum()
 
 
 def test_notes_report_running_means_of_loss_and_psnr():
@@ -181,6 +178,18 @@ def test_learning_rates_fall_exponentially():
     assert rates(0.0) == {"means": 2.0, "sh0": 3.0}
     assert rates(0.5) == pytest.approx({"means": 0.2, "sh0": 3.0})
     assert rates(1.0) == pytest.approx({"means": 0.02, "sh0": 3.0})
+
+
+def test_learning_rates_of_3dgs_continue():
+    """Oracle: gsplat's trainer, which multiplies the rate of positions by 0.01 ** (1 / 30,000) after every step."""
+    rates, wanted = continued_lr(BASE_LR, 30_000, 10_000), 1.6e-4
+    for step in range(40_000):
+        if step in (30_000, 35_000):
+            assert rates((step - 30_000) / 10_000)["means"] == pytest.approx(wanted, rel=1e-6)
+        wanted *= 0.01 ** (1 / 30_000)
+    end = rates(1.0)
+    assert end.pop("means") == pytest.approx(wanted, rel=1e-6) == pytest.approx(3.447e-7, rel=1e-3)
+    assert end == {"scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
 
 
 def test_targets_of_several_sizes_and_one_gaussian():

@@ -45,6 +45,7 @@ DEFAULT_RESOLUTION = 1600
 published results depend; INRIA's code limits only the width, so that portrait photographs stay larger."""
 
 HOLD_OUT = 8  # every eighth view, starting with the first, is held out: the protocol of 3DGS and Mip-NeRF 360
+JSONS = ("transforms.json", "transforms_train.json")
 MAX_ASPECT_ERROR = 0.01  # relative difference of aspect ratios of photograph and camera; scaled copies round sides
 
 
@@ -76,7 +77,8 @@ def load_views(
     some photographs are missing, an error is raised, because results from fewer views could pass for those of all.
 
     Args:
-        path: folder of the capture, or its camera file.
+        path: folder of the capture, or its camera file; or its folder of a scale, such as ``DATA/images_4``, which
+            then has the photographs.
         scale: use the photographs in the folder of this scale, such as 4 for ``images_4``. Default: the full-size
             folder, else that of scale 4, else the largest; if there is no ``images`` of any scale, ``input``, where
             INRIA's ``convert.py`` keeps the originals.
@@ -99,6 +101,8 @@ def load_views(
         raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
     path = archive = Path(path)
     try:
+        if scale is None and images is None and not unpacked:
+            path, scale = _of_scale(path)
         path = _uppermost_with_cameras(path) if unpacked else path
         capture, folder = _read_capture(path), path if path.is_dir() else path.parent
         moves = similarities(dataparser_file((folder, capture.root)), capture.applied)
@@ -158,12 +162,23 @@ def _read_capture(path: Path) -> Capture:
     )
 
 
+def _of_scale(path: Path) -> tuple[Path, int | None]:
+    """Return the capture and the scale of a folder such as ``DATA/images_4``, which has no cameras; else ``path``."""
+    prefix, _, scale = path.name.partition("_")
+    if prefix == IMAGES and scale.isdecimal() and path.is_dir() and not _has_cameras(path):
+        return path.parent, int(scale)
+    return path, None
+
+
+def _has_cameras(folder: Path) -> bool:
+    return bool(find_colmap(folder)) or any((folder / name).is_file() for name in JSONS)
+
+
 def _uppermost_with_cameras(path: Path) -> Path:
     """Return the first of ``path`` and the folders in it, the uppermost first, that has cameras; else ``path``. Refuse
     cameras in another folder that is not inside this one: a model is inside, a second capture beside."""
     below = sorted((each for each in path.rglob("*") if each.is_dir()), key=lambda each: (len(each.parts), each))
-    jsons = ("transforms.json", "transforms_train.json")
-    has_cameras = [each for each in (path, *below) if find_colmap(each) or any((each / n).is_file() for n in jsons)]
+    has_cameras = [each for each in (path, *below) if _has_cameras(each)]
     first = has_cameras[0] if has_cameras else path
     second = next((each for each in has_cameras if not each.is_relative_to(first)), None)
     if second is not None:
@@ -255,8 +270,9 @@ def pack_capture(path: Path, destination: Path, progress: Progress = silent) -> 
     files, and the photographs of its views, those that are used reduced without further loss. Equal captures make equal
     files."""
     load_views(path)  # refuses what a service would refuse
+    path, scale = _of_scale(path)
     capture = _read_capture(path)
-    photos = find_photos([posed.photo for posed in capture.images], capture.root) or ()
+    photos = find_photos([posed.photo for posed in capture.images], capture.root, scale=scale) or ()
     packed = {_packed_name(posed, photo): (posed, photo) for posed, photo in zip(capture.images, photos, strict=False)}
     if len(packed) < len({photo.path for photo in photos}):
         raise InvalidViewsError(f"two photographs of {path} have the same name in different folders; rename one")

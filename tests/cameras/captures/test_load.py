@@ -28,6 +28,9 @@ def test_fox(shared_data):
     assert {(view.camera.width, view.camera.height) for view in views.train} == {(540, 960)}
     np.testing.assert_allclose(views.train[0].camera.K, [[714.1977, 0, 270], [0, 714.1977, 480], [0, 0, 1]], atol=1e-4)
     assert views.background.tolist() == [0, 0, 0]
+    named = load_views(shared_data / "fox" / "images_2")
+    assert [view.photo for view in named.test] == [view.photo for view in views.test]
+    assert named.source == views.source
     quarter = load_views(shared_data / "fox").test[0]  # the default scale of a capture without full-size photographs
     with Image.open(shared_data / "fox" / "images_4" / "0001.jpg") as image:
         np.testing.assert_array_equal(quarter.load_photo(), np.asarray(image))

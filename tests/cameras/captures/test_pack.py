@@ -1,6 +1,7 @@
 """Packed captures; oracle: the views of the capture itself, and the names and sizes of what they show."""
 
 import json
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -81,6 +82,14 @@ def test_photographs_anywhere_are_found_in_the_archive(tmp_path, place):
     assert all(".." not in name and not name.startswith("/") for name in names)
     expected = load_views(capture)
     assert_same_views(load_views(unpacked, unpacked=True), expected)
+
+
+def test_the_folder_of_a_scale_packs_its_photographs(tmp_path):
+    capture = write_capture(tmp_path / "statue")
+    shutil.copytree(capture / "images", capture / "images_2")
+    unpacked, names = packed(capture / "images_2", tmp_path)
+    assert {name.split("/")[0] for name in names if name.endswith(".png")} == {"images_2"}
+    assert_same_views(load_views(unpacked, unpacked=True), load_views(capture / "images_2"))
 
 
 def test_large_photographs_are_packed_as_they_are_used(tmp_path):
