@@ -199,7 +199,7 @@ QUALITIES = {
 
 UNIFORM_ONLY = (
     *("shared_step_size", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),
-    *("quat_levels", "sh_weight_power"),
+    *("quat_levels", "gaussians_per_codebook_entry", "sh_weight_power"),
 )
 """Values of uniform planning; with rate_distortion, lambda and sensitivity decide instead."""
 
@@ -280,7 +280,7 @@ class EncodeSettings(StageSettings):
     quat_levels: Annotated[int, Field(ge=2, le=256)] = of_preset(100, "Levels of quaternions without shared_step_size.")
     sh0_step: Step = of_preset(0.055, "Quantisation step of the base colour: 0.055 is an error of at most 2 of 255.")
     gaussians_per_codebook_entry: Annotated[float, Field(ge=1, le=4096)] = of_preset(
-        7.0, "Gaussians per codebook entry, without rate_distortion."
+        7.0, "Gaussians per codebook entry."
     )
     sh_codebook_size: Annotated[int, Field(ge=64, le=65_536)] = of_preset(65_536, "Largest number of codebook entries.")
     sh_tolerance: Share = of_preset(0.001, "Invisible RMS error of SH coefficients, below which no codebook grows.")

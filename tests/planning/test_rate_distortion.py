@@ -132,7 +132,7 @@ def test_threads_do_not_change_a_byte():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"order": "plas"}, {"rotation_form": "pras"}, {"gaussians_per_codebook_entry": 50}, {"step_classes": 7}]
+    "changes", [{"order": "plas"}, {"rotation_form": "pras"}, {"sh_codebook_size": 64}, {"step_classes": 7}]
 )
 def test_rate_distortion_works_with_every_order_and_form(changes):
     splats = random_scene(700, 1, seed=8)
