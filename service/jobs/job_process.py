@@ -7,6 +7,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 import os
 import time
 from pathlib import Path
@@ -16,6 +17,8 @@ import kissgs
 from kissgs.formats import CONTAINERS
 
 from ..core.files import THUMBNAIL, THUMBNAIL_SIZE
+
+log = logging.getLogger("kissgs.service")
 
 Task = dict[str, Any]
 
@@ -54,7 +57,12 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
             **of_photographs,
             **{name: evaluation[name] for name in ("worst", "fifth_percentile", "detail", "shown")},
         }
-    if (image := _thumbnail(container, task["threads"])) is not None:
+    try:
+        image = _thumbnail(container, task["threads"])
+    except Exception:  # whatever it is, the result is complete without
+        log.exception("a result has no thumbnail")
+        image = None
+    if image is not None:
         write_file(folder / THUMBNAIL, image)
         summary["thumbnail"] = _size_and_hash(folder / THUMBNAIL)
     sync_folder(folder)
