@@ -20,7 +20,7 @@ SEARCHED = "+search"
 CAPTURED = "+photos"
 TIMED = "+time"  # suffixes of the preset's name in kind
 
-_GROUPS = {
+_GROUPS: dict[str, type[BaseModel]] = {
     "compact": kissgs.CompactSettings,
     "encode": kissgs.EncodeSettings,
     "finetune": kissgs.FinetuneSettings,

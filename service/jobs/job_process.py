@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +113,7 @@ def _convert(task: Task, target: Path, progress: kissgs.Progress) -> dict[str, A
     if task["evaluate"]:
         progress("evaluate", 0.6)
         views = None if task["views"] is None else kissgs.load_views(Path(task["views"]), unpacked=True)
-        written = kissgs.load(target, origin=task["origin"], threads=threads)
+        written = replace(kissgs.load(target, threads=threads), origin=original.origin)  # which the file cannot hold
         evaluation = kissgs.evaluate(original, written, views, threads=threads).as_dict()
     return {
         "count": len(original),
