@@ -110,7 +110,7 @@ def test_what_belongs_to_a_preset_changes_only_by_research(group, name):
 
 @pytest.mark.parametrize(("text", "found"), [("0.5", [0.5]), ("0.6,0.8", [0.6, 0.8]), ("", [])])
 def test_fractions_can_be_given_as_text(text, found):
-    """As ``--set finetune.pras_at=0.6,0.8`` gives them."""
+    """The command line gives them so: --set finetune.pras_at=0.6,0.8."""
     assert Settings.research("paper", finetune={"pras_at": text}).finetune.pras_at == found
 
 
