@@ -18,6 +18,7 @@ from kissgs.core.splats import MAX_GRID_SIDE
 # ``StageSettings``: the values of one stage, few of which are settings; the others belong to the preset.
 
 Share = Annotated[float, Field(ge=0, le=1)]
+Shares = Annotated[list[Share], BeforeValidator(lambda x: re.findall("[^,]+", x) if isinstance(x, str) else x)]
 Weight = Annotated[float, Field(ge=0, le=1000)]
 Rate = Annotated[float, Field(gt=0, le=100)]
 Steps = Annotated[int, Field(ge=0, le=1_000_000)]
@@ -352,9 +353,7 @@ class FinetuneSettings(TrainingViewSettings):
     synthetic_lr_scale: Rate = of_preset(0.3, "Factor on both where targets are renderings, which leave less error.")
     final_lr_scale: Annotated[float, Field(gt=0, le=1)] = of_preset(0.05, "Factor on both at the last step.")
     attraction: Weight = of_preset(1.0, "Weight of the attraction to levels.")
-    pras_at: list[Share] = of_preset(
-        [], "Fractions of the steps at which PRAS chooses forms anew; needs rate_weight 0."
-    )
+    pras_at: Shares = of_preset([], "Fractions of the steps at which PRAS chooses forms anew; needs rate_weight 0.")
     keeps_better: bool = of_preset(True, "Keep the container from before if it is better.")
     rate_weight: Weight = of_preset(
         2.0, "Weight of the estimated rate, in units of rd_lambda, against the image error."

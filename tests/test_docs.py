@@ -202,3 +202,12 @@ def test_the_page_expects_what_goals_with_photographs_have_reached():
     for goal, size, psnr in rows:
         found = int(size.replace(",", "")) / 79_451, float(psnr) - 32.09
         assert expected[goal] == pytest.approx(found, abs=0.006), goal
+
+
+def test_docker_gets_every_file_that_it_copies():
+    """Regression: scripts/install_torch was copied, but not sent to the builder."""
+    sent = set(re.findall(r"^!(.*)$", (ROOT / ".dockerignore").read_text(), re.MULTILINE))
+    lines = re.findall(r"^COPY (?!--from)(?:--\S+ )*(.*)$", (ROOT / "docker" / "Dockerfile").read_text(), re.MULTILINE)
+    copied = {source for line in lines for source in line.split()[:-1]}
+    assert {"kissgs", "scripts/install_torch"} <= copied
+    assert [source for source in sorted(copied) if source not in sent and source.split("/")[0] not in sent] == []

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 # Schedule of POPSpa: phases of training, the prunings between them, and learning rates (KISS-GS, section 3.2).
 
-
 # Learning rates before and at the end of refinement, in units of those of 3DGS; factor for renderings as targets.
 MEANS_LR, OTHER_LR, RENDERINGS_LR = (1.0, 0.01), (2.0, 0.1), 0.5
 

@@ -495,7 +495,8 @@ class TotalVariationLoss(Regularizer):
         total = torch.zeros((), dtype=torch.float64, device=self._one.device)
         for name, factor in PAPER_TV_WEIGHTS.items():
             plane = self._scene.planes[name]
-            levels, top = plane.levels(self._scene.latents[name]), plane.field.top if name != "means" else 255
+            levels = plane.levels(self._scene.latents[name])
+            top = 255 if name == "means" else max(plane.field.top, 1)  # 0 of a table with one value
             for image in _bytes(levels) if name == "means" else (levels,):
                 total = total + factor / top * (image[self._one] - image[self._other]).abs().mean()
         return weight * total

@@ -72,7 +72,8 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     """Estimate the wall time of a job on a small server, used until this server has measured jobs of its own. ``kind``
     is :attr:`service.core.schemas.JobOptions.kind`."""
     name, *stages = kind.split("+")
-    facts, millions = _FACTS[kissgs.Preset(name)], gaussians / 1e6
+    known = kissgs.Preset(name) if name in list(kissgs.Preset) else kissgs.Preset.BALANCED  # of an older version
+    facts, millions = _FACTS[known], gaussians / 1e6
     encoding = (facts.cpu_seconds_per_million + evaluate * EVALUATION) * millions
     compacts, tunes, searches = (suffix.removeprefix("+") in stages for suffix in (COMPACTED, FINETUNED, SEARCHED))
     training, tuning = (fixed + per_million * millions for fixed, per_million in (facts.training, facts.tuning))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 import kissgs
 from kissgs.formats import CONTAINERS
@@ -19,6 +19,12 @@ FINETUNED = "+finetune"
 SEARCHED = "+search"
 CAPTURED = "+photos"
 TIMED = "+time"  # suffixes of the preset's name in kind
+
+_GROUPS: dict[str, type[BaseModel]] = {
+    "compact": kissgs.CompactSettings,
+    "encode": kissgs.EncodeSettings,
+    "finetune": kissgs.FinetuneSettings,
+}
 
 REFERENCE = "^sha256:[0-9a-f]{64}$"  # of a capture
 
@@ -67,11 +73,18 @@ class JobOptions(kissgs.Settings):
 
     @classmethod
     def stored(cls, options: dict[str, Any]) -> Self:
-        """Return the options of a job in the database; older versions took values that belong to the preset now, and
-        had a preset "small", a coarser "balanced"."""
+        """Return the options of a job in the database. Older versions took values that belong to the preset now, had
+        others in presets and some that are gone, and a preset "small", a coarser "balanced"."""
         if options.get("preset") == "small":
             options = {**options, "preset": kissgs.Preset.BALANCED}
-        return cls.model_validate({"for_research": True, **options})
+        try:
+            return cls.model_validate({"for_research": True, **options})
+        except ValidationError:
+            known = {
+                group: {name: value for name, value in options.get(group, {}).items() if name in model.model_fields}
+                for group, model in _GROUPS.items()
+            }
+            return cls.model_validate({**options, **known, "for_research": True})
 
     @property
     def kind(self) -> str:

@@ -7,8 +7,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,8 @@ import kissgs
 from kissgs.formats import CONTAINERS
 
 from ..core.files import THUMBNAIL, THUMBNAIL_SIZE
+
+log = logging.getLogger("kissgs.service")
 
 Task = dict[str, Any]
 
@@ -54,7 +58,12 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
             **of_photographs,
             **{name: evaluation[name] for name in ("worst", "fifth_percentile", "detail", "shown")},
         }
-    if (image := _thumbnail(container, task["threads"])) is not None:
+    try:
+        image = _thumbnail(container, task["threads"])
+    except Exception:  # whatever it is, the result is complete without
+        log.exception("a result has no thumbnail")
+        image = None
+    if image is not None:
         write_file(folder / THUMBNAIL, image)
         summary["thumbnail"] = _size_and_hash(folder / THUMBNAIL)
     sync_folder(folder)
@@ -104,7 +113,7 @@ def _convert(task: Task, target: Path, progress: kissgs.Progress) -> dict[str, A
     if task["evaluate"]:
         progress("evaluate", 0.6)
         views = None if task["views"] is None else kissgs.load_views(Path(task["views"]), unpacked=True)
-        written = kissgs.load(target, origin=task["origin"], threads=threads)
+        written = replace(kissgs.load(target, threads=threads), origin=original.origin)  # which the file cannot hold
         evaluation = kissgs.evaluate(original, written, views, threads=threads).as_dict()
     return {
         "count": len(original),

@@ -75,7 +75,10 @@ export function choiceField(limits, presets) {
       const usual = expect({}, scene, named);
       if (!small.radio.checked && !size.checkValidity()) sized = false; // else it would prevent the submission
       const share = scene.trains ? TRAINED_SHARE : ENCODED_SHARE;
-      if (!sized && usual) size.value = String(Number(((share * usual.bytes) / MEGABYTE).toPrecision(2)));
+      if (!sized && usual) {
+        const proposed = Number(((share * usual.bytes) / MEGABYTE).toPrecision(2));
+        size.value = String(Math.max(proposed, Number(size.min))); // less would prevent the submission
+      }
       for (const each of rows) if (each !== before) each.show(expect(each.options(), scene, named));
     },
     /** Choose the options of an earlier job. @param {import("./api.js").JobOptions} options */

@@ -94,7 +94,8 @@ function optionFields(limits, presets) {
   function scene() {
     const captured = capture.chosen() !== null;
     const trains = limits.training && (captured || finetune.checked);
-    return { gaussians: facts?.gaussians ?? MILLION, degree: facts?.shDegree ?? 3, captured, trains };
+    const [gaussians, degree] = [facts?.gaussians ?? MILLION, facts?.shDegree ?? 3];
+    return { gaussians, degree, captured, trains, tuned: finetune.checked };
   }
 
   /** Enable the choices that can be combined, and say what to expect of each. */

@@ -1,8 +1,9 @@
 /** What to expect of a job: its bytes, loss and time, from what was measured on one scene, fox. */
 
 /**
- * @typedef {{gaussians: number, degree: number, captured: boolean, trains: boolean}} Scene what is known of a scene;
- *   `trains`: whether goals are served by training, on its photographs or else on renderings
+ * @typedef {{gaussians: number, degree: number, captured: boolean, trains: boolean, tuned: boolean}} Scene what
+ *   is known of a scene; `trains`: whether goals are served by training, on its photographs or else on renderings;
+ *   `tuned`: whether fine-tuning is wanted in any case
  * @typedef {[number, number]} Figure bytes per Gaussian, and the change of PSNR in decibels
  * @typedef {{bytes: number, change: number, below?: boolean, seconds: number | null}} Expectation `below`: whether the
  *   loss is larger than that; seconds are null for minutes of training
@@ -75,7 +76,7 @@ export function expectFixed(format, { gaussians, degree }) {
  * @param {Record<string, import("./api.js").Preset>} presets by name
  * @returns {Expectation | null}
  */
-export function expect({ preset, encode, time_limit: limit }, { gaussians, degree, captured, trains }, presets) {
+export function expect({ preset, encode, time_limit: limit }, { gaussians, degree, captured, trains, tuned }, presets) {
   const seconds = (/** @type {"fast" | "balanced"} */ name) =>
     START_SECONDS + (presets[name].cpu_seconds_per_million * gaussians) / MILLION / CORES;
   const encoding = seconds("balanced");
@@ -93,7 +94,7 @@ export function expect({ preset, encode, time_limit: limit }, { gaussians, degre
   }
   const within = limit && captured && trains && LIMITED.find(([encodings]) => limit >= encodings * encoding);
   const [size, loss] = within ? within.slice(1) : captured && name !== "fast" ? CAPTURED : [each, change];
-  return { bytes: size * scale, change: loss, seconds: limit ?? seconds(name) };
+  return { bytes: size * scale, change: loss, seconds: limit ?? (tuned ? null : seconds(name)) };
 }
 
 /**

@@ -4,6 +4,7 @@ import functools
 import io
 import math
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -196,6 +197,14 @@ def test_losses_of_weight_zero_are_skipped():
     assert RateLoss(quantized(), 0.0).penalty(0, {}) is None
     assert TotalVariationLoss(quantized(), 0.0, Pace(10)).penalty(9, {}) is None
     assert TotalVariationLoss(quantized(), 1.0, Pace(100)).penalty(35, {}) is None
+
+
+def test_total_variation_does_without_tables_of_one_value():
+    """Regression: a division by zero for a scene of one colour as ``.sog``."""
+    round_grey = replace(cloud(40, 1), sh0=np.zeros((40, 3), np.float32), scales=np.zeros((40, 3), np.float32))
+    scene = QuantizedScene(chosen(round_grey, "paper", SOG), 1, container=SOG)
+    assert (scene.planes["f_dc"].field.top, scene.planes["scales"].field.top) == (0, 0)
+    assert value(TotalVariationLoss(scene, 1.0, Pace(10)).penalty(9, {})) > 0  # of the others
 
 
 @pytest.mark.parametrize(("count", "preset"), [(400, "fast"), (70, "paper"), (1, "fast")])

@@ -146,6 +146,15 @@ def test_a_scene_in_another_format(service, kind, tmp_path):
     assert service.http.get(job["links"]["decoded"]).content == (tmp_path / "decoded.ply").read_bytes()
 
 
+def test_a_scene_that_was_moved_is_compared_in_its_place(service, tmp_path):
+    """Regression: PSNR of 12 dB, because the file does not record its origin."""
+    scene = kissgs.sample_scene(60, sh_degree=1)
+    kissgs.save(dataclasses.replace(scene, means=scene.means + np.float32([4000, 0, 0])), tmp_path / "x.ply")
+    options = {"format": "compressed.ply", "evaluate": True, "origin": "auto"}
+    job = service.ended(service.submit((tmp_path / "x.ply").read_bytes(), json.dumps(options)))
+    assert job["evaluation"]["psnr"] > 40
+
+
 CHANGES = {
     "a goal": {"encode": {"quality": "same"}},
     "a time limit": {"time_limit": 9},

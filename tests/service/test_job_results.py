@@ -179,3 +179,15 @@ def test_every_result_with_gaussians_has_a_thumbnail(service, job):
     job = service.ended(service.submit(file_of(empty)))
     assert (job["kept"], "thumbnail" in job["links"]) == (0, False)
     problem(service.http.get(f"/v1/jobs/{job['id']}/thumbnail.webp"), 404, "not-found")
+
+
+def test_a_job_succeeds_without_a_thumbnail(service, monkeypatch):
+    """Regression: a job whose result was complete failed where its image could not be drawn."""
+
+    def fail(*given):
+        raise MemoryError
+
+    monkeypatch.setattr("service.jobs.job_process._thumbnail", fail)
+    job = service.ended(service.submit())
+    assert (job["state"], "thumbnail" in job["links"]) == ("succeeded", False)
+    problem(service.http.get(f"/v1/jobs/{job['id']}/thumbnail.webp"), 404, "not-found")

@@ -171,6 +171,7 @@ def test_goals_and_a_time_limit(visit, busy):
     goal = {"encode": {"target_size": 8000}}
     assert sent_options(page, busy) == {**goal, "compact": {"auto_count": False}, "finetune": {"enabled": False}}
     page.get_by_label("Fine-tune").check()
+    assert figures(page, "Balanced")[2] == "minutes"
     assert sent_options(page, busy) == {**goal, "finetune": {"enabled": True}}
     keep.select_option("Keep half")
     page.get_by_label("Move to the origin").check()
@@ -178,6 +179,14 @@ def test_goals_and_a_time_limit(visit, busy):
     assert page.get_by_label("Fine-tune").is_disabled()
     assert keep.is_disabled()
     assert sent_options(page, busy) == {"origin": "auto", "format": "spz"}
+
+
+def test_a_scene_of_few_gaussians_can_be_sent(visit, busy):
+    """Regression: the size that was proposed for it was below the least one, which prevented the submission."""
+    page = visit(busy)
+    choose(page, scene_bytes(60, 0))
+    page.get_by_text("60 Gaussians").wait_for()
+    assert sent_options(page, busy) == {}
 
 
 def sent_options(page, service):

@@ -78,6 +78,14 @@ def test_a_job_of_sog(preview, service, sog, tmp_path):
     assert psnr(read.shown(len(sog.splats))[:-80], image[:-80]) > 40  # below are the buttons, which differ
 
 
+@pytest.mark.parametrize("kind", ["spz", "compressed.ply"])
+def test_a_job_in_another_format(preview, service, kind):
+    job = service.ended(service.submit(scene_bytes(1500, 3), options=json.dumps({"format": kind})))
+    tab = preview().open(service, job["id"])
+    assert colours(tab.shown(1500)) > 3000
+    assert f"{job['sizes']['container']:,}" in tab.page.locator("#statistics").inner_text()
+
+
 def in_bytes(text):
     number, unit = text.split()
     return float(number.replace(",", "")) * {"byte": 1, "bytes": 1, "kB": 1e3, "MB": 1e6}[unit]

@@ -9,6 +9,7 @@ from helpers.data_folders import add_a_job, database, listing, opened, service
 
 import kissgs
 from service.core.models import State
+from service.core.schemas import JobOptions
 from service.core.settings import SettingsError
 from service.jobs.status import Queue, job_status
 
@@ -57,6 +58,22 @@ def test_options_that_an_older_version_accepted_are_kept(tmp_path):
         task = context.worker._task(job, str(context.storage.upload(job_id)), tmp_path)
     for settings in (found, kissgs.Settings.model_validate(task["settings"])):
         assert (settings.encode.seed, settings.encode.sh_step, settings.compact.seed) == (3, 1.0, 0)
+
+
+@pytest.mark.parametrize("preset", ["balanced", "small"])
+def test_options_with_values_that_are_gone_are_kept_without_them(tmp_path, preset):
+    """Regression: a job with a value that was removed from the presets, or changed, failed the list of all jobs."""
+    options = JobOptions(encode={"seed": 3}).model_dump(mode="json") | {"preset": preset}
+    options["compact"] |= {"means_lr_scale": 1.0, "refine_steps": 5000}
+    with service(tmp_path / "data") as context:
+        job_id = add_a_job(context)
+    database(tmp_path / "data", f"UPDATE jobs SET preset = '{preset}', options = '{json.dumps(options)}'")
+    with service(tmp_path / "data") as context:
+        job = context.store.get(job_id)
+        found = job_status(job, Queue(context.store, 1)).options
+        task = context.worker._task(job, str(context.storage.upload(job_id)), tmp_path)
+    for settings in (found, kissgs.Settings.model_validate(task["settings"])):
+        assert (settings.preset, settings.encode.seed, settings.compact.refine_steps) == ("balanced", 3, 5000)
 
 
 @pytest.mark.parametrize("upload", ["kept", "gone"])

@@ -108,6 +108,12 @@ def test_what_belongs_to_a_preset_changes_only_by_research(group, name):
     assert name not in SCHEMA[GROUPS[group].__name__]["properties"]
 
 
+@pytest.mark.parametrize(("text", "found"), [("0.5", [0.5]), ("0.6,0.8", [0.6, 0.8]), ("", [])])
+def test_fractions_can_be_given_as_text(text, found):
+    """The command line gives them so: --set finetune.pras_at=0.6,0.8."""
+    assert Settings.research("paper", finetune={"pras_at": text}).finetune.pras_at == found
+
+
 def test_at_most_twenty_settings_are_public():
     others = [name for name in Settings.public() if name not in GROUPS]
     assert len(others) + sum(len(model.public()) for model in GROUPS.values()) <= 20

@@ -174,7 +174,9 @@ async def get_thumbnail(context: Service, job: RequestedJob) -> Response:
     """The result, drawn from the camera that its container records, with at most 320 pixels a side."""
     entry = _result(job).get("thumbnail")
     if entry is None:
-        raise ProblemError("not-found", "the result has no thumbnail: it shows nothing, or an older version made it")
+        raise ProblemError(
+            "not-found", "the result has no thumbnail: it shows nothing, drawing it failed, or an older version made it"
+        )
     file = context.storage.result(job.id) / THUMBNAIL
     return await _stored(file, sha256=entry["sha256"], media_type="image/webp", headers=_FOREVER)
 
