@@ -91,9 +91,14 @@ class JobOptions(kissgs.Settings):
         """Preset, further stages and whether time is limited: with the scene, they determine the duration. A conversion
         takes about as long as the preset fast."""
         preset = self.preset if self.format in CONTAINERS else kissgs.Preset.FAST
-        compacted, tuned, searched = self.compact.enabled, bool(self.finetune.enabled), self.searches
-        kind = preset + COMPACTED * compacted + FINETUNED * tuned + SEARCHED * searched
-        return kind + CAPTURED * (self.capture is not None) + TIMED * (self.time_limit is not None)
+        stages = {
+            COMPACTED: self.compact.enabled,
+            FINETUNED: bool(self.finetune.enabled),
+            SEARCHED: self.searches,
+            CAPTURED: self.capture is not None,
+            TIMED: self.time_limit is not None,
+        }
+        return "".join([preset, *(suffix for suffix, wanted in stages.items() if wanted)])
 
     @property
     def retrains(self) -> bool:

@@ -14,6 +14,7 @@ from anyio.to_thread import run_sync
 from pydantic import ValidationError
 from starlette.requests import Request
 
+import kissgs
 from kissgs.formats import CONTAINERS, UPLOADS, alternatives
 
 from ..core.files import checkpoint_bytes
@@ -144,11 +145,12 @@ def parse_options(text: str | bytes, *, photographs: bool | None = None) -> JobO
             f"the options are invalid: {named}; JobOptions in /openapi.json lists all settings",
             errors=found,
         ) from error
-    changes = options.searches, options.compact.enabled, options.finetune.enabled, options.time_limit
+    encodes = options.encode != kissgs.Settings.from_preset(options.preset).encode
+    changes = encodes, options.compact.enabled, options.finetune.enabled, options.time_limit
     if options.format not in CONTAINERS and any(changes):
         raise invalid(
-            f"format {options.format} holds the scene as it is; leave out goals, the time limit, compaction and "
-            "fine-tuning, or choose format sogxt or sog"
+            f"format {options.format} holds the scene as it is; leave out goals and other settings of the encoder, the "
+            "time limit, compaction and fine-tuning, or choose format sogxt or sog"
         )
     if options.trains and not can_train():
         raise invalid(

@@ -157,6 +157,7 @@ def test_a_scene_that_was_moved_is_compared_in_its_place(service, tmp_path):
 
 CHANGES = {
     "a goal": {"encode": {"quality": "same"}},
+    "an offset": {"encode": {"quality_offset_db": 3}},
     "a time limit": {"time_limit": 9},
     "fine-tuning": {"finetune": {"enabled": True}},
     "compaction": {"compact": {"ratio": 0.5}},
