@@ -18,7 +18,9 @@ from kissgs.core.splats import MAX_GRID_SIDE
 # ``StageSettings``: the values of one stage, few of which are settings; the others belong to the preset.
 
 Share = Annotated[float, Field(ge=0, le=1)]
-Shares = Annotated[list[Share], BeforeValidator(lambda x: re.findall("[^,]+", x) if isinstance(x, str) else x)]
+Shares = Annotated[
+    list[Share], BeforeValidator(lambda given: re.findall("[^,]+", given) if isinstance(given, str) else given)
+]
 Weight = Annotated[float, Field(ge=0, le=1000)]
 Rate = Annotated[float, Field(gt=0, le=100)]
 Steps = Annotated[int, Field(ge=0, le=1_000_000)]

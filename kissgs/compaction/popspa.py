@@ -97,7 +97,8 @@ def lr_schedule(settings: CompactSettings, phase: Phase, target_source: str) -> 
         return continued_lr(BASE_LR, settings.lr_offset + phase.first, phase.steps)
     scale = RENDERINGS_LR if target_source == "renderings" else 1.0
     base = {name: rate * scale for name, rate in BASE_LR.items()}
-    begin, end = ({name: (MEANS_LR if name == "means" else OTHER_LR)[at] for name in base} for at in (0, 1))
+    begin = {name: MEANS_LR[0] if name == "means" else OTHER_LR[0] for name in base}
+    end = {name: MEANS_LR[1] if name == "means" else OTHER_LR[1] for name in base}
     return exponential_lr(base, begin, end if phase.name == "refine" else begin)
 
 

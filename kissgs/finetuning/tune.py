@@ -166,13 +166,13 @@ class Tuner:
             done = int(state["done"])
             scene.restore(state)
             rate_loss.restore(state)
-        reforms = self.container.tables is None and not settings.rate_weight
-        left = [share for share in sorted(settings.pras_at) if reforms and share * pace.steps > done]
+        repeats = self.container.tables is None and not settings.rate_weight
+        fractions = [each for each in sorted(settings.pras_at) if repeats and each * pace.steps > done]
 
         def after(step: int) -> None:
             nonlocal checkpoint_note
-            if left and step >= left[0] * pace.steps:  # a limited time changes the number of steps on the way
-                left.pop(0)
+            if fractions and step >= fractions[0] * pace.steps:  # a limited time changes the number on the way
+                fractions.pop(0)
                 scene.choose_forms(PRAS_DECAY, self.context.threads)
             if checkpoint.due or (path is not None and step == pace.steps):
                 try:

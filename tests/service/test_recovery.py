@@ -46,17 +46,23 @@ def two_jobs(tmp_path):
     return tmp_path / "data", second, first
 
 
-def test_options_that_an_older_version_accepted_are_kept(tmp_path):
-    """Regression: a job whose values belong to the preset now had no status, and could not start."""
-    options = {"preset": "fast", "encode": {"seed": 3, "sh_step": 1.0}, "compact": {"seed": 0}}
+def read_again(options, tmp_path):
+    """Return the settings of a job with these stored options, as its status shows them and as it would start."""
     with service(tmp_path / "data") as context:
         job_id = add_a_job(context)
-    database(tmp_path / "data", f"UPDATE jobs SET options = '{json.dumps(options)}'")
+    change = f"preset = '{options['preset']}', options = '{json.dumps(options)}'"
+    database(tmp_path / "data", f"UPDATE jobs SET {change}")
     with service(tmp_path / "data") as context:
         job = context.store.get(job_id)
         found = job_status(job, Queue(context.store, 1)).options
         task = context.worker._task(job, str(context.storage.upload(job_id)), tmp_path)
-    for settings in (found, kissgs.Settings.model_validate(task["settings"])):
+    return found, kissgs.Settings.model_validate(task["settings"])
+
+
+def test_options_that_an_older_version_accepted_are_kept(tmp_path):
+    """Regression: a job whose values belong to the preset now had no status, and could not start."""
+    options = {"preset": "fast", "encode": {"seed": 3, "sh_step": 1.0}, "compact": {"seed": 0}}
+    for settings in read_again(options, tmp_path):
         assert (settings.encode.seed, settings.encode.sh_step, settings.compact.seed) == (3, 1.0, 0)
 
 
@@ -65,14 +71,7 @@ def test_options_with_values_that_are_gone_are_kept_without_them(tmp_path, prese
     """Regression: a job with a value that was removed from the presets, or changed, failed the list of all jobs."""
     options = JobOptions(encode={"seed": 3}).model_dump(mode="json") | {"preset": preset}
     options["compact"] |= {"means_lr_scale": 1.0, "refine_steps": 5000}
-    with service(tmp_path / "data") as context:
-        job_id = add_a_job(context)
-    database(tmp_path / "data", f"UPDATE jobs SET preset = '{preset}', options = '{json.dumps(options)}'")
-    with service(tmp_path / "data") as context:
-        job = context.store.get(job_id)
-        found = job_status(job, Queue(context.store, 1)).options
-        task = context.worker._task(job, str(context.storage.upload(job_id)), tmp_path)
-    for settings in (found, kissgs.Settings.model_validate(task["settings"])):
+    for settings in read_again(options, tmp_path):
         assert (settings.preset, settings.encode.seed, settings.compact.refine_steps) == ("balanced", 3, 5000)
 
 
