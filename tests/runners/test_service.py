@@ -155,7 +155,7 @@ def test_a_job_whose_process_is_killed_is_started_once_more(service):
     os.kill(*processes_of(service, job), signal.SIGKILL)
     assert result_of(service, job) == compressed(MEDIUM)
     assert service.status(job)["starts"] == 2
-    assert service.leftovers() == []
+    wait_until_nothing_is_left(service)
 
 
 @pytest.mark.quick(1)
