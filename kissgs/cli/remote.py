@@ -22,7 +22,7 @@ from kissgs.cli.options import (
     with_option_groups,
 )
 from kissgs.core.errors import OutputError, UnsupportedError
-from kissgs.formats import ENDINGS, OUTPUT_FORMATS, WRITTEN, ending_of, named_container
+from kissgs.formats import OUTPUT_FORMATS, ending_of, named_container
 
 if TYPE_CHECKING:
     from kissgs.client import Remote
@@ -109,7 +109,7 @@ def list_jobs(server: ServerOption = DEFAULT_SERVER, as_json: ServiceJsonOption 
 def get(
     job: JobArgument,
     output: Annotated[
-        Path | None, output_option("Output NAME.zip or NAME.sog. Default: the name of the scene.")
+        Path | None, output_option("Output file, with the ending of the job's format. Default: the name of the scene.")
     ] = None,
     server: ServerOption = DEFAULT_SERVER,
     force: ForceOption = False,
@@ -119,13 +119,11 @@ def get(
     from kissgs.client import Share
     from kissgs.io.files import refuse_existing
 
-    if output is not None and not output.name.lower().endswith((*ENDINGS, *WRITTEN)):
-        raise OutputError(f"{output!s:.100} is not the name of a container; end it in {' or '.join(ENDINGS)}")
     with _service(server) as remote, progress_bar(False) as bar:
         progress = _announcing(bar, server, False)
         known = remote.status(job)
-        kind = known["options"].get("format")  # services of older versions state none
-        ending = f".{kind}" if kind in OUTPUT_FORMATS else ending_of(named_container(kind, output))
+        kind = known["options"].get("format") or named_container(None, output)  # older services state none
+        ending = f".{kind}" if kind in OUTPUT_FORMATS else ending_of(kind)
         target = output or Path(f"{known['name']}{ending}")
         if not target.name.lower().endswith(ending):
             raise OutputError(f"{target!s:.100} is not the name of this job's result; end it in {ending}")

@@ -95,7 +95,7 @@ function optionFields(limits, presets) {
     const captured = capture.chosen() !== null;
     const trains = limits.training && (captured || finetune.checked);
     const [gaussians, degree] = [facts?.gaussians ?? MILLION, facts?.shDegree ?? 3];
-    return { gaussians, degree, captured, trains, tuned: finetune.checked };
+    return { gaussians, degree, captured, trains, tuned: finetune.checked, reduced: keep.value !== "" };
   }
 
   /** Enable the choices that can be combined, and say what to expect of each. */

@@ -1,9 +1,9 @@
 /** What to expect of a job: its bytes, loss and time, from what was measured on one scene, fox. */
 
 /**
- * @typedef {{gaussians: number, degree: number, captured: boolean, trains: boolean, tuned: boolean}} Scene what
- *   is known of a scene; `trains`: whether goals are served by training, on its photographs or else on renderings;
- *   `tuned`: whether fine-tuning is wanted in any case
+ * @typedef {{gaussians: number, degree: number, captured: boolean, trains: boolean, tuned: boolean, reduced: boolean}}
+ *   Scene what is known of a scene; `trains`: whether goals are served by training, on its photographs or else on
+ *   renderings; `tuned`: whether fine-tuning is wanted in any case; `reduced`: whether fewer Gaussians are
  * @typedef {[number, number]} Figure bytes per Gaussian, and the change of PSNR in decibels
  * @typedef {{bytes: number, change: number, below?: boolean, seconds: number | null}} Expectation `below`: whether the
  *   loss is larger than that; seconds are null for minutes of training
@@ -76,7 +76,9 @@ export function expectFixed(format, { gaussians, degree }) {
  * @param {Record<string, import("./api.js").Preset>} presets by name
  * @returns {Expectation | null}
  */
-export function expect({ preset, encode, time_limit: limit }, { gaussians, degree, captured, trains, tuned }, presets) {
+export function expect({ preset, encode, time_limit: limit }, scene, presets) {
+  const { gaussians, degree, captured, trains, tuned, reduced } = scene;
+  if (reduced) return null;
   const seconds = (/** @type {"fast" | "balanced"} */ name) =>
     START_SECONDS + (presets[name].cpu_seconds_per_million * gaussians) / MILLION / CORES;
   const encoding = seconds("balanced");

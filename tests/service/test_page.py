@@ -174,6 +174,7 @@ def test_goals_and_a_time_limit(visit, busy):
     assert figures(page, "Balanced")[2] == "minutes"
     assert sent_options(page, busy) == {**goal, "finetune": {"enabled": True}}
     keep.select_option("Keep half")
+    assert figures(page, "Balanced") == ["–", "–", "–"]  # nothing was measured of fewer Gaussians
     page.get_by_label("Move to the origin").check()
     page.get_by_label("Opens in").select_option("spz")
     assert page.get_by_label("Fine-tune").is_disabled()
