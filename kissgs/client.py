@@ -55,9 +55,7 @@ class Remote:
         try:
             import httpx
         except ModuleNotFoundError as error:
-            raise UnsupportedError(
-                "a kissgs service needs httpx, which is not installed: pip install 'kissgs[remote]'"
-            ) from error
+            raise UnsupportedError("a kissgs service needs httpx, which is missing: pip install httpx") from error
         if not _is_address(server):
             raise UnsupportedError(
                 f"{server!r} is not the address of a service; write it as http://localhost:8000, without a path"

@@ -13,7 +13,9 @@ def main() -> None:
     try:
         from .cli import run
     except ModuleNotFoundError as error:
-        sys.stderr.write(f"kissgs-serve: the package {error.name} is missing: pip install 'kissgs[service]'\n")
+        sys.stderr.write(
+            f"kissgs-serve: the package {error.name} is missing: run pip install '.[service]' in a checkout of kissgs\n"
+        )
         sys.exit(2)
     run()
 

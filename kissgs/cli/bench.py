@@ -162,7 +162,7 @@ def _outputs(table: Path, force: bool) -> dict[Path, Callable[[Sequence[Row]], b
         raise OutputError(f"{table!s:.100} is no name of a table; end it in .csv")
     files: dict[Path, Callable[[Sequence[Row]], bytes]] = {table: _csv, table.with_suffix(".png"): _png}
     if find_spec("matplotlib") is None:
-        sys.stderr.write("kissgs: no plot without matplotlib, which is missing: pip install 'kissgs[bench]'\n")
+        sys.stderr.write("kissgs: no plot without matplotlib, which is missing: pip install matplotlib\n")
         del files[table.with_suffix(".png")]
     for path in files:
         refuse_existing(path, overwrite=force)

@@ -14,7 +14,7 @@ from kissgs.compaction.result import Compacted, CompactionReport, CountTrial
 from kissgs.compaction.search_evaluation import SearchEvaluation
 from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.resources import has_torch
+from kissgs.core.resources import TORCH_MISSING, has_torch
 from kissgs.core.root_finding import find_root
 from kissgs.core.splats import Splats
 from kissgs.evaluation.results import ESTIMATED_DROP, drop_of
@@ -89,8 +89,7 @@ def chosen_views(splats: Splats, settings: CompactSettings, views: Views | None,
     """Return the views of a compaction; training that is impossible is refused before any other work."""
     if settings.trains and not has_torch():
         raise UnsupportedError(
-            "training needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough); the "
-            "method merge, that of the preset fast, does not need it"
+            f"training needs {TORCH_MISSING}; the method merge, that of the preset fast, does not need it"
         )
     if settings.trains and context.device == "cuda":
         need_cuda()

@@ -101,6 +101,9 @@ def peak_memory() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
+TORCH_MISSING = "torch, which is missing: pip install torch (a CPU build is enough: docs/guide/install.md)"
+
+
 def has_torch() -> bool:
     """Return whether torch is installed, which training needs."""
     return find_spec("torch") is not None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from kissgs.core.context import Context
-from kissgs.core.resources import has_torch
+from kissgs.core.resources import TORCH_MISSING, has_torch
 from kissgs.pipeline.limited_time import CAPTURE_TIME, SearchTime, encode_seconds
 from kissgs.settings import Preset, Settings
 
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from kissgs.cameras.views import Views
 
 NOT_TRAINED = (
-    "nothing was trained, because torch is missing: pip install 'kissgs[train]'; training makes "
-    "containers smaller at equal quality, much smaller on photographs"
+    f"nothing was trained, which needs {TORCH_MISSING}; training makes containers smaller at equal quality, much "
+    "smaller on photographs"
 )
 
 TOO_LITTLE_TIME = "there was too little time for training"

@@ -16,7 +16,7 @@ from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.context import Context, Device, load_kernels
 from kissgs.core.errors import OutputError, UnsupportedError
-from kissgs.core.resources import blas_workers, has_torch, return_free_memory
+from kissgs.core.resources import TORCH_MISSING, blas_workers, has_torch, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
 from kissgs.formats import ContainerName
@@ -206,9 +206,7 @@ def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: 
 def check_finetuning(settings: Settings, views: Views | None, device: Device) -> None:
     """Refuse fine-tuning that is impossible, or that would miss the goal, before any other work."""
     if not has_torch():
-        raise UnsupportedError(
-            "fine-tuning needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough)"
-        )
+        raise UnsupportedError(f"fine-tuning needs {TORCH_MISSING}")
     if device == "cuda":
         need_cuda()
     if settings.encode.psnr is not None and views is not None and any(view.photo for view in views.train):

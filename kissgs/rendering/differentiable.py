@@ -9,7 +9,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
-from kissgs.core.resources import Workers
+from kissgs.core.resources import TORCH_MISSING, Workers
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.constants import DILATION
@@ -22,7 +22,7 @@ try:
     from torch import Tensor
     from torch.autograd.function import BackwardCFunction, FunctionCtx, once_differentiable
 except ModuleNotFoundError as error:
-    raise UnsupportedError("gradients need torch, which is not installed: pip install 'kissgs[train]'") from error
+    raise UnsupportedError(f"gradients need {TORCH_MISSING}") from error
 
 Parameters = Mapping[str, Tensor]  # stored parameters of a scene, by the names in Splats
 

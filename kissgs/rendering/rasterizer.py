@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 RenderedImage = tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]  # colours and alphas of an image
 ImageRenderer = Callable[[Camera, Sequence[float]], RenderedImage]  # of a camera and a background, RGB
 
-GSPLAT_MISSING = "rendering on CUDA needs gsplat, which is not installed: pip install 'kissgs[cuda]'"
+GSPLAT_MISSING = "rendering on CUDA needs gsplat, which is missing: pip install gsplat"
 
 
 def rasterize_on_cuda(
@@ -77,7 +77,7 @@ def need_cuda() -> None:
     try:
         import torch
     except ImportError as error:
-        raise UnsupportedError("CUDA needs torch, which is not installed: pip install 'kissgs[cuda]'") from error
+        raise UnsupportedError("CUDA needs torch, which is missing: pip install torch gsplat") from error
     if not torch.cuda.is_available():
         raise UnsupportedError("torch finds no CUDA device; use the device cpu")
     if find_spec("gsplat") is None:

@@ -27,7 +27,7 @@ CONNECT_SECONDS = 60.0  # maximum seconds for the connection to a cluster, or th
 RECONNECT_SECONDS = 5.0  # minimum seconds between two attempts to connect again
 CLOSE_SECONDS = 20.0  # for the end of all items and of the driver; then it is killed, and Ray ends the items
 
-NOT_INSTALLED = "Ray is not installed; install it on every machine with: pip install 'kissgs[ray]'"
+NOT_INSTALLED = "Ray is not installed; install it on every machine with: pip install ray"
 
 
 class RayRunner:

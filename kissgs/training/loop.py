@@ -13,7 +13,7 @@ import numpy as np
 
 from kissgs.core.context import DEFAULT_CONTEXT, Context, Pace
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.resources import keep_free_memory
+from kissgs.core.resources import TORCH_MISSING, keep_free_memory
 from kissgs.rendering.cpu.frame import Gradients
 from kissgs.rendering.differentiable import Parameters, photometric_loss, rasterize
 from kissgs.training.supervision import TrainingTargets
@@ -22,7 +22,7 @@ try:
     import torch
     from torch import Tensor
 except ModuleNotFoundError as error:
-    raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
+    raise UnsupportedError(f"training needs {TORCH_MISSING}") from error
 
 SMOOTHING = 0.98  # weight of the former value in the running means of loss and squared error
 BASE_LR = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}  # of 3DGS

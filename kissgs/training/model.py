@@ -15,7 +15,7 @@ from kissgs.core.array_types import Float32, Int, Int32
 from kissgs.core.context import Device
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.numba_kernels import compiled
-from kissgs.core.resources import Workers
+from kissgs.core.resources import TORCH_MISSING, Workers
 from kissgs.core.splats import (
     ATTRIBUTES,
     LOG_SCALE_LIMIT,
@@ -34,7 +34,7 @@ try:
     from torch import Tensor
     from torch.optim.adam import adam as torch_adam
 except ModuleNotFoundError as error:
-    raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
+    raise UnsupportedError(f"training needs {TORCH_MISSING}") from error
 
 # Numba kernel of Adam: gradients of some rows, of all or both, in one pass over parameters and moments.
 #

@@ -194,7 +194,7 @@ def test_missing_torch_is_reported(folder, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stderr.startswith(b"kissgs: training needs torch, which is missing: pip install 'kissgs[train]'")
+    assert done.stderr.startswith(b"kissgs: training needs torch, which is missing: pip install torch")
     assert len(kissgs.load(tmp_path / "b.ply")) == 99
 
 

@@ -11,7 +11,7 @@ from helpers.ray_cluster import RayCluster
 def ray_cluster():
     """A Ray cluster of two nodes of one processor each."""
     if find_spec("ray") is None:
-        pytest.skip("Ray is not installed (pip install 'kissgs[ray]')")
+        pytest.skip("Ray is not installed (pip install ray)")
     with RayCluster() as cluster, pytest.MonkeyPatch.context() as patch:
         for name, value in cluster.environment.items():
             patch.setenv(name, value)

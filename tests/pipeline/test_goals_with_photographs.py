@@ -176,7 +176,7 @@ def test_without_torch_the_report_says_what_is_missing(tmp_path, monkeypatch):
     found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=9, max_encodes=1), views=views)
     assert found.report.compaction is None
     assert found.report.finetuning is None
-    assert "torch is missing: pip install 'kissgs[train]'" in found.report.note
+    assert "needs torch, which is missing: pip install torch" in found.report.note
     assert "estimated" not in found.report.note
     kept = kissgs.compress(scene, settings=with_photographs({"enabled": False}, target_size="1MB", max_encodes=1))
     assert "torch" not in kept.report.note

@@ -254,8 +254,8 @@ def test_the_note_says_what_torch_would_have_bought(tmp_path, monkeypatch):
     monkeypatch.setattr("kissgs.pipeline.choice.has_torch", lambda: False)
     for capture in (views, None):
         plenty, little = (Settings.research("balanced", time_limit=t, **FEW_VIEWS) for t in (LONG, 1e-3))
-        assert "torch is missing" in kissgs.compress(scene, settings=plenty, views=capture).report.note
-        assert "torch is missing" not in kissgs.compress(scene, settings=little, views=capture).report.note
+        assert "needs torch, which is missing" in kissgs.compress(scene, settings=plenty, views=capture).report.note
+        assert "needs torch, which is missing" not in kissgs.compress(scene, settings=little, views=capture).report.note
 
 
 @pytest.mark.quick(1)
