@@ -115,7 +115,9 @@ function optionFields(limits, presets) {
       `Quality is the change of PSNR to photographs, all measured on ${presets.measured_on}.`;
   }
 
-  if (!limits.training) byId("finetune-note").textContent = "This server has no torch, which training needs.";
+  if (!limits.training) {
+    byId("finetune-note").textContent = "This server has no torch, which training needs; make setup TRAIN=1 adds it.";
+  }
   byId("compose").addEventListener("change", refresh);
   refresh();
   return {
