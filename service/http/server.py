@@ -187,6 +187,8 @@ class Server(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drain jobs and requests concurrently."""
         await asyncio.gather(self._context.worker.drain(), super().shutdown(sockets))
+        if self.force_exit:  # uvicorn leaves out the application's own end then, and logs a traceback
+            await self.lifespan.shutdown()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Stop starting jobs, end streams and long polls, then let uvicorn finish its requests. uvicorn's handler would

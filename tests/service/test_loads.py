@@ -159,6 +159,7 @@ def test_an_upload_while_the_service_stops(start, more):
     if more:
         service.interrupt()
     service.join()
+    assert "Traceback" not in service.log.read_text()
     service.restart()
     assert service.status(job)["state"] in ("queued", "running")
 
