@@ -159,9 +159,17 @@ def test_an_upload_while_the_service_stops(start, more):
     if more:
         service.interrupt()
     service.join()
-    assert "Traceback" not in service.log.read_text()
     service.restart()
     assert service.status(job)["state"] in ("queued", "running")
+
+
+def test_a_second_signal_at_once_is_no_failure(start, caplog):
+    """That of ``timeout make serve``: make passes on the signal that its group gets as well."""
+    service = start()
+    service.interrupt()
+    service.interrupt()
+    service.join()
+    assert "Traceback" not in caplog.text
 
 
 def test_clients_cannot_add_log_lines_or_metric_labels(service):
