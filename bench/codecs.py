@@ -12,7 +12,8 @@ import shlex
 import sys
 from typing import Any
 
-from bench.common import arguments, at_quality_offset, bytes_at, head, row, run, signed, write
+from bench.common import arguments, at_quality_offset, head, row, run, signed, write
+from bench.curves import bytes_at
 from bench.external import FORMATS, External, measure_external
 from kissgs import Evaluation, KissgsError, Preset
 from kissgs.cli.bench import Measurement, measured

@@ -1,0 +1,577 @@
+"""The experiments of the KISS-GS paper on the scenes of a manifest: points, tables and plots.
+
+    python bench/paper.py scenes.yaml -o results --published rd.csv
+    python bench/paper.py --published rd.csv    # the factors of published points alone
+
+The manifest names scenes by data set; its paths are relative to it:
+
+    datasets:
+      MipNeRF360:
+        bicycle:
+          capture: 360_v2/bicycle                # held-out photographs evaluate, at most 1600 pixels long
+          training: 360_v2/bicycle/images_4      # default: the capture; "renderings": those of the scene
+          reference: inria/bicycle.ply           # has the quality at which bytes are compared
+          checkpoints:
+            L: {scene: mcmc/bicycle.ply, count: 256000}    # compacted to a count or a ratio
+            XL: {scene: popspa/bicycle.ply}                # as it is
+    preset: paper                                # the default
+    settings: {finetune: {steps: 2000}}          # values of the preset to change
+
+Files and points.csv are in the output folder; a later run makes what is missing or has other inputs or settings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import shlex
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import yaml
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, ValidationInfo
+
+import kissgs
+from bench.common import markdown, parser_of, percent, run, signed, write
+from bench.curves import MEAN, METRICS, Point, append_point, means, ranks, read_points, reduction
+from bench.external import convert
+from bench.paper_parts import PARTS, PUBLISHED_BYTES, LeaveOut, encode_parts
+from bench.strategies import OF_PAPER, STRATEGIES, compacted
+from kissgs import KissgsError, Preset, Settings, Splats, UnsupportedError, Views
+from kissgs.core.context import Context
+from kissgs.evaluation.evaluate import compare_images, in_scene_frame
+from kissgs.io.files import atomic_file
+
+REFERENCE, BASE = "reference", "inria-ply"
+"""Tier and series of the scene that has the quality at which bytes are compared."""
+
+# The manifest.
+
+
+def _in_folder(path: Path, info: ValidationInfo) -> Path:
+    return Path(info.context or "", path)
+
+
+ManifestPath = Annotated[Path, AfterValidator(_in_folder)]
+
+
+class Checkpoint(BaseModel):
+    """A scene that is encoded, and to how many Gaussians it is compacted before."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    scene: ManifestPath
+    count: int | None = None
+    ratio: float | None = None
+
+    @property
+    def budget(self) -> dict[str, object]:
+        """Settings of compaction; empty if the scene is encoded as it is."""
+        return self.model_dump(exclude={"scene"}, exclude_none=True)
+
+
+class Scene(BaseModel):
+    """A scene of a data set."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    capture: ManifestPath
+    training: Literal["renderings"] | ManifestPath | None = None
+    reference: ManifestPath | None = None
+    checkpoints: dict[str, Checkpoint] = {}
+
+    @property
+    def training_capture(self) -> Path | None:
+        """Capture to train on; None for renderings of the scene."""
+        return None if self.training == "renderings" else Path(self.training or self.capture)
+
+
+Group = Literal["compact", "encode", "finetune"]
+GROUPS: tuple[Group, ...] = get_args(Group)
+
+
+class Manifest(BaseModel):
+    """Scenes by data set, and how they are compressed."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    datasets: dict[str, dict[str, Scene]]
+    preset: Preset = Preset.PAPER
+    settings: dict[Group, dict[str, Any]] = {}
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Read a manifest.
+
+    Raises:
+        KissgsError: the file is no YAML, or something in it is missing, unknown or wrong.
+    """
+    try:
+        return Manifest.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")), context=path.parent)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        place = ".".join(str(each) for each in problem["loc"]) or "the file"
+        raise KissgsError(f"{path}: {place}: {problem['msg'].lower()}; --help shows a manifest") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise KissgsError(f"{path} is no YAML: {' '.join(str(error).split())}; --help shows a manifest") from error
+
+
+# A scene with the number of Gaussians of one tier, and the files that are made of it.
+
+Times = tuple[Mapping[str, float], float]
+"""Wall seconds by stage, and processor seconds of all threads."""
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """What a decoder gets, the bytes that it gets it from, and the times of making them."""
+
+    splats: Splats
+    bytes: int
+    times: Times = ({}, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A point that is to be made, unless there is one with the same key."""
+
+    series: str
+    key: str
+    make: Callable[[], Made]
+
+
+@dataclass(frozen=True)
+class Work:
+    """A checkpoint, or the reference of its scene; ``given`` are the arguments of the command."""
+
+    dataset: str
+    name: str
+    tier: str
+    scene: Scene
+    checkpoint: Checkpoint
+    manifest: Manifest
+    given: argparse.Namespace
+
+    def __str__(self) -> str:
+        return f"{self.dataset}/{self.name} {self.tier}"
+
+    @cached_property
+    def original(self) -> Splats:
+        """The scene before compaction."""
+        return kissgs.load(self.checkpoint.scene)
+
+    @cached_property
+    def views(self) -> Views:
+        """Views to evaluate from, in the coordinates of the scene."""
+        return in_scene_frame(self.original, views_of(self.scene.capture))
+
+    @cached_property
+    def training(self) -> Views | None:
+        """Views to train on; None for renderings of the scene."""
+        path = self.scene.training_capture
+        return None if path is None else in_scene_frame(self.original, views_of(path))
+
+    @cached_property
+    def images(self) -> dict[int, Any]:
+        """Renderings of the scene by number of the view, filled by evaluations."""
+        return {}
+
+    def settings(self, **changes: Mapping[str, object]) -> Settings:
+        """Return the settings of the manifest with changes by group."""
+        given = self.manifest.settings
+        compact, encode, finetune = ({**given.get(name, {}), **changes.get(name, {})} for name in GROUPS)
+        return Settings.research(self.manifest.preset, compact=compact, finetune=finetune, **encode)
+
+    def key(self, *parts: BaseModel | str) -> str:
+        """Return what stands for the scene, its views, and settings or texts."""
+        texts = [part.model_dump_json() if isinstance(part, BaseModel) else part for part in parts]
+        captures = self.scene.capture, self.scene.training_capture
+        views = [path and digest_of_views(path) for path in captures]
+        return digest(json.dumps([digest_of_file(self.checkpoint.scene), *views, *texts]).encode())
+
+    def file(self, series: str, ending: str, make: Callable[[Path], Times], *parts: BaseModel | str) -> Job:
+        """Return a job for a file, which ``make`` writes and which depends on the parts, unless it exists."""
+        key = self.key(*parts)  # equal for equal files, whatever the series
+        path = Path(self.given.output, self.dataset, self.name, self.tier, f"{key}{ending}")
+        return Job(series, key, partial(stored, path, make))
+
+    def small_file(self) -> Path:
+        """Return the scene that is encoded, compacted now unless it has been."""
+        if not self.checkpoint.budget:
+            return self.checkpoint.scene
+        job = compaction(self)
+        job.make()
+        return Path(self.given.output, self.dataset, self.name, self.tier, f"{job.key}.ply")
+
+
+def stored(path: Path, make: Callable[[Path], Times]) -> Made:
+    """Return what is in a file; ``make`` writes it unless an earlier run has. Its times are in a file beside it."""
+    times = path.with_name(f"{path.name}.json")
+    if not times.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        found = make(path)
+        with atomic_file(times) as file:
+            file.write(json.dumps(found).encode())
+    stages, cpu_seconds = json.loads(times.read_bytes())
+    return Made(kissgs.load(path, raw_axes=True), path.stat().st_size, (stages, cpu_seconds))
+
+
+def digest(data: bytes) -> str:
+    """Return a short hash."""
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+@cache
+def digest_of_file(path: Path) -> str:
+    """Return the hash of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+views_of = cache(kissgs.load_views)
+
+
+@cache
+def digest_of_views(path: Path) -> str:
+    """Return the hash of all cameras of a capture, and of the sizes of its photographs."""
+    found = list[bytes]()
+    for view in views_of(path).all:
+        size = 0 if view.photo is None else view.photo.stat().st_size
+        found += [f"{view.name} {size}".encode(), view.camera.viewmat.tobytes(), view.camera.K.tobytes()]
+    return digest(b"\n".join(found))
+
+
+def works(manifest: Manifest, given: argparse.Namespace) -> Iterator[Work]:
+    """Return the works of a manifest that are wanted; those whose files are missing are named."""
+    for dataset, scenes in manifest.datasets.items():
+        for name, scene in scenes.items():
+            checkpoints = {} if scene.reference is None else {REFERENCE: Checkpoint(scene=scene.reference)}
+            for tier, checkpoint in (checkpoints | scene.checkpoints).items():
+                work = Work(dataset, name, tier, scene, checkpoint, manifest, given)
+                needed = checkpoint.scene, scene.capture, scene.training_capture or scene.capture
+                missing = [path for path in needed if not path.exists()]
+                wanted = name in (given.scenes or [name]) and tier in (REFERENCE, *(given.tiers or [tier]))
+                if wanted and missing:
+                    sys.stderr.write(f"{work} is skipped: there is no {missing[0]}\n")
+                elif wanted:
+                    yield work
+
+
+# Rate and distortion: the checkpoint compacted, encoded, fine-tuned, and in other formats.
+
+
+def rate_distortion(work: Work) -> Iterator[Job]:
+    """Return the points of one tier; of the reference as it is and encoded."""
+    yield compaction(work)
+    if work.tier == REFERENCE:
+        yield encoding(work, "inria-sogxt")
+        return
+    yield encoding(work, "popspa-sogxt")
+    yield encoding(work, "popspa-sogxt-ft", finetune={"enabled": True})
+    if work.given.splat_transform:
+        yield converted(work, "sog")
+    else:
+        yield encoding(work, "popspa-sog", ".sog")
+    yield converted(work, "spz")
+
+
+def compaction(work: Work) -> Job:
+    """Return the job of the ``.ply`` that is encoded."""
+    source = work.checkpoint.scene
+    if not work.checkpoint.budget:
+        series = BASE if work.tier == REFERENCE else "popspa-ply"
+        return Job(series, work.key(), lambda: Made(work.original, source.stat().st_size))
+    settings = work.settings(compact=work.checkpoint.budget)
+
+    def make(path: Path) -> Times:
+        report = kissgs.compact(source, path, settings=settings, **training_of(work, path)).report
+        stages = defaultdict[str, float](float)
+        for step in report.steps:
+            stages[step.name] += step.seconds
+        return stages, report.cpu_seconds
+
+    return work.file("popspa-ply", ".ply", make, settings.compact)
+
+
+def training_of(work: Work, path: Path) -> dict[str, Any]:
+    """Return the arguments of a compaction or compression into a file that have nothing to do with its settings."""
+    checkpoint = path.with_suffix(".checkpoint")
+    return {"views": work.training, "checkpoint": checkpoint, "overwrite": True, "device": work.given.device}
+
+
+def encoding(work: Work, series: str, ending: str = ".zip", **changes: Mapping[str, object]) -> Job:
+    """Return the job of a container, with changes of settings by group."""
+    settings = work.settings(**changes)
+    used = [settings.encode, *([settings.finetune] if settings.finetune.enabled else [])]
+
+    def make(path: Path) -> Times:
+        report = kissgs.compress(work.small_file(), path, settings=settings, **training_of(work, path)).report
+        return report.seconds, report.cpu_seconds
+
+    return work.file(series, ending, make, compaction(work).key, ending, *used)
+
+
+def converted(work: Work, ending: str) -> Job:
+    """Return the job of a ``.sog`` or ``.spz``, by splat-transform if it is given."""
+    tool = work.given.splat_transform
+
+    def make(path: Path) -> Times:
+        if tool:
+            wall, cpu, _ = convert(shlex.split(tool), work.small_file(), path, [])
+            return {"convert": wall}, cpu
+        scene = kissgs.load(work.small_file())
+        return timed("convert", lambda: kissgs.save(scene, path, raw_axes=True, overwrite=True))
+
+    return work.file(f"popspa-{ending}", f".{ending}", make, compaction(work).key, ending, tool)
+
+
+def timed(stage: str, make: Callable[[], object]) -> Times:
+    """Call a function; return its times."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    make()
+    return {stage: time.perf_counter() - wall}, time.process_time() - cpu
+
+
+# The other studies.
+
+
+def ablation(work: Work) -> Iterator[Job]:
+    """Return the containers of preset ``paper`` with one part left out, which no decoder reads."""
+    settings, before = work.settings().encode, compaction(work).key
+    if settings.rate_distortion:
+        raise UnsupportedError(f"the ablation leaves out parts of preset paper, not of {work.manifest.preset}")
+    whole = cache(lambda: encode_parts(kissgs.load(work.small_file()), settings, 0))
+
+    def make(leave_out: LeaveOut | None) -> Made:
+        parts = whole() if leave_out is None else leave_out(whole(), settings, 0)
+        return Made(parts.decoded, parts.size(settings, 0))
+
+    for name, (leave_out, _, _) in PARTS.items():
+        yield Job(f"without: {name}", work.key(before, settings, name), partial(make, leave_out))
+
+
+def strategies(work: Work) -> Iterator[Job]:
+    """Return the scene with as many Gaussians by strategies of compaction."""
+    settings = work.settings(compact=work.checkpoint.budget).compact
+
+    def make(name: str, path: Path) -> Times:
+        scene = work.original
+        count = min(settings.count or max(1, round(len(scene) * (settings.ratio or 1))), len(scene))
+        context = Context(device=work.given.device)
+
+        def write_scene() -> None:
+            kissgs.save(compacted(scene, count, name, settings, work.training, context), path, overwrite=True)
+
+        return timed("compact", write_scene)
+
+    for name in work.given.strategies if work.checkpoint.budget else ():
+        yield work.file(f"compaction: {name}", ".ply", partial(make, name), settings, name)
+
+
+def sensitivity(work: Work) -> Iterator[Job]:
+    """Return fine-tuned containers with other settings of fine-tuning and of what it trains."""
+    usual = work.settings()
+    entries, steps = usual.encode.gaussians_per_codebook_entry, usual.finetune.steps
+    variants: dict[str, dict[str, dict[str, object]]] = {
+        "as it is": {},
+        "codebook twice as large": {"encode": {"gaussians_per_codebook_entry": max(entries / 2, 1)}},
+        "codebook half as large": {"encode": {"gaussians_per_codebook_entry": entries * 2}},
+        "256 levels of rotations": {"encode": {"quat_levels": 256}},
+        "PRAS before only": {"finetune": {"pras_at": []}},
+        "no total variation": {"finetune": {"tv_weight": 0}},
+        "total variation x 10": {"finetune": {"tv_weight": 10 * usual.finetune.tv_weight}},
+        "half the steps": {"finetune": {"steps": max(steps // 2, 1)}},
+        "twice the steps": {"finetune": {"steps": 2 * steps}},
+    }
+    for name, changes in variants.items():
+        finetune = {"enabled": True, **changes.get("finetune", {})}
+        yield encoding(work, f"fine-tuning: {name}", finetune=finetune, encode=changes.get("encode", {}))
+
+
+STUDIES = {"rd": rate_distortion, "ablation": ablation, "compaction": strategies, "sensitivity": sensitivity}
+
+
+def points_of(manifest: Manifest, given: argparse.Namespace) -> list[Point]:
+    """Return all wanted points, those that are missing made now; what fails is said, and the others are made."""
+    table, found = given.output / "points.csv", list[Point]()
+    known = {point.place: point for point in read_points(table)} if table.exists() else {}
+    for work in works(manifest, given):
+        for study in given.studies if work.tier != REFERENCE else ("rd",):
+            try:
+                for job in STUDIES[study](work):
+                    point = known.get((job.series, work.dataset, work.name, work.tier))
+                    if point is None or point.key != job.key or (given.lpips and point.lpips is None):
+                        point = measured(work, job)
+                        append_point(table, point)
+                        sys.stderr.write(f"{work}, {job.series}: {point.bytes:,.0f} bytes, {point.psnr:.2f} dB\n")
+                    found.append(point)
+            except (KissgsError, OSError) as error:
+                sys.stderr.write(f"{work}, {study}: {error}\n")
+    return found
+
+
+def measured(work: Work, job: Job) -> Point:
+    """Make a file, and compare what it shows with the held-out photographs."""
+    made = job.make()
+    given, (stages, cpu_seconds) = work.given, made.times
+    options = {"reference_images": work.images, "lpips": given.lpips}
+    views, context = work.views, Context(device=given.device)
+    found = compare_images(work.original, made.splats, views, context, **options).mean.candidate
+    return Point(
+        series=job.series,
+        dataset=work.dataset,
+        scene=work.name,
+        tier=work.tier,
+        bytes=made.bytes,
+        psnr=found.psnr,
+        ssim=found.ssim,
+        lpips=found.lpips,
+        seconds=sum(stages.values()),
+        cpu_seconds=cpu_seconds,
+        stages=" ".join(f"{name}={seconds:.2f}" for name, seconds in stages.items()),
+        key=job.key,
+    )
+
+
+# Tables and plots.
+
+TITLES = {"without": "Parts left out of the codec", "fine-tuning": "Settings of fine-tuning"}
+
+
+def tables(found: Sequence[Point], published: Sequence[Point]) -> str:
+    """Return all tables that these means over scenes fill, in Markdown."""
+    curves = [point for point in found if ": " not in point.series]
+    head = ["data set", "tier", "series", *QUALITY, "seconds", "CPU s"]
+    sections = {
+        "Means over scenes": markdown(head, [[p.dataset, p.tier, p.series, *cells(p), *seconds(p)] for p in curves]),
+        "Times smaller than the reference at its quality": reductions(curves, published),
+        "Compaction": compaction_table(found),
+        **{title: changes(found, f"{prefix}: ") for prefix, title in TITLES.items()},
+    }
+    return "\n".join(f"## {title}\n\n{text}" for title, text in sections.items() if text)
+
+
+QUALITY = "bytes", *METRICS.values()
+
+
+def cells(point: Point) -> list[object]:
+    """Return bytes and quality as text."""
+    values = zip((point.psnr, point.ssim, point.lpips), (2, 4, 4), strict=True)
+    return [round(point.bytes), *("" if value is None else f"{value:.{digits}f}" for value, digits in values)]
+
+
+def seconds(point: Point) -> list[str]:
+    """Return wall and processor seconds as text."""
+    return ["" if value is None else f"{value:.1f}" for value in (point.seconds, point.cpu_seconds)]
+
+
+def reductions(found: Sequence[Point], published: Sequence[Point]) -> str:
+    """Return the reduction factors of all series; * is a lower bound, and - a quality that is never reached."""
+    both = [points for points in (found, published) if points]
+
+    def factors(points: Sequence[Point], dataset: str, series: str) -> list[str]:
+        reference, curve = ([p for p in points if p.place == (name, dataset, MEAN, p.tier)] for name in (BASE, series))
+        return [reduction(reference[0], curve, metric) if reference and curve else "" for metric in METRICS]
+
+    names = dict.fromkeys((p.dataset, p.series) for points in both for p in points if p.series != BASE)
+    rows = [[*name, *(cell for points in both for cell in factors(points, *name))] for name in names]
+    head = [*METRICS.values(), *(f"published {name}" for name in METRICS.values() if len(both) == 2)]
+    return markdown(["data set", "series", *head], [row for row in rows if any(row[2:])])
+
+
+def changes(found: Sequence[Point], prefix: str) -> str:
+    """Return the changes of bytes and quality from the first series of this prefix, with those that are published."""
+    rows, first = list[list[object]](), dict[tuple[str, str], Point]()
+    for point in (point for point in found if point.series.startswith(prefix)):
+        name, place = point.series.removeprefix(prefix), (point.dataset, point.tier)
+        base = first.setdefault(place, point)
+        if base is point:
+            rows.append([*place, name, *cells(point), "", *[""] * 2])
+            continue
+        pairs = [(getattr(point, metric), getattr(base, metric)) for metric in METRICS]
+        moved = [None if None in pair else pair[0] - pair[1] for pair in pairs]
+        _, more, psnr = PARTS.get(name, (None, None, None))
+        paper = percent(None if more is None else more / PUBLISHED_BYTES), signed(psnr, 4)
+        rows.append([*place, name, percent(point.bytes / base.bytes - 1), *(signed(each, 4) for each in moved), *paper])
+    return markdown(["data set", "tier", prefix.strip(": "), *QUALITY, "published: bytes", "PSNR"], rows)
+
+
+def compaction_table(found: Sequence[Point]) -> str:
+    """Return the strategies of compaction with their ranks, last the means of these over data sets and tiers."""
+    groups = defaultdict[tuple[str, str], dict[str, Point]](dict)
+    for point in found:
+        if point.series.startswith("compaction: "):
+            groups[point.dataset, point.tier][point.series.removeprefix("compaction: ")] = point
+    rows, every = list[list[object]](), defaultdict[str, list[float]](list)
+    for place, group in groups.items():
+        for name, rank in ranks(group).items():
+            rows.append([*place, name, *cells(group[name]), f"{rank:.2f}", *seconds(group[name])])
+            every[name].append(rank)
+    rows += [["all", "", name, *[""] * 4, f"{sum(each) / len(each):.2f}", "", ""] for name, each in every.items()]
+    return markdown(["data set", "tier", "strategy", *QUALITY, "rank", "seconds", "CPU s"], rows)
+
+
+def plot(path: Path, found: Sequence[Point], published: Sequence[Point]) -> None:
+    """Draw the curves of one data set, published ones dashed."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 5), layout="constrained")
+    names = list(dict.fromkeys(point.series for point in (*found, *published)))
+    for axes, (metric, label) in zip(figure.subplots(1, 3), METRICS.items(), strict=True):
+        for number, series in enumerate(names):
+            for points, form in ((found, "o-"), (published, "o--")):
+                curve = sorted((p.bytes / 1e6, getattr(p, metric)) for p in points if p.series == series)
+                name = series if points is found else f"{series}, published"
+                axes.plot(*zip(*curve, strict=True), form, color=f"C{number}", label=name) if curve else None
+        axes.set(xscale="log", xlabel="megabytes", ylabel=label)
+        axes.grid(alpha=0.3)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")
+    figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+    """Make the points of a manifest, and print and draw what they show."""
+    parser = parser_of(__doc__)
+    parser.add_argument("manifest", nargs="?", type=Path)
+    parser.add_argument("-o", "--output", type=Path, default=Path("paper-results"), help="folder for all files")
+    parser.add_argument("--published", type=Path, metavar="CSV", help="points to compare with, such as another run's")
+    parser.add_argument("--studies", nargs="+", default=["rd"], choices=list(STUDIES), help="default: rd")
+    parser.add_argument("--strategies", nargs="+", default=OF_PAPER, choices=list(STRATEGIES), help="of compaction")
+    parser.add_argument("--scenes", nargs="+", help="only these")
+    parser.add_argument("--tiers", nargs="+", help="only these")
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--lpips", action="store_true", help="also measure LPIPS")
+    parser.add_argument("--splat-transform", default="", help="command that writes .sog and .spz; default: kissgs does")
+    given = parser.parse_args()
+    if given.manifest is None and given.published is None:
+        parser.error("give a manifest, or published points")
+    published = [] if given.published is None else read_points(given.published)
+    if given.manifest is None:
+        write(reductions([], means(published)))
+        return
+    given.output.mkdir(parents=True, exist_ok=True)
+    points = points_of(read_manifest(given.manifest), given)
+    scenes = {(point.dataset, point.scene) for point in points}
+    found, theirs = means(points), means([p for p in published if (p.dataset, p.scene) in scenes])
+    text = tables(found, theirs)
+    write(text)
+    (given.output / "tables.md").write_text(text, encoding="utf-8")
+    if find_spec("matplotlib") is None:
+        sys.stderr.write("no plots without matplotlib, which is missing: pip install 'kissgs[bench]'\n")
+        return
+    for dataset in dict.fromkeys(point.dataset for point in found):
+        ours = [point for point in found if point.dataset == dataset and ": " not in point.series]
+        if ours:
+            plot(given.output / f"{dataset}.png", ours, [point for point in theirs if point.dataset == dataset])
+
+
+if __name__ == "__main__":
+    run(main)
