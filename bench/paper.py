@@ -9,7 +9,7 @@ The manifest names scenes by data set; its paths are relative to it:
       MipNeRF360:
         bicycle:
           capture: 360_v2/bicycle                # held-out photographs evaluate, at most 1600 pixels long
-          training: 360_v2/bicycle/images_4      # default: the capture; "renderings": those of the scene
+          training: 360_v2/bicycle/images_4      # default: the capture
           reference: inria/bicycle.ply           # has the quality at which bytes are compared
           checkpoints:
             L: {scene: mcmc/bicycle.ply, count: 256000}    # compacted to a count or a ratio
@@ -25,16 +25,17 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
 import shlex
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, ValidationInfo
@@ -44,11 +45,13 @@ from bench.common import markdown, parser_of, percent, run, signed, write
 from bench.curves import MEAN, METRICS, Point, append_point, means, ranks, read_points, reduction
 from bench.external import convert
 from bench.paper_parts import PARTS, PUBLISHED_BYTES, LeaveOut, encode_parts
-from bench.strategies import OF_PAPER, STRATEGIES, compacted
 from kissgs import KissgsError, Preset, Settings, Splats, UnsupportedError, Views
+from kissgs.compaction.merging import merge_gaussians
+from kissgs.compaction.popspa import Popspa
 from kissgs.core.context import Context
 from kissgs.evaluation.evaluate import compare_images, in_scene_frame
 from kissgs.io.files import atomic_file
+from kissgs.training.supervision import SCORING_STRIDE, supervision_views, training_targets
 
 REFERENCE, BASE = "reference", "inria-ply"
 """Tier and series of the scene that has the quality at which bytes are compared."""
@@ -84,18 +87,9 @@ class Scene(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     capture: ManifestPath
-    training: Literal["renderings"] | ManifestPath | None = None
+    training: ManifestPath | None = None
     reference: ManifestPath | None = None
     checkpoints: dict[str, Checkpoint] = {}
-
-    @property
-    def training_capture(self) -> Path | None:
-        """Capture to train on; None for renderings of the scene."""
-        return None if self.training == "renderings" else Path(self.training or self.capture)
-
-
-Group = Literal["compact", "encode", "finetune"]
-GROUPS: tuple[Group, ...] = get_args(Group)
 
 
 class Manifest(BaseModel):
@@ -105,7 +99,7 @@ class Manifest(BaseModel):
 
     datasets: dict[str, dict[str, Scene]]
     preset: Preset = Preset.PAPER
-    settings: dict[Group, dict[str, Any]] = {}
+    settings: dict[Literal["compact", "encode", "finetune"], dict[str, Any]] = {}
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -126,17 +120,17 @@ def read_manifest(path: Path) -> Manifest:
 
 # A scene with the number of Gaussians of one tier, and the files that are made of it.
 
-Times = tuple[Mapping[str, float], float]
-"""Wall seconds by stage, and processor seconds of all threads."""
+Make = Callable[[Path, Path], Mapping[str, float] | None]
+"""Writes a file, the second, from another; returns the seconds of the stages of that, if it has any."""
 
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What a decoder gets, the bytes that it gets it from, and the times of making them."""
+    """What a decoder gets, the bytes that it gets it from, and columns of a point about how it was made."""
 
     splats: Splats
     bytes: int
-    times: Times = ({}, 0.0)
+    times: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +153,7 @@ class Work:
     checkpoint: Checkpoint
     manifest: Manifest
     given: argparse.Namespace
+    images: dict[int, Any] = field(default_factory=dict)  # renderings of the original that evaluations have made
 
     def __str__(self) -> str:
         return f"{self.dataset}/{self.name} {self.tier}"
@@ -174,54 +169,53 @@ class Work:
         return in_scene_frame(self.original, views_of(self.scene.capture))
 
     @cached_property
-    def training(self) -> Views | None:
-        """Views to train on; None for renderings of the scene."""
-        path = self.scene.training_capture
-        return None if path is None else in_scene_frame(self.original, views_of(path))
-
-    @cached_property
-    def images(self) -> dict[int, Any]:
-        """Renderings of the scene by number of the view, filled by evaluations."""
-        return {}
+    def training(self) -> Views:
+        """Views to train on."""
+        return in_scene_frame(self.original, views_of(self.scene.training or self.scene.capture))
 
     def settings(self, **changes: Mapping[str, object]) -> Settings:
         """Return the settings of the manifest with changes by group."""
         given = self.manifest.settings
-        compact, encode, finetune = ({**given.get(name, {}), **changes.get(name, {})} for name in GROUPS)
+        compact = {**given.get("compact", {}), **changes.get("compact", {})}
+        finetune = {**given.get("finetune", {}), **changes.get("finetune", {})}
+        encode = {**given.get("encode", {}), **changes.get("encode", {})}
         return Settings.research(self.manifest.preset, compact=compact, finetune=finetune, **encode)
 
     def key(self, *parts: BaseModel | str) -> str:
         """Return what stands for the scene, its views, and settings or texts."""
         texts = [part.model_dump_json() if isinstance(part, BaseModel) else part for part in parts]
-        captures = self.scene.capture, self.scene.training_capture
-        views = [path and digest_of_views(path) for path in captures]
+        views = [digest_of_views(path) for path in (self.scene.capture, self.scene.training or self.scene.capture)]
         return digest(json.dumps([digest_of_file(self.checkpoint.scene), *views, *texts]).encode())
 
-    def file(self, series: str, ending: str, make: Callable[[Path], Times], *parts: BaseModel | str) -> Job:
-        """Return a job for a file, which ``make`` writes and which depends on the parts, unless it exists."""
-        key = self.key(*parts)  # equal for equal files, whatever the series
-        path = Path(self.given.output, self.dataset, self.name, self.tier, f"{key}{ending}")
-        return Job(series, key, partial(stored, path, make))
+    def path(self, key: str, ending: str) -> Path:
+        """Return the file of a job: files of equal keys are equal, whatever their series."""
+        return Path(self.given.output, self.dataset, self.name, self.tier, f"{key}{ending}")
 
-    def small_file(self) -> Path:
-        """Return the scene that is encoded, compacted now unless it has been."""
-        if not self.checkpoint.budget:
-            return self.checkpoint.scene
+    def file(self, series: str, ending: str, make: Make, *parts: BaseModel | str, small: bool = True) -> Job:
+        """Return a job for a file that depends on the parts, made of the compacted scene or of the one before."""
+        key = self.key(*([compaction(self).key] if small else []), *parts)
+        source = self.compacted if small else lambda: self.checkpoint.scene
+        return Job(series, key, lambda: stored(self.path(key, ending), make, source))
+
+    def compacted(self) -> Path:
+        """Return the compacted scene, which is made now unless it exists."""
         job = compaction(self)
         job.make()
-        return Path(self.given.output, self.dataset, self.name, self.tier, f"{job.key}.ply")
+        return self.path(job.key, ".ply") if self.checkpoint.budget else self.checkpoint.scene
 
 
-def stored(path: Path, make: Callable[[Path], Times]) -> Made:
+def stored(path: Path, make: Make, source: Callable[[], Path]) -> Made:
     """Return what is in a file; ``make`` writes it unless an earlier run has. Its times are in a file beside it."""
     times = path.with_name(f"{path.name}.json")
     if not times.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
-        found = make(path)
+        scene = source()
+        wall, cpu = time.perf_counter(), sum(os.times()[:4])
+        stages = " ".join(f"{name}={seconds:.2f}" for name, seconds in (make(scene, path) or {}).items())
+        wall, cpu = time.perf_counter() - wall, sum(os.times()[:4]) - cpu
         with atomic_file(times) as file:
-            file.write(json.dumps(found).encode())
-    stages, cpu_seconds = json.loads(times.read_bytes())
-    return Made(kissgs.load(path, raw_axes=True), path.stat().st_size, (stages, cpu_seconds))
+            file.write(json.dumps({"seconds": wall, "cpu_seconds": cpu, "stages": stages}).encode())
+    return Made(kissgs.load(path, raw_axes=True), path.stat().st_size, json.loads(times.read_bytes()))
 
 
 def digest(data: bytes) -> str:
@@ -256,7 +250,7 @@ def works(manifest: Manifest, given: argparse.Namespace) -> Iterator[Work]:
             checkpoints = {} if scene.reference is None else {REFERENCE: Checkpoint(scene=scene.reference)}
             for tier, checkpoint in (checkpoints | scene.checkpoints).items():
                 work = Work(dataset, name, tier, scene, checkpoint, manifest, given)
-                needed = checkpoint.scene, scene.capture, scene.training_capture or scene.capture
+                needed = checkpoint.scene, scene.capture, scene.training or scene.capture
                 missing = [path for path in needed if not path.exists()]
                 wanted = name in (given.scenes or [name]) and tier in (REFERENCE, *(given.tiers or [tier]))
                 if wanted and missing:
@@ -291,14 +285,14 @@ def compaction(work: Work) -> Job:
         return Job(series, work.key(), lambda: Made(work.original, source.stat().st_size))
     settings = work.settings(compact=work.checkpoint.budget)
 
-    def make(path: Path) -> Times:
+    def make(source: Path, path: Path) -> Mapping[str, float]:
         report = kissgs.compact(source, path, settings=settings, **training_of(work, path)).report
         stages = defaultdict[str, float](float)
         for step in report.steps:
             stages[step.name] += step.seconds
-        return stages, report.cpu_seconds
+        return stages
 
-    return work.file("popspa-ply", ".ply", make, settings.compact)
+    return work.file("popspa-ply", ".ply", make, settings.compact, small=False)
 
 
 def training_of(work: Work, path: Path) -> dict[str, Any]:
@@ -312,32 +306,23 @@ def encoding(work: Work, series: str, ending: str = ".zip", **changes: Mapping[s
     settings = work.settings(**changes)
     used = [settings.encode, *([settings.finetune] if settings.finetune.enabled else [])]
 
-    def make(path: Path) -> Times:
-        report = kissgs.compress(work.small_file(), path, settings=settings, **training_of(work, path)).report
-        return report.seconds, report.cpu_seconds
+    def make(source: Path, path: Path) -> Mapping[str, float]:
+        return kissgs.compress(source, path, settings=settings, **training_of(work, path)).report.seconds
 
-    return work.file(series, ending, make, compaction(work).key, ending, *used)
+    return work.file(series, ending, make, ending, *used)
 
 
 def converted(work: Work, ending: str) -> Job:
     """Return the job of a ``.sog`` or ``.spz``, by splat-transform if it is given."""
     tool = work.given.splat_transform
 
-    def make(path: Path) -> Times:
+    def make(source: Path, path: Path) -> None:
         if tool:
-            wall, cpu, _ = convert(shlex.split(tool), work.small_file(), path, [])
-            return {"convert": wall}, cpu
-        scene = kissgs.load(work.small_file())
-        return timed("convert", lambda: kissgs.save(scene, path, raw_axes=True, overwrite=True))
+            convert(shlex.split(tool), source, path, [])
+        else:
+            kissgs.save(kissgs.load(source), path, raw_axes=True, overwrite=True)
 
-    return work.file(f"popspa-{ending}", f".{ending}", make, compaction(work).key, ending, tool)
-
-
-def timed(stage: str, make: Callable[[], object]) -> Times:
-    """Call a function; return its times."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    make()
-    return {stage: time.perf_counter() - wall}, time.process_time() - cpu
+    return work.file(f"popspa-{ending}", f".{ending}", make, ending, tool)
 
 
 # The other studies.
@@ -348,7 +333,7 @@ def ablation(work: Work) -> Iterator[Job]:
     settings, before = work.settings().encode, compaction(work).key
     if settings.rate_distortion:
         raise UnsupportedError(f"the ablation leaves out parts of preset paper, not of {work.manifest.preset}")
-    whole = cache(lambda: encode_parts(kissgs.load(work.small_file()), settings, 0))
+    whole = cache(lambda: encode_parts(kissgs.load(work.compacted()), settings, 0))
 
     def make(leave_out: LeaveOut | None) -> Made:
         parts = whole() if leave_out is None else leave_out(whole(), settings, 0)
@@ -358,22 +343,44 @@ def ablation(work: Work) -> Iterator[Job]:
         yield Job(f"without: {name}", work.key(before, settings, name), partial(make, leave_out))
 
 
+AT_ONCE, IN_ROUNDS = {"min_keep_per_scoring": 0.0}, {"min_keep_per_scoring": 0.8}
+ALONE = {"admm_rho": 0.0, "erank_weight": 0.0, "min_scale_weight": 0.0, "prune_rounds": 1}
+ADMM, ERANK = {"admm_rho": 5e-4}, {"erank_weight": 0.01, "min_scale_weight": 1.0}
+"""Weights in the published code of GaussianSpa and of the effective-rank loss."""
+
+OF_PAPER = "POP + train + POP + refine", "POP + sparsify + POP + refine", "POPSpa"
+STRATEGIES: dict[str, tuple[str, dict[str, Any]]] = {
+    "POP": ("untrained", AT_ONCE),
+    "POP in rounds": ("untrained", IN_ROUNDS),
+    "merge": ("untrained", {}),
+    "POP + refine": ("refined", AT_ONCE),
+    "POP in rounds + refine": ("refined", IN_ROUNDS),
+    "merge + refine": ("refined", {}),
+    OF_PAPER[0]: ("trained", {**AT_ONCE, **ALONE}),
+    OF_PAPER[1]: ("trained", {**AT_ONCE, **ALONE, **ADMM}),
+    OF_PAPER[2]: ("trained", {**AT_ONCE, **ALONE, **ADMM, **ERANK}),
+    "prunings along the way": ("trained", {**IN_ROUNDS, **ALONE, "prune_rounds": 5}),
+}
+"""When the Gaussians that are left are trained, for as many steps in total, and settings of compaction."""
+
+
 def strategies(work: Work) -> Iterator[Job]:
     """Return the scene with as many Gaussians by strategies of compaction."""
     settings = work.settings(compact=work.checkpoint.budget).compact
 
-    def make(name: str, path: Path) -> Times:
-        scene = work.original
+    def make(name: str, _: Path, path: Path) -> None:
+        (when, changes), scene, context = STRATEGIES[name], work.original, Context(device=work.given.device)
         count = min(settings.count or max(1, round(len(scene) * (settings.ratio or 1))), len(scene))
-        context = Context(device=work.given.device)
-
-        def write_scene() -> None:
-            kissgs.save(compacted(scene, count, name, settings, work.training, context), path, overwrite=True)
-
-        return timed("compact", write_scene)
+        steps = {"sparsify_steps": 0, "refine_steps": settings.steps if when == "refined" else 0}
+        own = settings.model_copy(update={**({} if when == "trained" else steps), **changes})
+        stride = SCORING_STRIDE if settings.trains else 1
+        supervised = supervision_views(scene, work.training, settings, context, scoring_stride=stride)
+        targets = training_targets(scene, supervised, context) if own.trains else None
+        reduced = merge_gaussians(scene, count, context)[0] if name.startswith("merge") else scene
+        kissgs.save(Popspa(reduced, own, supervised, context, targets)(count).splats, path, overwrite=True)
 
     for name in work.given.strategies if work.checkpoint.budget else ():
-        yield work.file(f"compaction: {name}", ".ply", partial(make, name), settings, name)
+        yield work.file(f"compaction: {name}", ".ply", partial(make, name), settings, name, small=False)
 
 
 def sensitivity(work: Work) -> Iterator[Job]:
@@ -420,25 +427,14 @@ def points_of(manifest: Manifest, given: argparse.Namespace) -> list[Point]:
 
 def measured(work: Work, job: Job) -> Point:
     """Make a file, and compare what it shows with the held-out photographs."""
-    made = job.make()
-    given, (stages, cpu_seconds) = work.given, made.times
-    options = {"reference_images": work.images, "lpips": given.lpips}
-    views, context = work.views, Context(device=given.device)
-    found = compare_images(work.original, made.splats, views, context, **options).mean.candidate
-    return Point(
-        series=job.series,
-        dataset=work.dataset,
-        scene=work.name,
-        tier=work.tier,
-        bytes=made.bytes,
-        psnr=found.psnr,
-        ssim=found.ssim,
-        lpips=found.lpips,
-        seconds=sum(stages.values()),
-        cpu_seconds=cpu_seconds,
-        stages=" ".join(f"{name}={seconds:.2f}" for name, seconds in stages.items()),
-        key=job.key,
+    made, context, lpips = job.make(), Context(device=work.given.device), work.given.lpips
+    compared = compare_images(
+        work.original, made.splats, work.views, context, reference_images=work.images, lpips=lpips
     )
+    found = compared.mean.candidate
+    quality = {"bytes": made.bytes, "psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips, **made.times}
+    place = {"series": job.series, "dataset": work.dataset, "scene": work.name, "tier": work.tier}
+    return Point(**place, **quality, key=job.key)
 
 
 # Tables and plots.

@@ -1,6 +1,6 @@
 """Costs of the service beyond the compression itself, measured on one that is started and stopped.
 
-python bench/service.py scene.ply
+python bench/service.py
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -19,25 +18,21 @@ from pathlib import Path
 import httpx
 
 from bench.common import parser_of, run, write
-from kissgs import KissgsError, Preset, Remote, Settings, load, sample_scene, save
+from kissgs import KissgsError, sample_scene, save
 
 UPLOAD_BYTES = 500_000_000
 POLLS = 600
-REPEATS = 5
 
 
 def main() -> None:
-    """Measure the time of status requests, memory during uploads, and ``fast`` jobs beside ``kissgs compress``."""
+    """Measure the time of status requests, and memory during uploads."""
     parser = parser_of(__doc__)
-    parser.add_argument("scene", type=Path)
-    scene = parser.parse_args().scene
-    load(scene)  # refuses what is no scene
+    parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with service(folder / "data") as (url, pid), httpx.Client(base_url=url, trust_env=False) as http:
             latency(http, folder)
             upload_memory(pid, http, folder)
-            overhead(url, scene, folder)
 
 
 def latency(http: httpx.Client, folder: Path) -> None:
@@ -83,26 +78,6 @@ def peak_memory(pid: int) -> int:
     """Return the largest resident set of a process of Linux, bytes."""
     text = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
     return int(text.partition("VmHWM:")[2].split()[0]) << 10
-
-
-def overhead(url: str, scene: Path, folder: Path) -> None:
-    """Print the seconds of ``fast`` jobs beside those of the command, which also starts Python."""
-    here, there, uploads, target = [], [], [], folder / "out.zip"
-    command = [sys.executable, "-c", "from kissgs.cli.main import main; main()", "compress", str(scene), "-p", "fast"]
-    with Remote(url) as remote:
-        for repeat in range(REPEATS + 1):
-            begun = time.perf_counter()
-            subprocess.run([*command, "-q", "-f", "-o", str(target)], check=True)
-            middle = time.perf_counter()
-            job = remote.submit(scene, settings=Settings(preset=Preset.FAST))
-            uploaded = time.perf_counter()
-            remote.download(remote.follow(job["id"]), target, overwrite=True)
-            if repeat:  # the first warms the caches of both
-                here.append(middle - begun)
-                uploads.append(uploaded - middle)
-                there.append(time.perf_counter() - uploaded)
-    command_s, upload_s, job_s = map(statistics.median, (here, uploads, there))
-    write(f"{scene.name}: kissgs compress {command_s:.2f} s, the job {job_s:.2f} s after {upload_s:.2f} s of upload")
 
 
 @contextlib.contextmanager
