@@ -78,9 +78,11 @@ def row(*cells: object) -> None:
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a table; empty if it has no rows."""
-    lines = [_line(head), "|" + "---|" * len(head), *map(_line, rows)]
-    return "\n".join([*lines, ""]) if rows else ""
+    """Return a table without its empty columns; empty if it has no rows."""
+    kept = [number for number in range(len(head)) if any(row[number] != "" for row in rows)]
+    lines = [[cells[number] for number in kept] for cells in (head, *rows)]
+    lines.insert(1, ["---"] * len(kept))
+    return "".join(f"{_line(cells)}\n" for cells in lines) if rows else ""
 
 
 def _line(cells: Sequence[object]) -> str:

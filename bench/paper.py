@@ -439,34 +439,49 @@ def measured(work: Work, job: Job) -> Point:
 
 # Tables and plots.
 
-TITLES = {"without": "Parts left out of the codec", "fine-tuning": "Settings of fine-tuning"}
+TITLES = {
+    "": "Means over scenes",
+    "without": "Parts left out of the codec",
+    "compaction": "Strategies of compaction",
+    "fine-tuning": "Settings of fine-tuning",
+}
+"""By the beginning of a series, up to a colon."""
 
 
 def tables(found: Sequence[Point], published: Sequence[Point]) -> str:
     """Return all tables that these means over scenes fill, in Markdown."""
-    curves = [point for point in found if ": " not in point.series]
-    head = ["data set", "tier", "series", *QUALITY, "seconds", "CPU s"]
-    sections = {
-        "Means over scenes": markdown(head, [[p.dataset, p.tier, p.series, *cells(p), *seconds(p)] for p in curves]),
-        "Times smaller than the reference at its quality": reductions(curves, published),
-        "Compaction": compaction_table(found),
-        **{title: changes(found, f"{prefix}: ") for prefix, title in TITLES.items()},
-    }
+    sections = {title: study_table(found, study) for study, title in TITLES.items()}
+    sections["Times smaller than the reference at its quality"] = reductions(found, published)
     return "\n".join(f"## {title}\n\n{text}" for title, text in sections.items() if text)
 
 
-QUALITY = "bytes", *METRICS.values()
+def study_table(found: Sequence[Point], study: str) -> str:
+    """Return the points of a study, with changes from the first one of their tier, the mean rank of each strategy of
+    compaction over data sets and tiers, and what the paper has for the parts of its codec."""
+    groups, every = defaultdict[tuple[str, str], dict[str, Point]](dict), defaultdict[str, list[float]](list)
+    for point in found:
+        prefix, colon, name = point.series.partition(": ")
+        if study == (prefix if colon else ""):
+            groups[point.dataset, point.tier][name or prefix] = point
+    rows = list[list[object]]()
+    for place, group in groups.items():
+        first, rank = next(iter(group.values())), ranks(group) if study == "compaction" else {}
+        for name, point in group.items():
+            quality = [_with_change(getattr(point, metric), getattr(first, metric)) for metric in METRICS]
+            seconds = ["" if not value else f"{value:.1f}" for value in (point.seconds, point.cpu_seconds)]
+            _, more, psnr = PARTS.get(name, (None, None, None))
+            paper = [percent(None if more is None else more / PUBLISHED_BYTES), signed(psnr, 4)]
+            rows.append([*place, name, round(point.bytes), percent(point.bytes / first.bytes - 1), *quality])
+            rows[-1] += [f"{rank[name]:.2f}" if rank else "", *seconds, *paper]
+        for name, value in rank.items():
+            every[name].append(value)
+    rows += [["all", "", name, *[""] * 5, f"{sum(each) / len(each):.2f}", *[""] * 4] for name, each in every.items()]
+    head = ["data set", "tier", study or "series", "bytes", "change", *METRICS.values(), "rank", "seconds", "CPU s"]
+    return markdown([*head, "published: bytes", "published: PSNR"], rows)
 
 
-def cells(point: Point) -> list[object]:
-    """Return bytes and quality as text."""
-    values = zip((point.psnr, point.ssim, point.lpips), (2, 4, 4), strict=True)
-    return [round(point.bytes), *("" if value is None else f"{value:.{digits}f}" for value, digits in values)]
-
-
-def seconds(point: Point) -> list[str]:
-    """Return wall and processor seconds as text."""
-    return ["" if value is None else f"{value:.1f}" for value in (point.seconds, point.cpu_seconds)]
+def _with_change(value: float | None, first: float | None) -> str:
+    return "" if value is None or first is None else f"{value:.4f} ({value - first:+.4f})"
 
 
 def reductions(found: Sequence[Point], published: Sequence[Point]) -> str:
@@ -477,42 +492,11 @@ def reductions(found: Sequence[Point], published: Sequence[Point]) -> str:
         reference, curve = ([p for p in points if p.place == (name, dataset, MEAN, p.tier)] for name in (BASE, series))
         return [reduction(reference[0], curve, metric) if reference and curve else "" for metric in METRICS]
 
-    names = dict.fromkeys((p.dataset, p.series) for points in both for p in points if p.series != BASE)
+    curves = [point for points in both for point in points if ": " not in point.series and point.series != BASE]
+    names = dict.fromkeys((point.dataset, point.series) for point in curves)
     rows = [[*name, *(cell for points in both for cell in factors(points, *name))] for name in names]
     head = [*METRICS.values(), *(f"published {name}" for name in METRICS.values() if len(both) == 2)]
     return markdown(["data set", "series", *head], [row for row in rows if any(row[2:])])
-
-
-def changes(found: Sequence[Point], prefix: str) -> str:
-    """Return the changes of bytes and quality from the first series of this prefix, with those that are published."""
-    rows, first = list[list[object]](), dict[tuple[str, str], Point]()
-    for point in (point for point in found if point.series.startswith(prefix)):
-        name, place = point.series.removeprefix(prefix), (point.dataset, point.tier)
-        base = first.setdefault(place, point)
-        if base is point:
-            rows.append([*place, name, *cells(point), "", *[""] * 2])
-            continue
-        pairs = [(getattr(point, metric), getattr(base, metric)) for metric in METRICS]
-        moved = [None if None in pair else pair[0] - pair[1] for pair in pairs]
-        _, more, psnr = PARTS.get(name, (None, None, None))
-        paper = percent(None if more is None else more / PUBLISHED_BYTES), signed(psnr, 4)
-        rows.append([*place, name, percent(point.bytes / base.bytes - 1), *(signed(each, 4) for each in moved), *paper])
-    return markdown(["data set", "tier", prefix.strip(": "), *QUALITY, "published: bytes", "PSNR"], rows)
-
-
-def compaction_table(found: Sequence[Point]) -> str:
-    """Return the strategies of compaction with their ranks, last the means of these over data sets and tiers."""
-    groups = defaultdict[tuple[str, str], dict[str, Point]](dict)
-    for point in found:
-        if point.series.startswith("compaction: "):
-            groups[point.dataset, point.tier][point.series.removeprefix("compaction: ")] = point
-    rows, every = list[list[object]](), defaultdict[str, list[float]](list)
-    for place, group in groups.items():
-        for name, rank in ranks(group).items():
-            rows.append([*place, name, *cells(group[name]), f"{rank:.2f}", *seconds(group[name])])
-            every[name].append(rank)
-    rows += [["all", "", name, *[""] * 4, f"{sum(each) / len(each):.2f}", "", ""] for name, each in every.items()]
-    return markdown(["data set", "tier", "strategy", *QUALITY, "rank", "seconds", "CPU s"], rows)
 
 
 def plot(path: Path, found: Sequence[Point], published: Sequence[Point]) -> None:

@@ -1,8 +1,10 @@
-"""``bench/paper.py`` on made data sets; reference: the published table, curves given as formulas, captures of known views."""
+"""``bench/paper.py`` on made data sets; reference: the published table, curves as formulas, captures of known views."""
 
-import csv
+import contextlib
+import io
 import math
 import sys
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +87,8 @@ def test_a_bound_and_a_quality_that_is_never_reached():
 
 
 def test_means_need_all_scenes_of_the_data_set():
-    points = [point(100, 30, scene="a", tier="S"), point(300, 34, scene="b", tier="S"), point(900, 35, scene="a", tier="L")]
+    points = [point(100, 30, scene="a", tier="S"), point(300, 34, scene="b", tier="S")]
+    points.append(point(900, 35, scene="a", tier="L"))
     (mean,) = means(points)
     assert (mean.bytes, mean.psnr, mean.ssim, mean.lpips, mean.scene) == (200, 32, 0.32, None, "_mean")
 
@@ -110,7 +113,7 @@ def test_points_survive_their_file(tmp_path):
 COLMAP = {"MipNeRF360": "images images_4", "TanksAndTemples": "images", "DeepBlending": "images"}
 VIEWS = around(10, size=32)
 FEW = {
-    "compact": {"sparsify_steps": 2, "refine_steps": 2},
+    "compact": {"sparsify_steps": 2, "refine_steps": 2, "admm_interval": 1},
     "encode": {"plas_radius_decay": 0.5, "sh_kmeans_iterations": 1},
     "finetune": {"steps": 2, "batch": 1, "pras_at": [0.5]},
 }
@@ -149,7 +152,7 @@ def write_synthetic(scene, folder):
 
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory):
-    """Return a manifest of all layouts; the checkpoints are copies of the scene with noise, the reference is large."""
+    """Return a manifest of two scenes of each layout."""
     folder = tmp_path_factory.mktemp("datasets")
     datasets = {}
     for number, dataset in enumerate([*COLMAP, "SyntheticNeRF"]):
@@ -181,8 +184,106 @@ def run_paper(monkeypatch, capsys, *words):
     return capsys.readouterr()
 
 
-def test_the_experiments_of_all_data_sets(manifest, tmp_path, monkeypatch, capsys):
-    first = run_paper(monkeypatch, capsys, manifest, "-o", tmp_path)
-    points = read_points(tmp_path / "points.csv")
-    assert len(points) == 8 * (2 + 2 * 5)
-    print(first.out)
+@pytest.fixture(scope="module")
+def results(manifest, tmp_path_factory):
+    """Return the folder of all points of rate and distortion, and what was said."""
+    folder = tmp_path_factory.mktemp("results")
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(io.StringIO()) as said:
+        patch.setattr(sys, "argv", ["paper.py", str(manifest), "-o", str(folder)])
+        paper.main()
+    return folder, said.getvalue()
+
+
+def test_the_experiments_of_all_data_sets(manifest, results):
+    """Bytes are those of files, and quality that of held-out photographs, every eighth, or those of the test split."""
+    folder, said = results
+    points = {point.place: point for point in read_points(folder / "points.csv")}
+    series = ["ply", "sogxt", "sogxt-ft", "sog", "spz"]
+    tiers = [("reference", f"inria-{each}") for each in series[:2]]
+    tiers += [(tier, f"popspa-{each}") for tier in "SL" for each in series]
+    datasets = yaml.safe_load(manifest.read_text())["datasets"]
+    scenes = list(product(datasets, ("one", "two")))
+    assert set(points) == {(each, *scene, tier) for scene in scenes for tier, each in tiers}
+    assert len(said.splitlines()) == len(points)
+    for dataset, name in scenes:
+        root = manifest.parent / dataset / name
+        scene, views = kissgs.load(root / "scene.ply"), kissgs.load_views(root)
+        assert [len(views.test), len(views.train)] == [2, 8]
+        assert views.background.tolist() == [dataset == "SyntheticNeRF"] * 3
+        small, whole = points["popspa-spz", dataset, name, "S"], points["popspa-sogxt", dataset, name, "L"]
+        (file,) = (folder / dataset / name / "S").glob("*.spz")
+        assert (small.bytes, len(kissgs.load(file, raw_axes=True))) == (file.stat().st_size, 60)
+        (made,) = (path for path in (folder / dataset / name / "L").glob("*.zip") if path.stem == whole.key)
+        found = kissgs.evaluate(scene, kissgs.decompress(made), views).mean.candidate
+        assert (whole.psnr, whole.ssim) == pytest.approx((found.psnr, found.ssim))
+        assert points["popspa-ply", dataset, name, "L"].psnr > 50, "the photographs are renderings of the scene"
+        assert whole.seconds > 0
+        assert "codebook=" in whole.stages
+    text = (folder / "tables.md").read_text()
+    assert "| DeepBlending | popspa-ply | 1.0 | 1.0 |" in text
+    assert "| MipNeRF360 | S | popspa-sogxt-ft |" in text
+    assert (folder / "SyntheticNeRF.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_second_run_makes_what_is_missing_or_has_changed(manifest, results, monkeypatch, capsys):
+    folder, _ = results
+    again = run_paper(monkeypatch, capsys, manifest, "-o", folder, "--published", folder / "points.csv")
+    assert again.err == ""
+    assert "published PSNR" in again.out
+    document = yaml.safe_load(manifest.read_text())
+    document["settings"]["finetune"]["steps"] = 1
+    (root := manifest.parent / "changed.yaml").write_text(yaml.safe_dump(document))
+    found = run_paper(monkeypatch, capsys, root, "-o", folder, "--scenes", "two", "--tiers", "S")
+    assert [line.partition(":")[0] for line in found.err.splitlines()] == [
+        f"{dataset}/two S, popspa-sogxt-ft" for dataset in document["datasets"]
+    ]
+
+
+def test_the_other_studies(manifest, tmp_path, monkeypatch, capsys):
+    """The ablation begins with the container of preset paper; merging and pruning leave as many Gaussians."""
+    document = yaml.safe_load(manifest.read_text())
+    document["datasets"] = {"MipNeRF360": {"one": document["datasets"]["MipNeRF360"]["one"]}}
+    document["datasets"]["MipNeRF360"]["gone"] = {"capture": "nowhere", "checkpoints": {"S": {"scene": "no.ply"}}}
+    (path := manifest.parent / "one.yaml").write_text(yaml.safe_dump(document))
+    strategies = "merge", "merge + refine", "POP + refine", *paper.OF_PAPER, "prunings along the way"
+    studies = "--studies", "rd", "ablation", "compaction", "sensitivity", "--strategies", *strategies
+    said = run_paper(monkeypatch, capsys, path, "-o", tmp_path, *studies, "--tiers", "S")
+    assert f"MipNeRF360/gone S is skipped: there is no {manifest.parent / 'no.ply'}\n" in said.err
+    points = {point.series: point for point in read_points(tmp_path / "points.csv")}
+    for one, other in (("without: nothing", "popspa-sogxt"), ("fine-tuning: as it is", "popspa-sogxt-ft")):
+        assert (points[one].bytes, points[one].psnr) == (points[other].bytes, points[other].psnr)
+    assert points["without: WebP"].bytes > points["without: nothing"].bytes
+    assert points["compaction: POPSpa"].psnr == points["popspa-ply"].psnr
+    assert len({points[f"compaction: {name}"].psnr for name in strategies}) == len(strategies)
+    assert {points[f"compaction: {name}"].bytes for name in strategies} == {points["popspa-ply"].bytes}
+    rows = [line for line in said.out.splitlines() if line.startswith("| all |")]
+    assert len(rows) == len(strategies)
+    assert "| +104.2 % | +0.0097 |" in said.out, "the published change of bytes and PSNR"
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("datasets: [", "is no YAML"),
+        ("[]", "the file: input should be"),
+        ("datasets: {d: {s: {checkpoints: {}}}}", "datasets.d.s.capture: field required"),
+        ("datasets: {d: {s: {capture: a, checkpoints: {L: {scene: a, size: 3}}}}}", "size: extra inputs"),
+        ("{datasets: {}, settings: {encoder: {}}}", "settings.encoder"),
+    ],
+)
+def test_a_wrong_manifest_is_one_sentence(tmp_path, text, reason):
+    (path := tmp_path / "wrong.yaml").write_text(text)
+    with pytest.raises(kissgs.KissgsError) as refused:
+        paper.read_manifest(path)
+    assert reason in str(refused.value)
+    assert str(refused.value).startswith(str(path))
+    assert "\n" not in str(refused.value)
+
+
+def test_the_ablation_needs_preset_paper(manifest, tmp_path, monkeypatch, capsys):
+    scene = yaml.safe_load(manifest.read_text())["datasets"]["DeepBlending"]["one"]
+    scene.pop("reference")
+    document = {"datasets": {"DeepBlending": {"one": scene}}, "preset": "balanced"}
+    (path := manifest.parent / "balanced.yaml").write_text(yaml.safe_dump(document))
+    said = run_paper(monkeypatch, capsys, path, "-o", tmp_path, "--studies", "ablation", "--tiers", "L")
+    assert said.err == "DeepBlending/one L, ablation: the ablation leaves out parts of preset paper, not of balanced\n"
