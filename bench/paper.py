@@ -23,6 +23,7 @@ Files and points.csv are in the output folder; a later run makes what is missing
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import json
 import os
@@ -77,7 +78,7 @@ class Checkpoint(BaseModel):
 
     @property
     def budget(self) -> dict[str, object]:
-        """Settings of compaction; empty if the scene is encoded as it is."""
+        """Setting of compaction; empty if the scene is encoded as it is."""
         return self.model_dump(exclude={"scene"}, exclude_none=True)
 
 
@@ -126,11 +127,13 @@ Make = Callable[[Path, Path], Mapping[str, float] | None]
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What a decoder gets, the bytes that it gets it from, and columns of a point about how it was made."""
+    """What a decoder gets, the bytes that it gets it from, and the times of making them as in :class:`Point`."""
 
     splats: Splats
     bytes: int
-    times: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float | None = None
+    cpu_seconds: float | None = None
+    stages: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,15 +166,9 @@ class Work:
         """The scene before compaction."""
         return kissgs.load(self.checkpoint.scene)
 
-    @cached_property
-    def views(self) -> Views:
-        """Views to evaluate from, in the coordinates of the scene."""
-        return in_scene_frame(self.original, views_of(self.scene.capture))
-
-    @cached_property
-    def training(self) -> Views:
-        """Views to train on."""
-        return in_scene_frame(self.original, views_of(self.scene.training or self.scene.capture))
+    def views(self, capture: Path | None) -> Views:
+        """Return the views of a capture, by default of that to evaluate from, in the coordinates of the scene."""
+        return in_scene_frame(self.original, views_of(capture or self.scene.capture))
 
     def settings(self, **changes: Mapping[str, object]) -> Settings:
         """Return the settings of the manifest with changes by group."""
@@ -183,9 +180,10 @@ class Work:
 
     def key(self, *parts: BaseModel | str) -> str:
         """Return what stands for the scene, its views, and settings or texts."""
+        captures = self.scene.capture, self.scene.training or self.scene.capture
         texts = [part.model_dump_json() if isinstance(part, BaseModel) else part for part in parts]
-        views = [digest_of_views(path) for path in (self.scene.capture, self.scene.training or self.scene.capture)]
-        return digest(json.dumps([digest_of_file(self.checkpoint.scene), *views, *texts]).encode())
+        inputs = [kissgs.__version__, digest_of(self.checkpoint.scene), *map(digest_of, captures), *texts]
+        return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:16]
 
     def path(self, key: str, ending: str) -> Path:
         """Return the file of a job: files of equal keys are equal, whatever their series."""
@@ -211,36 +209,29 @@ def stored(path: Path, make: Make, source: Callable[[], Path]) -> Made:
         path.parent.mkdir(parents=True, exist_ok=True)
         scene = source()
         wall, cpu = time.perf_counter(), sum(os.times()[:4])
-        stages = " ".join(f"{name}={seconds:.2f}" for name, seconds in (make(scene, path) or {}).items())
-        wall, cpu = time.perf_counter() - wall, sum(os.times()[:4]) - cpu
+        stages = make(scene, path) or {}
+        text = " ".join(f"{name}={seconds:.2f}" for name, seconds in stages.items())
+        found = time.perf_counter() - wall, sum(os.times()[:4]) - cpu, text
         with atomic_file(times) as file:
-            file.write(json.dumps({"seconds": wall, "cpu_seconds": cpu, "stages": stages}).encode())
-    return Made(kissgs.load(path, raw_axes=True), path.stat().st_size, json.loads(times.read_bytes()))
-
-
-def digest(data: bytes) -> str:
-    """Return a short hash."""
-    return hashlib.sha256(data).hexdigest()[:16]
-
-
-@cache
-def digest_of_file(path: Path) -> str:
-    """Return the hash of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+            file.write(json.dumps(found).encode())
+    return Made(kissgs.load(path, raw_axes=True), path.stat().st_size, *json.loads(times.read_bytes()))
 
 
 views_of = cache(kissgs.load_views)
 
 
 @cache
-def digest_of_views(path: Path) -> str:
-    """Return the hash of all cameras of a capture, and of the sizes of its photographs."""
-    found = list[bytes]()
-    for view in views_of(path).all:
-        size = 0 if view.photo is None else view.photo.stat().st_size
-        found += [f"{view.name} {size}".encode(), view.camera.viewmat.tobytes(), view.camera.K.tobytes()]
-    return digest(b"\n".join(found))
+def digest_of(path: Path) -> str:
+    """Return the hash of a scene, or of a capture: of all its cameras, and of the sizes of its photographs."""
+    digest = hashlib.sha256()
+    if path.is_file():
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256")
+    else:
+        for view in views_of(path).all:
+            size = 0 if view.photo is None else view.photo.stat().st_size
+            digest.update(f"{view.name} {size} {view.camera.viewmat.tolist()} {view.camera.K.tolist()}".encode())
+    return digest.hexdigest()
 
 
 def works(manifest: Manifest, given: argparse.Namespace) -> Iterator[Work]:
@@ -286,7 +277,15 @@ def compaction(work: Work) -> Job:
     settings = work.settings(compact=work.checkpoint.budget)
 
     def make(source: Path, path: Path) -> Mapping[str, float]:
-        report = kissgs.compact(source, path, settings=settings, **training_of(work, path)).report
+        report = kissgs.compact(
+            source,
+            path,
+            settings=settings,
+            views=work.views(work.scene.training),
+            checkpoint=path.with_suffix(".checkpoint"),
+            overwrite=True,
+            device=work.given.device,
+        ).report
         stages = defaultdict[str, float](float)
         for step in report.steps:
             stages[step.name] += step.seconds
@@ -295,19 +294,21 @@ def compaction(work: Work) -> Job:
     return work.file("popspa-ply", ".ply", make, settings.compact, small=False)
 
 
-def training_of(work: Work, path: Path) -> dict[str, Any]:
-    """Return the arguments of a compaction or compression into a file that have nothing to do with its settings."""
-    checkpoint = path.with_suffix(".checkpoint")
-    return {"views": work.training, "checkpoint": checkpoint, "overwrite": True, "device": work.given.device}
-
-
 def encoding(work: Work, series: str, ending: str = ".zip", **changes: Mapping[str, object]) -> Job:
     """Return the job of a container, with changes of settings by group."""
     settings = work.settings(**changes)
     used = [settings.encode, *([settings.finetune] if settings.finetune.enabled else [])]
 
     def make(source: Path, path: Path) -> Mapping[str, float]:
-        return kissgs.compress(source, path, settings=settings, **training_of(work, path)).report.seconds
+        return kissgs.compress(
+            source,
+            path,
+            settings=settings,
+            views=work.views(work.scene.training),
+            checkpoint=path.with_suffix(".checkpoint"),
+            overwrite=True,
+            device=work.given.device,
+        ).report.seconds
 
     return work.file(series, ending, make, ending, *used)
 
@@ -374,7 +375,7 @@ def strategies(work: Work) -> Iterator[Job]:
         steps = {"sparsify_steps": 0, "refine_steps": settings.steps if when == "refined" else 0}
         own = settings.model_copy(update={**({} if when == "trained" else steps), **changes})
         stride = SCORING_STRIDE if settings.trains else 1
-        supervised = supervision_views(scene, work.training, settings, context, scoring_stride=stride)
+        supervised = supervision_views(scene, work.views(work.scene.training), settings, context, scoring_stride=stride)
         targets = training_targets(scene, supervised, context) if own.trains else None
         reduced = merge_gaussians(scene, count, context)[0] if name.startswith("merge") else scene
         kissgs.save(Popspa(reduced, own, supervised, context, targets)(count).splats, path, overwrite=True)
@@ -412,29 +413,54 @@ def points_of(manifest: Manifest, given: argparse.Namespace) -> list[Point]:
     known = {point.place: point for point in read_points(table)} if table.exists() else {}
     for work in works(manifest, given):
         for study in given.studies if work.tier != REFERENCE else ("rd",):
-            try:
-                for job in STUDIES[study](work):
+            jobs = list[Job]()
+            with said(f"{work}, {study}"):
+                jobs.extend(STUDIES[study](work))
+            for job in jobs:
+                with said(f"{work}, {job.series}"):
                     point = known.get((job.series, work.dataset, work.name, work.tier))
                     if point is None or point.key != job.key or (given.lpips and point.lpips is None):
                         point = measured(work, job)
                         append_point(table, point)
                         sys.stderr.write(f"{work}, {job.series}: {point.bytes:,.0f} bytes, {point.psnr:.2f} dB\n")
                     found.append(point)
-            except (KissgsError, OSError) as error:
-                sys.stderr.write(f"{work}, {study}: {error}\n")
     return found
+
+
+@contextlib.contextmanager
+def said(what: str) -> Iterator[None]:
+    """Say an error of the library or the system, and go on."""
+    try:
+        yield
+    except (KissgsError, OSError) as error:
+        sys.stderr.write(f"{what}: {error}\n")
 
 
 def measured(work: Work, job: Job) -> Point:
     """Make a file, and compare what it shows with the held-out photographs."""
-    made, context, lpips = job.make(), Context(device=work.given.device), work.given.lpips
-    compared = compare_images(
-        work.original, made.splats, work.views, context, reference_images=work.images, lpips=lpips
+    made, context = job.make(), Context(device=work.given.device)
+    found = compare_images(
+        work.original,
+        made.splats,
+        work.views(None),
+        context,
+        reference_images=work.images,
+        lpips=work.given.lpips,
+    ).mean.candidate
+    return Point(
+        series=job.series,
+        dataset=work.dataset,
+        scene=work.name,
+        tier=work.tier,
+        bytes=made.bytes,
+        psnr=found.psnr,
+        ssim=found.ssim,
+        lpips=found.lpips,
+        seconds=made.seconds,
+        cpu_seconds=made.cpu_seconds,
+        stages=made.stages,
+        key=job.key,
     )
-    found = compared.mean.candidate
-    quality = {"bytes": made.bytes, "psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips, **made.times}
-    place = {"series": job.series, "dataset": work.dataset, "scene": work.name, "tier": work.tier}
-    return Point(**place, **quality, key=job.key)
 
 
 # Tables and plots.

@@ -20,19 +20,18 @@ import httpx
 from bench.common import parser_of, run, write
 from kissgs import KissgsError, sample_scene, save
 
-UPLOAD_BYTES = 500_000_000
 POLLS = 600
 
 
 def main() -> None:
-    """Measure the time of status requests, and memory during uploads."""
+    """Print the time of status requests, and the memory of the server."""
     parser = parser_of(__doc__)
     parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with service(folder / "data") as (url, pid), httpx.Client(base_url=url, trust_env=False) as http:
             latency(http, folder)
-            upload_memory(pid, http, folder)
+            write(f"memory of the server: {peak_memory(pid) / 2**20:.0f} MiB")
 
 
 def latency(http: httpx.Client, folder: Path) -> None:
@@ -53,25 +52,6 @@ def latency(http: httpx.Client, folder: Path) -> None:
     spent.sort()
     median, late = spent[len(spent) // 2], spent[int(0.99 * len(spent))]
     write(f"status while a job runs: p50 {median:.1f} ms, p99 {late:.1f} ms ({len(spent)} requests)")
-
-
-def upload_memory(pid: int, http: httpx.Client, folder: Path) -> None:
-    """Print the memory of the server, and how much it grows while a large scene arrives."""
-    path = folder / "upload.ply"
-    save(sample_scene(20_000), path)
-    header, end, rows = path.read_bytes().partition(b"end_header\n")
-    times = round(UPLOAD_BYTES / len(rows))
-    with path.open("wb") as file:
-        file.write(header.replace(b"vertex 20000\n", b"vertex %d\n" % (20_000 * times)) + end)
-        for _ in range(times):
-            file.write(rows)
-    before, begun = peak_memory(pid), time.perf_counter()
-    with path.open("rb") as file:
-        answer = http.post("/v1/jobs", params={"options": '{"preset": "fast"}'}, timeout=600, content=file)
-    rate = path.stat().st_size / (time.perf_counter() - begun) / 1e6
-    http.delete(answer.raise_for_status().json()["links"]["self"], timeout=10)
-    grown = peak_memory(pid) - before
-    write(f"memory of the server: {before / 2**20:.0f} MiB, {grown / 2**20:+.1f} during an upload at {rate:.0f} MB/s")
 
 
 def peak_memory(pid: int) -> int:
