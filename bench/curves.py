@@ -46,7 +46,7 @@ class Point(BaseModel):
 
     @property
     def place(self) -> tuple[str, str, str, str]:
-        """What the point is of; a later point of the same place replaces it."""
+        """Names of what the point is of; a later point of the same place replaces it."""
         return self.series, self.dataset, self.scene, self.tier
 
     def quality(self, metric: str) -> float | None:

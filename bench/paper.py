@@ -127,7 +127,7 @@ Make = Callable[[Path, Path], Mapping[str, float] | None]
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What a decoder gets, the bytes that it gets it from, and the times of making them as in :class:`Point`."""
+    """A scene that a decoder gets, the bytes that it needs, and the times of making them as in a :class:`Point`."""
 
     splats: Splats
     bytes: int
@@ -471,7 +471,7 @@ TITLES = {
     "compaction": "Strategies of compaction",
     "fine-tuning": "Settings of fine-tuning",
 }
-"""By the beginning of a series, up to a colon."""
+"""Titles of tables by the beginning of a series, up to a colon."""
 
 
 def tables(found: Sequence[Point], published: Sequence[Point]) -> str:
@@ -534,9 +534,10 @@ def plot(path: Path, found: Sequence[Point], published: Sequence[Point]) -> None
     for axes, (metric, label) in zip(figure.subplots(1, 3), METRICS.items(), strict=True):
         for number, series in enumerate(names):
             for points, form in ((found, "o-"), (published, "o--")):
-                curve = sorted((p.bytes / 1e6, getattr(p, metric)) for p in points if p.series == series)
+                curve = sorted((p for p in points if p.series == series), key=lambda point: point.bytes)
+                x, y = [point.bytes / 1e6 for point in curve], [getattr(point, metric) for point in curve]
                 name = series if points is found else f"{series}, published"
-                axes.plot(*zip(*curve, strict=True), form, color=f"C{number}", label=name) if curve else None
+                axes.plot(x, y, form, color=f"C{number}", label=name if curve else None)
         axes.set(xscale="log", xlabel="megabytes", ylabel=label)
         axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")

@@ -4,8 +4,8 @@
 
 Each drawing of a file is compared with the drawing of the scene by the same renderer: a viewer, with its own settings,
 or kissgs.render. Row "scene.ply" compares the viewer with kissgs.render. "reordered.ply" is the scene with its rows
-shuffled: what the order of Gaussians alone changes. Needs Chromium, and what scripts/setup dev installs. NAME.csv gets a
-contact sheet, NAME.png, beside it.
+shuffled: what the order of Gaussians alone changes. Needs Chromium, and what scripts/setup dev installs. NAME.csv gets
+a contact sheet, NAME.png, beside it.
 """
 
 from __future__ import annotations
