@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import kissgs
 from bench import paper
 from bench.curves import METRICS, Point, append_point, means, ranks, read_points, reduction
+from kissgs.evaluation import evaluate
 from kissgs.rendering.rasterizer import render
 
 RD = Path(__file__).parents[2] / "shared/data/paper/rd.csv"
@@ -237,6 +238,18 @@ def test_a_second_run_makes_what_is_missing_or_has_changed(manifest, results, mo
     assert [line.partition(":")[0] for line in found.err.splitlines()] == [
         f"{dataset}/two S, popspa-sogxt-ft" for dataset in document["datasets"]
     ]
+
+
+def test_lpips_is_added_to_points_without_making_files_again(manifest, results, monkeypatch, capsys):
+    folder, _ = results
+    words = manifest, "-o", folder, "--scenes", "one", "--tiers", "L"
+    run_paper(monkeypatch, capsys, *words)
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*/one/*/*")}
+    monkeypatch.setattr(evaluate, "Lpips", lambda device: lambda image, target: 0.25)
+    found = run_paper(monkeypatch, capsys, *words, "--lpips")
+    assert len(found.err.splitlines()) == 4 * (2 + 5)
+    assert "0.2500 (+0.0000)" in found.out
+    assert before == {path: path.stat().st_mtime_ns for path in folder.glob("*/one/*/*")}
 
 
 def test_the_other_studies(manifest, tmp_path, monkeypatch, capsys):
