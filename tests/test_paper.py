@@ -71,11 +71,12 @@ def test_published_points_alone_are_printed(monkeypatch, capsys):
 
 
 def test_bytes_are_interpolated_in_their_logarithm_on_the_pareto_front():
-    """A point no better than a smaller one is left out: with it, the curve would not reach 30 dB before 4,000 bytes."""
-    reference = point(1_000_000, 30.0)
-    curve = [point(1000, 29.0), point(2000, 28.5), point(4000, 31.0)]
-    assert reduction(reference, curve, "psnr") == f"{1e6 / math.sqrt(1000 * 4000):.0f}"
-    assert reduction(reference, list(reversed(curve)), "ssim") == "500"
+    """A point no better than a smaller one is left out: with it, 29.1 dB would be between 1,000 and 8,000 bytes."""
+    reference = point(1_000_000, 29.1)
+    curve = [point(1000, 29.0), point(2000, 29.5), point(8000, 29.2), point(16000, 31.0)]
+    for points in (curve, curve[::-1]):
+        for metric in ("psnr", "ssim"):
+            assert reduction(reference, points, metric) == f"{1e6 / (1000 * 2**0.2):.0f}"
 
 
 def test_a_bound_and_a_quality_that_is_never_reached():
