@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numba import float32, int32, int64, njit, uint32, void
@@ -30,7 +30,7 @@ from kissgs.rendering.cpu.records import (
 @njit(nogil=True, error_model="numpy")
 def _sort_list(keys: np.ndarray, rows: np.ndarray, spans: np.ndarray, scratch: np.ndarray, counts: np.ndarray) -> None:
     """Sort ``rows`` and ``spans`` of one tile's members by their keys, stably. ``scratch`` has four rows, as long as
-    the keys or longer, ``counts`` 2048 entries."""
+    the keys or longer, ``counts`` 256 entries."""
     count = keys.shape[0]
     order, other = scratch[0], scratch[1]
     for i in range(count):
@@ -46,17 +46,17 @@ def _sort_list(keys: np.ndarray, rows: np.ndarray, spans: np.ndarray, scratch: n
         differing = np.uint32(0)
         for i in range(1, count):
             differing |= keys[i] ^ keys[0]
-        for shift in range(0, 33, 11):
-            if (differing >> np.uint32(shift)) & np.uint32(2047) == 0:
+        for shift in range(0, 32, 8):
+            if (differing >> np.uint32(shift)) & np.uint32(255) == 0:
                 continue
             counts[:] = 0
             for i in range(count):
-                counts[(keys[i] >> np.uint32(shift)) & np.uint32(2047)] += 1
+                counts[(keys[i] >> np.uint32(shift)) & np.uint32(255)] += 1
             total = 0
-            for digit in range(2048):
+            for digit in range(256):
                 total, counts[digit] = total + counts[digit], total
             for i in range(count):
-                digit = (keys[order[i]] >> np.uint32(shift)) & np.uint32(2047)
+                digit = (keys[order[i]] >> np.uint32(shift)) & np.uint32(255)
                 other[counts[digit]] = order[i]
                 counts[digit] += 1
             order, other = other, order
@@ -73,7 +73,7 @@ def sort_tiles(lists: TileLists, first: int, last: int, keys: np.ndarray) -> Non
     starts, longest = lists.starts, 0
     for tile in range(first, last):
         longest = max(longest, starts[tile + 1] - starts[tile])
-    scratch, counts = np.empty((4, longest), np.uint32), np.empty(2048, np.int64)
+    scratch, counts = np.empty((4, longest), np.uint32), np.empty(256, np.int64)
     for tile in range(first, last):
         a, b = starts[tile], starts[tile + 1]
         _sort_list(keys[a:b], lists.members[a:b], lists.spans[a:b], scratch, counts)
@@ -109,77 +109,101 @@ def fill_slots(members: np.ndarray, out: Slots) -> int:
 @njit(nogil=True, error_model="numpy")
 def _clamp(value: float, top: int) -> int:
     """Return ``value`` rounded down and clamped to 0 to ``top``; 0 for NaN. Safe for values beyond int64."""
-    if not value > 0:
-        return 0
-    return int(value) if value < top else top
+    positive = value if value > 0 else 0.0
+    return int(positive if positive < top else np.float64(top))
+
+
+class Disc(NamedTuple):
+    """The disc u² + v² <= tau of a footprint, with u = l0 dx + l1 dy and v = l2 dy, and what follows from it once."""
+
+    x: float  # of the centre
+    y: float
+    width: float  # half the size of its bounding box, pixels
+    height: float
+    l2: float
+    radius: float  # √tau
+    k: float  # l1 / l2
+    top: float  # |v| at the leftmost and rightmost points
+    per_l0: float
+    slant: float  # dx of the highest point
+    area: float  # a tau, with a = l1² + l2²
+    cross: float  # l0 l1
+    product: float  # l0 l2
+    per_a: float
 
 
 @njit(nogil=True, error_model="numpy")
-def _disc(records: np.ndarray, n: int) -> tuple[float, float, float, float, float, float]:
-    """Return a footprint's centre, l0, l1, l2 and largest u² + v²; float32 alphas may exceed exact ones by rounding."""
-    x, y = np.float64(records[n, 0]), np.float64(records[n, 1])
+def _disc(records: np.ndarray, n: int) -> Disc:
+    """Return the disc of footprint ``n``, a little larger, as float32 alphas may exceed exact ones by rounding."""
     l0, l1, l2 = np.float64(records[n, 2]), np.float64(records[n, 3]), np.float64(records[n, 4])
-    return x, y, l0, l1, l2, np.float64(records[n, 9]) * 1.0001 + 1e-5
-
-
-@njit(nogil=True, error_model="numpy")
-def _halves(records: np.ndarray, n: int, row: int, halves: int) -> tuple[int, int]:
-    """Return the first and last (exclusive) half of a tile that footprint ``n`` touches in a row of tiles. The
-    footprint is the disc u² + v² <= tau. In a row of tiles, v is in an interval; x = (u - k v) / l0 is largest at v =
-    -k √tau / √(1 + k²) or at the interval's nearer end."""
-    centre_x, centre_y, l0, l1, l2, tau = _disc(records, n)
-    radius = np.sqrt(tau)
-    low = max((16 * row + 0.5 - centre_y) * l2, -radius)
-    high = min((16 * row + 15.5 - centre_y) * l2, radius)
-    if not low <= high:
-        return 0, 0
-    k = l1 / l2
-    extreme = k * radius / np.sqrt(1.0 + k * k)
-    v = min(max(-extreme, low), high)
-    right = centre_x + (np.sqrt(max(tau - v * v, 0.0)) - k * v) / l0
-    v = min(max(extreme, low), high)
-    left = centre_x - (np.sqrt(max(tau - v * v, 0.0)) + k * v) / l0
-    return _clamp(np.ceil((left - 7.51) / 8), halves), _clamp(np.floor((right - 0.49) / 8) + 1, halves)
-
-
-@njit(nogil=True, error_model="numpy")
-def _box(records: np.ndarray, n: int, halves: int, rows: int) -> tuple[int, int, int, int]:
-    """Return the first and last (exclusive) half of a tile, and row of tiles, that footprint ``n`` touches."""
-    x, y, l0, l1, l2, tau = _disc(records, n)
-    width = np.sqrt(tau * (l1 * l1 + l2 * l2)) / (l0 * l2)
-    height = np.float64(records[n, 10]) * 1.0001 + 0.01
-    return (
-        _clamp(np.ceil((x - width - 7.51) / 8), halves),
-        _clamp(np.floor((x + width - 0.49) / 8) + 1, halves),
-        _clamp(np.ceil((y - height - 15.5) / 16), rows),
-        _clamp(np.floor((y + height - 0.5) / 16) + 1, rows),
+    tau = np.float64(records[n, 9]) * 1.0001 + 1e-5
+    radius, per_l0, a, k = np.sqrt(tau), 1.0 / l0, l1 * l1 + l2 * l2, l1 / l2
+    reach = np.sqrt(1.0 + k * k)
+    return Disc(
+        np.float64(records[n, 0]),
+        np.float64(records[n, 1]),
+        radius * reach * per_l0,
+        np.float64(records[n, 10]) * 1.0001 + 0.01,
+        l2,
+        radius,
+        k,
+        k * radius / reach,
+        per_l0,
+        k * radius * per_l0,
+        a * tau,
+        l0 * l1,
+        l0 * l2,
+        1.0 / a,
     )
 
 
 @njit(nogil=True, error_model="numpy")
-def _span(records: np.ndarray, n: int, half: int, row: int) -> int:
+def _halves(disc: Disc, row: int, halves: int) -> tuple[int, int]:
+    """Return the first and last (exclusive) half of a tile that a footprint touches in a row of tiles, in which v is in
+    an interval; x = (u - k v) / l0 is largest at v = -k √tau / √(1 + k²) or at the interval's nearer end."""
+    low = max((16 * row + 0.5 - disc.y) * disc.l2, -disc.radius)
+    high = min((16 * row + 15.5 - disc.y) * disc.l2, disc.radius)
+    if not low <= high:
+        return 0, 0
+    tau = disc.radius * disc.radius
+    v = min(max(-disc.top, low), high)
+    right = disc.x + (np.sqrt(max(tau - v * v, 0.0)) - disc.k * v) * disc.per_l0
+    v = min(max(disc.top, low), high)
+    left = disc.x - (np.sqrt(max(tau - v * v, 0.0)) + disc.k * v) * disc.per_l0
+    return _clamp(np.ceil((left - 7.51) / 8), halves), _clamp(np.floor((right - 0.49) / 8) + 1, halves)
+
+
+@njit(nogil=True, error_model="numpy")
+def _box(disc: Disc, halves: int, rows: int) -> tuple[int, int, int, int]:
+    """Return the first and last (exclusive) half of a tile, and row of tiles, that a footprint touches."""
+    return (
+        _clamp(np.ceil((disc.x - disc.width - 7.51) / 8), halves),
+        _clamp(np.floor((disc.x + disc.width - 0.49) / 8) + 1, halves),
+        _clamp(np.ceil((disc.y - disc.height - 15.5) / 16), rows),
+        _clamp(np.floor((disc.y + disc.height - 0.5) / 16) + 1, rows),
+    )
+
+
+@njit(nogil=True, error_model="numpy")
+def _span(disc: Disc, half: int, row: int) -> int:
     """Return the rows of pixels that a footprint touches in half of a tile, as ``32 * first + last``, last exclusive.
-    Within the half's columns, the footprint is highest at its own highest point or at the nearer side of the half."""
-    centre_x, centre_y, l0, l1, l2, tau = _disc(records, n)
-    x, y = 8 * half - centre_x, 16 * row - centre_y
-    reach = np.sqrt(tau) / l2
-    top_offset = l1 * reach / l0
-    a = l1 * l1 + l2 * l2
-    dx = min(max(-top_offset, x + 0.5), x + 7.5)
-    b = l0 * l1 * dx
-    low = (np.sqrt(max(b * b - a * (l0 * l0 * dx * dx - tau), 0.0)) - b) / a
-    dx = min(max(top_offset, x + 0.5), x + 7.5)
-    b = l0 * l1 * dx
-    high = (np.sqrt(max(b * b - a * (l0 * l0 * dx * dx - tau), 0.0)) + b) / a
+    Within the half's columns, the footprint is highest at its own highest point or at the nearer side of the half: at
+    dx, a dy = -l0 l1 dx ± √(a tau - (l0 l2 dx)²)."""
+    x, y = 8 * half - disc.x, 16 * row - disc.y
+    dx = min(max(-disc.slant, x + 0.5), x + 7.5)
+    across = disc.product * dx
+    low = (np.sqrt(max(disc.area - across * across, 0.0)) - disc.cross * dx) * disc.per_a
+    dx = min(max(disc.slant, x + 0.5), x + 7.5)
+    across = disc.product * dx
+    high = (np.sqrt(max(disc.area - across * across, 0.0)) + disc.cross * dx) * disc.per_a
     return 32 * _clamp(np.ceil(-high - y - 0.51), 16) + _clamp(np.floor(low - y - 0.49) + 1, 16)
 
 
 @njit(nogil=True, error_model="numpy")
-def _whole_span(records: np.ndarray, n: int, row: int) -> int:
+def _whole_span(disc: Disc, row: int) -> int:
     """Return the span of a footprint that lies within one column of halves, see :func:`_span`."""
-    y = 16 * row - np.float64(records[n, 1])
-    reach = np.float64(records[n, 10]) * 1.0001 + 0.01
-    return 32 * _clamp(np.ceil(-reach - y - 0.51), 16) + _clamp(np.floor(reach - y - 0.49) + 1, 16)
+    y = 16 * row - disc.y
+    return 32 * _clamp(np.ceil(-disc.height - y - 0.51), 16) + _clamp(np.floor(disc.height - y - 0.49) + 1, 16)
 
 
 @compiled(void(float32[:, ::1], int64, int64, int64[:, ::1]))
@@ -187,11 +211,12 @@ def count_tiles(records: np.ndarray, first: int, last: int, per_tile: np.ndarray
     """Add the number of footprints ``first`` to ``last`` (exclusive) that touch each tile to ``per_tile``."""
     rows, columns = per_tile.shape
     for n in range(first, last):
-        left, right, top, bottom = _box(records, n, 2 * columns, rows)
+        disc = _disc(records, n)
+        left, right, top, bottom = _box(disc, 2 * columns, rows)
         several = right - left > 1 and bottom - top > 1
         for row in range(top, bottom):
             if several:
-                left, right = _halves(records, n, row, 2 * columns)
+                left, right = _halves(disc, row, 2 * columns)
             for column in range(left // 2, (right + 1) // 2):
                 per_tile[row, column] += 1
 
@@ -205,18 +230,19 @@ def fill_tiles(
     records, depths = footprints.records, footprints.depths.view(np.uint32)
     rows, columns = ends.shape
     for n in range(first, last):
-        left, right, top, bottom = _box(records, n, 2 * columns, rows)
+        disc = _disc(records, n)
+        left, right, top, bottom = _box(disc, 2 * columns, rows)
         several, one_half = right - left > 1 and bottom - top > 1, right - left == 1
         for row in range(top, bottom):
             if several:
-                left, right = _halves(records, n, row, 2 * columns)
+                left, right = _halves(disc, row, 2 * columns)
             for column in range(left // 2, (right + 1) // 2):
                 end = ends[row, column]
                 keys[end] = depths[n]
                 lists.members[end] = n
                 lists.spans[end] = 0
                 for half in range(max(left, 2 * column), min(right, 2 * column + 2)):
-                    span = _whole_span(records, n, row) if one_half else _span(records, n, half, row)
+                    span = _whole_span(disc, row) if one_half else _span(disc, half, row)
                     lists.spans[end] |= np.uint32(span << (half % 2 * 16))
                 ends[row, column] = end + 1
 
