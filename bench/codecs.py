@@ -1,6 +1,7 @@
 """Presets, points of their quality curves, and external codecs on scenes, each in a process of its own.
 
     python bench/codecs.py fox.ply --views fox --offsets -7 -3 4 --external sog spz --sog-iterations 1
+    python bench/codecs.py 65536 262144 -p fast balanced    # sample scenes of so many Gaussians
 
 External codecs need splat-transform (npm install -g @playcanvas/splat-transform). An offset is a value of
 quality_offset_db of the presets that plan by rate and distortion; bytes are compared at equal PSNR along that curve.
@@ -8,13 +9,17 @@ quality_offset_db of the presets that plan by rate and distortion; bytes are com
 
 from __future__ import annotations
 
+import argparse
 import shlex
 import sys
+import tempfile
+from pathlib import Path
 from typing import Any
 
-from bench.common import arguments, at_quality_offset, bytes_at, head, row, run, signed, write
+from bench.common import at_quality_offset, capture, head, parser_of, row, run, signed, write
+from bench.curves import bytes_at
 from bench.external import FORMATS, External, measure_external
-from kissgs import Evaluation, KissgsError, Preset
+from kissgs import Evaluation, KissgsError, Preset, sample_scene, save
 from kissgs.cli.bench import Measurement, measured
 from kissgs.cli.options import chosen
 
@@ -23,49 +28,65 @@ IMAGES = "PSNR to photographs", "change, dB", "SSIM", "PSNR to the original", "S
 
 
 def main() -> None:
-    """Print tables of all codecs and of the bytes by file, and the bytes at equal PSNR."""
-    parser = arguments(__doc__)
+    """Print a table for each scene, and the bytes at equal PSNR; samples are on disk only while they are measured."""
+    parser = parser_of(__doc__)
+    parser.add_argument("scenes", nargs="+", metavar="SCENE", help="file, or number of Gaussians of a sample scene")
+    parser.add_argument("--degree", type=int, default=3, choices=range(4), help="of sample scenes")
+    parser.add_argument("--views", type=capture, metavar="DATA", help="capture with cameras and photographs")
     parser.add_argument("-p", "--presets", nargs="+", default=list(Preset))
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="change a setting of all presets"
     )
+    parser.add_argument("--each", nargs="+", default=[], metavar="NAME=VALUE", help="also make each of these changes")
     parser.add_argument("--containers", nargs="+", default=["sogxt"], choices=["sogxt", "sog"])
     parser.add_argument("--offsets", nargs="+", type=float, default=[], metavar="DB")
     parser.add_argument("--external", nargs="+", default=[], choices=FORMATS)
     parser.add_argument("--splat-transform", default="splat-transform", help="command that starts it")
     parser.add_argument("--sog-iterations", type=int, help="k-means iterations over the SH of .sog")
     given = parser.parse_args()
-    files: dict[str, dict[str, int]] = {}
+    for scene in given.scenes:
+        write(f"{scene}:", "")
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(scene)
+            if scene.isdecimal():
+                path = Path(folder, "scene.ply")
+                save(sample_scene(int(scene), sh_degree=given.degree), path)
+            measure(path, given)
+
+
+def measure(scene: Path, given: argparse.Namespace) -> None:
+    """Print the table of a scene; what fails is said, and the others are measured."""
     points: dict[str, list[tuple[float, float]]] = {}
-    others: dict[str, tuple[float, int]] = {}
+    others: dict[str, tuple[float, float]] = {}
     head(*HEAD, *IMAGES)
     for preset in given.presets:
-        settings = chosen(preset, given.set)
-        offsets = given.offsets if settings.encode.rate_distortion else []
-        for container in given.containers:
-            curve = str(preset) if container == "sogxt" else f"{preset} .{container}"
-            for offset in [None, *offsets]:
-                tuned = settings if offset is None else at_quality_offset(settings, offset)
-                found = measured(given.scene, tuned, container=container, views=given.views)
-                name = curve if offset is None else f"{curve} at {offset:g}"
-                psnr = print_measurement(name, found)
-                files[name] = found.report.file_bytes
-                points.setdefault(curve, []).append((psnr, found.report.container_bytes))
+        for change in [None, *given.each]:
+            settings = chosen(preset, [*given.set, *filter(None, [change])])
+            offsets = given.offsets if settings.encode.rate_distortion and not change else []
+            for container in given.containers:
+                curve = " ".join([preset, *([] if container == "sogxt" else [".sog"]), *filter(None, [change])])
+                for offset in [None, *offsets]:
+                    tuned = settings if offset is None else at_quality_offset(settings, offset)
+                    name = curve if offset is None else f"{curve} at {offset:g}"
+                    try:
+                        found = measured(scene, tuned, container=container, views=given.views)
+                    except KissgsError as error:
+                        sys.stderr.write(f"{name}: {error}\n")
+                        continue
+                    point = print_measurement(name, found), float(found.report.container_bytes)
+                    if change:
+                        others[name] = point
+                    else:
+                        points.setdefault(curve, []).append(point)
     for ending in given.external:
+        command, iterations = shlex.split(given.splat_transform), given.sog_iterations
         try:
-            external = measure_external(
-                given.scene,
-                ending,
-                shlex.split(given.splat_transform),
-                sh_iterations=given.sog_iterations,
-                views=given.views,
-            )
+            external = measure_external(scene, ending, command, sh_iterations=iterations, views=given.views)
         except KissgsError as error:
             sys.stderr.write(f"{error}\n")
             continue
-        psnr = print_external(f".{ending}", external)
-        others[f".{ending}"] = psnr, external.bytes
-    print_files(files)
+        others[f".{ending}"] = print_external(f".{ending}", external), float(external.bytes)
+    write("")
     for name, (psnr, size) in others.items():
         for curve, curve_points in points.items():
             equal = bytes_at(curve_points, psnr)
@@ -100,14 +121,6 @@ def images(evaluation: Evaluation) -> list[Any]:
         photos = [f"{mean.candidate.psnr:.2f}", signed(mean.change), f"{mean.candidate.ssim:.4f}"]
     worst = evaluation.worst.comparison.candidate_vs_reference.psnr
     return [*photos, f"{other.psnr:.2f}", f"{other.ssim:.4f}", f"{worst:.2f}"]
-
-
-def print_files(files: dict[str, dict[str, int]]) -> None:
-    """Print the bytes of every file of the containers."""
-    write("")
-    head("bytes of", *files)
-    for name in dict.fromkeys(name for each in files.values() for name in each):
-        row(name, *(each.get(name, "") for each in files.values()))
 
 
 if __name__ == "__main__":

@@ -1,21 +1,14 @@
-"""Arguments of studies, tables in Markdown, and bytes at equal quality."""
+"""Arguments of studies, and tables in Markdown."""
 
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from kissgs import EncodeSettings, KissgsError, Settings, Views, load_views
 from kissgs.settings import GOALS
-
-Curve = Sequence[tuple[float, float]]
-"""Points (quality, bytes) in any order."""
 
 
 def parser_of(about: str | None) -> argparse.ArgumentParser:
@@ -39,26 +32,10 @@ def capture(path: str) -> Views:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def training_views(views: Views, source: str) -> Views:
-    """Return views to train by ``photos``, ``cameras`` or ``scene``, and to evaluate by the held-out ones, or all."""
-    if source == "photos":
-        return views
-    bare = tuple(replace(view, photo=None) for view in views.train) if source == "cameras" else ()
-    return replace(views, train=bare, test=views.test or views.train)
-
-
 def positive(text: str) -> int:
     """Return a whole number of at least 1."""
     number = int(text)
     if number < 1:
-        raise ValueError
-    return number
-
-
-def fraction(text: str) -> float:
-    """Return a number above 0 and up to 1."""
-    number = float(text)
-    if not 0 < number <= 1:
         raise ValueError
     return number
 
@@ -97,7 +74,19 @@ def head(*names: str) -> None:
 
 def row(*cells: object) -> None:
     """Print a row of a table: numbers with thousands separators, other texts as they are."""
-    write("| " + " | ".join(f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in cells) + " |")
+    write(_line(cells))
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return a table without its empty columns; empty if it has no rows."""
+    kept = [number for number in range(len(head)) if any(row[number] != "" for row in rows)]
+    lines = [[cells[number] for number in kept] for cells in (head, *rows)]
+    lines.insert(1, ["---"] * len(kept))
+    return "".join(f"{_line(cells)}\n" for cells in lines) if rows else ""
+
+
+def _line(cells: Sequence[object]) -> str:
+    return "| " + " | ".join(f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in cells) + " |"
 
 
 def signed(value: float | None, digits: int = 2) -> str:
@@ -108,32 +97,3 @@ def signed(value: float | None, digits: int = 2) -> str:
 def percent(share: float | None) -> str:
     """Return a change as a signed percentage; empty for None."""
     return "" if share is None else f"{100 * share:+.1f} %"
-
-
-def bytes_at(curve: Curve, quality: float) -> float | None:
-    """Return the bytes at this quality, their logarithm interpolated linearly; None beyond the ends of the curve."""
-    x, y = _sorted(curve)
-    if not len(x) or not x[0] <= quality <= x[-1]:
-        return None
-    return float(np.exp(np.interp(quality, x, y)))
-
-
-def saving(curve: Curve, other: Curve) -> float | None:
-    """Return the share of bytes that ``other`` saves at equal quality, on average; negative if it needs more.
-
-    The Bjøntegaard delta rate (VCEG-M33), negated, with linear interpolation: the mean difference of the logarithms of
-    bytes over the range of quality that both curves cover. None if there is no such range.
-    """
-    (x0, y0), (x1, y1) = _sorted(curve), _sorted(other)
-    low = max(x.min(initial=np.inf) for x in (x0, x1))
-    high = min(x.max(initial=-np.inf) for x in (x0, x1))
-    if not low < high:
-        return None
-    grid = np.linspace(low, high, 1001)
-    return 1 - float(np.exp(np.mean(np.interp(grid, x1, y1) - np.interp(grid, x0, y0))))
-
-
-def _sorted(curve: Curve) -> tuple[np.ndarray, np.ndarray]:
-    """Return ascending finite qualities, and the logarithms of the bytes."""
-    kept = sorted((quality, math.log(size)) for quality, size in curve if math.isfinite(quality))
-    return np.array([q for q, _ in kept]), np.array([b for _, b in kept])

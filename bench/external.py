@@ -34,13 +34,11 @@ def measure_external(
 
     Without a GPU, ``.sog`` of a scene of degree 3 takes minutes for each of ``sh_iterations``.
     """
-    if sys.platform == "win32":
-        raise UnsupportedError("Windows does not report the resources of a process; use another system")
     iterations = [] if sh_iterations is None or ending != "sog" else ["-i", str(sh_iterations)]
     with tempfile.TemporaryDirectory() as folder:
         encoded, decoded = Path(folder, f"scene.{ending}"), Path(folder, "decoded.ply")
-        wall, encode_cpu, memory = _convert(command, scene.resolve(), encoded, iterations)
-        _, decode_cpu, other_memory = _convert(command, encoded, decoded, [])
+        wall, encode_cpu, memory = convert(command, scene.resolve(), encoded, iterations)
+        _, decode_cpu, other_memory = convert(command, encoded, decoded, [])
         return External(
             bytes=encoded.stat().st_size,
             encode_seconds=wall,
@@ -63,8 +61,10 @@ sys.exit(os.waitstatus_to_exitcode(status))
 """A small process that starts the tool: Linux counts the memory of the process that starts another as the other's."""
 
 
-def _convert(command: Sequence[str], source: Path, target: Path, options: list[str]) -> tuple[float, float, int]:
+def convert(command: Sequence[str], source: Path, target: Path, options: list[str]) -> tuple[float, float, int]:
     """Run the tool; return its wall time, its CPU time and its largest resident set."""
+    if sys.platform == "win32":
+        raise UnsupportedError("Windows does not report the resources of a process; use another system")
     call = [*command, "-g", "cpu", "-w", *options, str(source), str(target)]
     done = subprocess.run(
         [sys.executable, "-ISc", WATCHER, *call], check=False, capture_output=True, text=True, errors="replace"

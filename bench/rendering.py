@@ -1,4 +1,4 @@
-"""Processor time of the rasteriser forward and backward, of loss and Adam, of training steps and removal scores.
+"""Processor time of the rasteriser forward and backward, of training steps and of removal scores.
 
     python bench/rendering.py fox.ply --views fox --gaussians 20000 79451 300000 1000000
 
@@ -20,8 +20,8 @@ from kissgs.core.context import Pace, load_kernels
 from kissgs.core.resources import Workers, keep_free_memory
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.cpu.frame import Gradients, draw
-from kissgs.rendering.differentiable import photometric_loss, rasterize
+from kissgs.rendering.cpu.frame import draw
+from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.rasterizer import removal_scores, render
 from kissgs.training.loop import TrainingPlan, torch_threads, train
 from kissgs.training.model import GaussianModel
@@ -31,7 +31,7 @@ REPEATS = 5
 NO_RATES = dict.fromkeys(ATTRIBUTES, 0.0)
 """Learning rates of 0, so that every repeat finds the same scene."""
 
-NAMES = "forward", "forward + backward", "L1 + SSIM", "Adam", "forward + scores", "training step"
+NAMES = "forward", "forward + backward", "forward + scores", "training step"
 
 
 def main() -> None:
@@ -62,10 +62,8 @@ def one_view(splats: Splats, model: GaussianModel, camera: Camera) -> tuple[int,
     """Return the number of Gaussians that touch the image, and the milliseconds of each repeat by name."""
     viewmats, Ks = torch.from_numpy(camera.viewmat[None]), torch.from_numpy(camera.K[None])
     weights = torch.rand((1, camera.height, camera.width, 3), generator=torch.Generator().manual_seed(0))
-    received: list[Gradients] = []
 
-    def differentiate() -> torch.Tensor:
-        received.clear()
+    def differentiate() -> None:
         images, _ = rasterize(
             model.gaussians(),
             viewmats=viewmats,
@@ -75,21 +73,13 @@ def one_view(splats: Splats, model: GaussianModel, camera: Camera) -> tuple[int,
             dilation=camera.dilation,
             antialiased=splats.antialiased,
             threads=0,
-            receive=received.append,
+            receive=lambda gradients: None,
         )
         torch.autograd.backward(images, weights)
-        return images.detach()
 
-    def adam() -> None:
-        model.add_gradients(received[0])
-        model.step(NO_RATES)
-
-    images = differentiate().requires_grad_()
     operations: tuple[Callable[[], object], ...] = (
         lambda: render(splats, camera),
         differentiate,
-        lambda: torch.autograd.backward(photometric_loss(images, weights, threads=0)),
-        adam,
         lambda: removal_scores(splats, [camera]),
     )
     with torch_threads(0):

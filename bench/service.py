@@ -1,6 +1,6 @@
 """Costs of the service beyond the compression itself, measured on one that is started and stopped.
 
-python bench/service.py scene.ply
+python bench/service.py
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -19,25 +18,20 @@ from pathlib import Path
 import httpx
 
 from bench.common import parser_of, run, write
-from kissgs import KissgsError, Preset, Remote, Settings, load, sample_scene, save
+from kissgs import KissgsError, sample_scene, save
 
-UPLOAD_BYTES = 500_000_000
 POLLS = 600
-REPEATS = 5
 
 
 def main() -> None:
-    """Measure the time of status requests, memory during uploads, and ``fast`` jobs beside ``kissgs compress``."""
+    """Print the time of status requests, and the memory of the server."""
     parser = parser_of(__doc__)
-    parser.add_argument("scene", type=Path)
-    scene = parser.parse_args().scene
-    load(scene)  # refuses what is no scene
+    parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with service(folder / "data") as (url, pid), httpx.Client(base_url=url, trust_env=False) as http:
             latency(http, folder)
-            upload_memory(pid, http, folder)
-            overhead(url, scene, folder)
+            write(f"memory of the server: {peak_memory(pid) / 2**20:.0f} MiB")
 
 
 def latency(http: httpx.Client, folder: Path) -> None:
@@ -60,49 +54,10 @@ def latency(http: httpx.Client, folder: Path) -> None:
     write(f"status while a job runs: p50 {median:.1f} ms, p99 {late:.1f} ms ({len(spent)} requests)")
 
 
-def upload_memory(pid: int, http: httpx.Client, folder: Path) -> None:
-    """Print the memory of the server, and how much it grows while a large scene arrives."""
-    path = folder / "upload.ply"
-    save(sample_scene(20_000), path)
-    header, end, rows = path.read_bytes().partition(b"end_header\n")
-    times = round(UPLOAD_BYTES / len(rows))
-    with path.open("wb") as file:
-        file.write(header.replace(b"vertex 20000\n", b"vertex %d\n" % (20_000 * times)) + end)
-        for _ in range(times):
-            file.write(rows)
-    before, begun = peak_memory(pid), time.perf_counter()
-    with path.open("rb") as file:
-        answer = http.post("/v1/jobs", params={"options": '{"preset": "fast"}'}, timeout=600, content=file)
-    rate = path.stat().st_size / (time.perf_counter() - begun) / 1e6
-    http.delete(answer.raise_for_status().json()["links"]["self"], timeout=10)
-    grown = peak_memory(pid) - before
-    write(f"memory of the server: {before / 2**20:.0f} MiB, {grown / 2**20:+.1f} during an upload at {rate:.0f} MB/s")
-
-
 def peak_memory(pid: int) -> int:
     """Return the largest resident set of a process of Linux, bytes."""
     text = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
     return int(text.partition("VmHWM:")[2].split()[0]) << 10
-
-
-def overhead(url: str, scene: Path, folder: Path) -> None:
-    """Print the seconds of ``fast`` jobs beside those of the command, which also starts Python."""
-    here, there, uploads, target = [], [], [], folder / "out.zip"
-    command = [sys.executable, "-c", "from kissgs.cli.main import main; main()", "compress", str(scene), "-p", "fast"]
-    with Remote(url) as remote:
-        for repeat in range(REPEATS + 1):
-            begun = time.perf_counter()
-            subprocess.run([*command, "-q", "-f", "-o", str(target)], check=True)
-            middle = time.perf_counter()
-            job = remote.submit(scene, settings=Settings(preset=Preset.FAST))
-            uploaded = time.perf_counter()
-            remote.download(remote.follow(job["id"]), target, overwrite=True)
-            if repeat:  # the first warms the caches of both
-                here.append(middle - begun)
-                uploads.append(uploaded - middle)
-                there.append(time.perf_counter() - uploaded)
-    command_s, upload_s, job_s = map(statistics.median, (here, uploads, there))
-    write(f"{scene.name}: kissgs compress {command_s:.2f} s, the job {job_s:.2f} s after {upload_s:.2f} s of upload")
 
 
 @contextlib.contextmanager

@@ -2,10 +2,10 @@
 
     python bench/viewers.py fox.ply balanced.sog other.sog --views fox -o fox.csv
 
-Each drawing of a file is compared with the drawing of the scene by the same renderer: a viewer or kissgs.render. The
-viewers have their own settings, or with --exact those of the original rasteriser where they can. Row "scene.ply"
-compares the viewer with kissgs.render. "reordered.ply" is the scene with its rows shuffled: what the order of Gaussians
-alone changes. Needs Chromium, and what scripts/setup dev installs. NAME.csv gets a contact sheet, NAME.png, beside it.
+Each drawing of a file is compared with the drawing of the scene by the same renderer: a viewer, with its own settings,
+or kissgs.render. Row "scene.ply" compares the viewer with kissgs.render. "reordered.ply" is the scene with its rows
+shuffled: what the order of Gaussians alone changes. Needs Chromium, and what scripts/setup dev installs. NAME.csv gets
+a contact sheet, NAME.png, beside it.
 """
 
 from __future__ import annotations
@@ -63,7 +63,6 @@ def main() -> None:
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--size", nargs=2, type=positive, default=(480, 360), metavar=("W", "H"), help="of images")
     parser.add_argument("--cameras", type=positive, default=6, help="largest number of cameras")
-    parser.add_argument("--exact", action="store_true", help="settings of the original rasteriser")
     parser.add_argument("-o", "--output", type=Path, metavar="NAME.csv", help="table")
     given = parser.parse_args()
     if given.output is not None and given.output.suffix == ".png":
@@ -74,7 +73,7 @@ def main() -> None:
     files += [
         Drawn(path.name, path.read_bytes(), with_origin(clean(load(path))[0], scene.origin)) for path in given.files
     ]
-    draw(files, chosen_cameras(scene, given.views, given.cameras, given.size), given.exact)
+    draw(files, chosen_cameras(scene, given.views, given.cameras, given.size))
     table = list(rows(files))
     head(*map(str, table[0]))
     for cells in table[1:]:
@@ -115,7 +114,7 @@ def chosen_cameras(scene: Splats, views: Views | None, count: int, size: Sequenc
     return [each.resized(size[0], round(size[0] * each.height / each.width)) for each in spread]
 
 
-def draw(files: Sequence[Drawn], cameras: Sequence[Camera], exact: bool) -> None:
+def draw(files: Sequence[Drawn], cameras: Sequence[Camera]) -> None:
     """Draw all files with all renderers, over black."""
     for drawn in files:
         drawn.images["kissgs"] = [render_clamped(drawn.splats, each, np.zeros(3), Context(0)) for each in cameras]
@@ -124,7 +123,7 @@ def draw(files: Sequence[Drawn], cameras: Sequence[Camera], exact: bool) -> None
     try:
         with chromium() as browser:
             for name, endings in READ.items():
-                with opened(name, browser, "" if exact else "?defaults") as (viewer, _):
+                with opened(name, browser, "?defaults") as (viewer, _):
                     for drawn in files:
                         ending = next((each for each in endings if drawn.name.endswith(f".{each}")), None)
                         if ending:

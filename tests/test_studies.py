@@ -17,7 +17,8 @@ from PIL import Image
 
 import kissgs
 from bench import paper_parts
-from bench.common import at_quality_offset, bytes_at, saving
+from bench.common import at_quality_offset
+from bench.curves import bytes_at
 from bench.external import measure_external
 from bench.rendering import resampled
 from kissgs.core.context import Context
@@ -47,14 +48,6 @@ def test_bytes_are_interpolated_exponentially_and_not_extrapolated(growth):
         assert bytes_at([*curve, (math.inf, 5.0), (math.nan, 5.0)], quality) == pytest.approx(1e6 * growth**quality)
     assert [bytes_at(curve, quality) for quality in (29.99, 41.01, math.nan)] == [None] * 3
     assert bytes_at([], 30.0) is None
-
-
-def test_the_saving_is_the_mean_difference_where_both_curves_are():
-    curve = [(q, 1e6 * 1.1**q) for q in (30.0, 34.0, 41.0)]
-    other = [(q, 0.8e6 * 1.1**q) for q in (33.0, 38.0, 50.0)]
-    assert saving(curve, other) == pytest.approx(0.2)
-    assert saving(other, curve) == pytest.approx(-0.25)
-    assert saving(curve, [(50.0, 1.0), (60.0, 2.0)]) is None
 
 
 def test_a_quality_offset_replaces_every_goal():

@@ -277,6 +277,7 @@ def compare_images(
     context: Context = DEFAULT_CONTEXT,
     *,
     reference_images: dict[int, Rendering] | None = None,
+    lpips: bool = False,
 ) -> Evaluation:
     """Compare two scenes from these views alone: the test views, or the training views if there are none.
     ``reference_images`` are the reference's renderings by number of the view, read and filled, for comparisons of many
@@ -284,7 +285,7 @@ def compare_images(
     reference, candidate = clean(reference)[0], clean(candidate)[0]
     if context.device == "cpu":
         load_kernels(context.progress)
-    measure = _measure(False, False, context.device)
+    measure = _measure(False, lpips, context.device)
     evaluation = _compare_views(reference, candidate, views, "test", measure, context, reference_images)
     context.progress("evaluate", 1.0)
     return evaluation
