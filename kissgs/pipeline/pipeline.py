@@ -21,7 +21,7 @@ from kissgs.finetuning.result import FinetuneReport
 from kissgs.formats import ContainerName, named_container
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.choice import choose, resolved
-from kissgs.pipeline.containers import FILES
+from kissgs.pipeline.encoding import FILES, Work, check_finetuning, encode, make_tuner, measure, plan, write
 from kissgs.pipeline.goal import Attempt
 from kissgs.pipeline.limited_time import Expected
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
@@ -31,7 +31,6 @@ from kissgs.training.checkpoint import delete_checkpoints, finetune_checkpoint_p
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
-    from kissgs.pipeline.encoding import Work
     from kissgs.pipeline.goal import Container
 
 
@@ -278,8 +277,6 @@ def compress(
     Raises:
         KissgsError: one of its subclasses, with a message for the user.
     """
-    from kissgs.pipeline.encoding import Work
-
     views = _loaded(views)
     requested, keep_all = settings or Settings(), sensitivity is not None
     settings = resolved(requested, views, keep_all=keep_all)
@@ -391,8 +388,6 @@ def _check(
     device: Device,
 ) -> None:
     """Refuse what cannot be done, before any work."""
-    from kissgs.pipeline.encoding import check_finetuning
-
     if target is not None:
         check_destination(target, overwrite=overwrite, names=FILES)
     if checkpoint is not None and settings.time_limit is not None:
@@ -432,7 +427,6 @@ def _search(work: Work, *, time_only: bool) -> tuple[Container, tuple[Attempt, .
 def _encode_once(work: Work, checkpoint: Path | None, *, disposable: bool) -> Container:
     """Plan, fine-tune if the settings say so, and write the files. A disposable scene that is not fine-tuned is
     forgotten once it is planned, so that its memory is free for the files."""
-    from kissgs.pipeline.encoding import encode, make_tuner, measure, plan, write
     from kissgs.pipeline.goal import Container
 
     settings, compacted = work.settings.encode, len(work.original) - len(work.splats)

@@ -20,7 +20,7 @@ from kissgs.core.splats import ATTRIBUTES
 from kissgs.evaluation.evaluate import evaluate
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.tune import Tuner, _Result
-from kissgs.pipeline.containers import DECODERS, MODELS, write_files
+from kissgs.pipeline.encoding import DECODERS, MODELS, write_files
 from kissgs.pipeline.scene_files import describe
 from kissgs.planning import rotation_forms
 from kissgs.rendering.sensitivity import measure_sensitivity
