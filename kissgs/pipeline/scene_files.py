@@ -41,7 +41,7 @@ def recognise(source: Path | bytes | Mapping[str, bytes], *, name: str | None = 
     """Return the format of a scene: a file, a folder, the bytes of a file, or a container's files in memory.
 
     The metadata file of a container and the manifest of a streamed scene stand for their folder. ``.splat`` is
-    recognised by its name only.
+    recognised by its name only, checkpoints too.
 
     Args:
         source: the scene, or the first 512 bytes of a file, of which every zip then counts as "sogxt".
@@ -64,7 +64,7 @@ def recognise(source: Path | bytes | Mapping[str, bytes], *, name: str | None = 
         return by_content
     ending = Path(name).suffix
     of_ending = next((kind for kind, each in FORMATS.items() if ending in each.endings), "ply")
-    if FORMATS[of_ending].by_ending and head[:4] not in ZIP_MAGICS:
+    if FORMATS[of_ending].by_ending and (FORMATS[of_ending].is_zip or head[:4] not in ZIP_MAGICS):
         return of_ending
     if is_container(source):
         return _packed_format(source, "sog" if of_ending == "sog" else "sogxt")
@@ -214,7 +214,8 @@ def load(
 
     Args:
         path: ``.ply``, ``.spz``, ``.splat``, ``.ksplat``, ``.glb`` or ``.gltf``; a SOG-XT or SOG container (zip,
-            folder, or its ``meta.json``); a streamed scene (zip, folder, or its ``lod-meta.json`` or ``levels.json``).
+            folder, or its ``meta.json``); a streamed scene (zip, folder, or its ``lod-meta.json`` or ``levels.json``);
+            a checkpoint of gsplat (``.pt``) or splatfacto (``.ckpt``).
         max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
         level: level of detail of a streamed scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
