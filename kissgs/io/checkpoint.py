@@ -38,7 +38,7 @@ _SHAPES: dict[str, tuple[tuple[int, ...], ...]] = {
 }
 """Shapes of attributes in files, without the number of Gaussians; the first is that of a scene."""
 
-_RANK = re.compile(r"(?P<step>.+_rank)(?P<rank>[0-9]+)(?P<ending>\.\w+)")
+_RANK = re.compile(r"(?P<step>.+_rank)(?P<rank>[0-9]{1,4})(?P<ending>\.\w+)")
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,6 @@
 """Oracle: checkpoints that torch writes as the trainers do, of random values."""
 
+import contextlib
 import os
 import sys
 
@@ -200,10 +201,8 @@ def test_damaged_copies_are_a_scene_or_refused(tmp_path):
         for at in rng.integers(0, len(data), 3):
             data[at] = rng.integers(0, 256)
         (tmp_path / "a.pt").write_bytes(data[: rng.choice([len(data), len(data) // 2])])
-        try:
+        with contextlib.suppress(KissgsError):
             assert read_checkpoint(tmp_path / "a.pt").sh_degree < len(COEFFICIENTS)
-        except KissgsError:
-            pass
 
 
 def test_without_torch(tmp_path, monkeypatch):

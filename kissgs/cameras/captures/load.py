@@ -125,7 +125,7 @@ def load_views(
         source = source.replace(f"{archive}/", "").replace(f"{archive}", "the archive")
     if photos is not None:
         source = f"{source}, photographs of {_folders(photos)}"
-        return Views(train, test, background, source, similarities=moves)
+        return Views(train, test, background, source, similarities=moves, points=capture.points)
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
     note = "the archive has no photographs" if unpacked else note
