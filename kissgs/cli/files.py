@@ -222,8 +222,7 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
     if output is not None and "-" in inputs:
         raise OutputError(f"-o {output} is a folder, but standard input has no name; give -o NAME{suffix}")
     targets = []
-    for name in inputs:
-        stem = _stem(name)
+    for name, stem in zip(inputs, _names(inputs) if output is not None else map(_stem, inputs), strict=True):
         if not stem:
             raise OutputError(f"{name} has no name to derive the output from; give the output with -o")
         folder = output if output is not None else Path(name).parent
@@ -231,6 +230,21 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
     if len(set(targets)) < len(targets):
         raise OutputError("two inputs have the same name and would become one file; process them one by one")
     return targets
+
+
+def _names(inputs: list[str]) -> list[str]:
+    """Return the names of outputs in one folder: those of the inputs; of equal ones, those of the nearest folders above
+    them that all differ."""
+    stems = [_stem(name) for name in inputs]
+    names = list(stems)
+    for stem in {each for each in stems if stems.count(each) > 1}:
+        equal = [n for n, each in enumerate(stems) if each == stem]
+        paths = [Path(os.path.abspath(inputs[n])) for n in equal]  # noqa: PTH100  links keep their names
+        above = [[folder.name for folder in path.parents] for path in paths]
+        differing = next((level for level in zip(*above, strict=False) if len(set(level)) == len(equal)), None)
+        for n, name in zip(equal, differing or [stem] * len(equal), strict=True):
+            names[n] = name
+    return names
 
 
 def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:

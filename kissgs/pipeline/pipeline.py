@@ -195,7 +195,7 @@ def compact(
     """
     from kissgs.compaction.budget import compact_scene
 
-    views = _loaded(views)
+    views = _loaded(views, source)
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_ply(target, overwrite=overwrite)
@@ -277,7 +277,7 @@ def compress(
     Raises:
         KissgsError: one of its subclasses, with a message for the user.
     """
-    views = _loaded(views)
+    views = _loaded(views, source)
     requested, keep_all = settings or Settings(), sensitivity is not None
     settings = resolved(requested, views, keep_all=keep_all)
     target, kind = None if destination is None else Path(destination), named_container(container, destination)
@@ -360,13 +360,13 @@ def compress(
     return Compressed(encoded.files, order, report, remaining, kind)
 
 
-def _loaded(views: Views | AnyPath | None) -> Views | None:
-    """Return the views, loaded if they are the path of a capture."""
+def _loaded(views: Views | AnyPath | None, source: Splats | AnyPath | bytes) -> Views | None:
+    """Return the views, loaded for the scene if they are the path of a capture."""
     if views is None:
         return None
     from kissgs.cameras.captures.load import as_views
 
-    return as_views(views)
+    return as_views(views, None if isinstance(source, Splats | bytes) else Path(source))
 
 
 def _fitting(splats: Splats, views: Views | None, context: Context, *, force: bool) -> tuple[Views | None, str]:

@@ -104,6 +104,22 @@ def test_cameras_are_moved_into_nerfstudios_frame_where_the_scene_is_there(tmp_p
         np.testing.assert_allclose(rendered(moved_scene(), view.camera), expected, atol=0.02)
 
 
+def test_the_run_of_a_scene_has_nerfstudios_frame(tmp_path):
+    """nerfstudio writes the transform beside the folder of checkpoints, not into the capture."""
+    write_photos(tmp_path / "data/images")
+    write_transforms(tmp_path / "data")
+    run_folder = tmp_path / "outputs/data/splatfacto/2026-01-01"
+    (run_folder / "nerfstudio_models").mkdir(parents=True)
+    write_dataparser(run_folder)
+    for scene in (run_folder / "nerfstudio_models/step-000029999.ckpt", run_folder / "splat.ply"):
+        views = kissgs.load_views(tmp_path / "data", scene=scene)
+        assert "moved by dataparser_transforms.json" in fitting_views(moved_scene(), views)[1]
+    kissgs.save(moved_scene(), scene)
+    settings = kissgs.Settings.from_preset("fast")
+    report = kissgs.compress(scene, settings=settings, evaluate=True, views=tmp_path / "data").report
+    assert "moved by dataparser_transforms.json" in report.note
+
+
 def test_evaluate_moves_cameras_too(tmp_path):
     write_photos(tmp_path / "images")
     write_transforms(tmp_path)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import io
 import zipfile
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path, PurePosixPath
 
@@ -46,6 +49,7 @@ published results depend; INRIA's code limits only the width, so that portrait p
 
 HOLD_OUT = 8  # every eighth view, starting with the first, is held out: the protocol of 3DGS and Mip-NeRF 360
 JSONS = ("transforms.json", "transforms_train.json")
+MAX_ARGUMENTS_BYTES = 1 << 16  # of cfg_args that are read; INRIA's trainer writes 300
 MAX_ASPECT_ERROR = 0.01  # relative difference of aspect ratios of photograph and camera; scaled copies round sides
 
 
@@ -56,6 +60,7 @@ def load_views(
     images: Path | None = None,
     resolution: int | None = None,
     hold_out: int = HOLD_OUT,
+    scene: Path | None = None,
     unpacked: bool = False,
 ) -> Views:
     """Load the views of a capture; of its photographs, only the headers are read.
@@ -70,8 +75,12 @@ def load_views(
     are loaded.
 
     Cameras are in the coordinates of the camera file. nerfstudio trains scenes in others: its
-    ``dataparser_transforms.json``, in the capture's folder or beside the camera file, is read for those who compare the
-    views with a scene (:attr:`Views.similarities`).
+    ``dataparser_transforms.json``, in the folder of the run that ``scene`` is from, in the capture's folder or beside
+    the camera file, is read for those who compare the views with a scene (:attr:`Views.similarities`); gsplat's frame
+    follows from the points of a COLMAP model (:attr:`Views.points`).
+
+    A folder that INRIA's trainer has written stands for the capture, the folder of photographs and the background that
+    its ``cfg_args`` names.
 
     If there is no folder of photographs, views have cameras only, without distortion, and ``note`` says so. If only
     some photographs are missing, an error is raised, because results from fewer views could pass for those of all.
@@ -86,6 +95,7 @@ def load_views(
         resolution: maximum of the longer side, pixels; None for 1600.
         hold_out: every ``hold_out``-th view in order of names, starting with the first, is held out; 0 for none. A
             split that the capture defines takes precedence.
+        scene: file of the scene that the views are for.
         unpacked: ``path`` is the folder of an archive from elsewhere. The capture is its uppermost folder with cameras,
             and photographs are looked for in it only, wherever a camera file says they are.
 
@@ -101,16 +111,22 @@ def load_views(
         raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
     path = archive = Path(path)
     try:
+        training = None if unpacked else _trained_on(path)
+        if training is not None:
+            path, images = training.capture, training.photographs if scale is None and images is None else images
         if scale is None and images is None and not unpacked:
             path, scale = _of_scale(path)
         path = _uppermost_with_cameras(path) if unpacked else path
         capture, folder = _read_capture(path), path if path.is_dir() else path.parent
-        moves = similarities(dataparser_file((folder, capture.root)), capture.applied)
+        run = [] if scene is None else list(scene.absolute().parents)[:2]
+        moves = similarities(dataparser_file((*run, folder, capture.root)), capture.applied)
     except OSError as error:  # even testing for a path fails without permission or if a name is too long
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
     names = [posed.photo for posed in capture.images]
     photos = find_photos(names, capture.root, scale=scale, images=images, inside=unpacked)
     white = capture.white and (photos is None or read_photo_header(photos[0].path).transparent)
+    if training is not None:
+        white = training.white
     background = np.full(3, float(white), dtype=np.float32)
     limit = DEFAULT_RESOLUTION if resolution is None else resolution
     views = []
@@ -132,9 +148,9 @@ def load_views(
     return Views(train, test, background, f"{source}, no photographs", note, moves)
 
 
-def as_views(views: Views | str | PathLike[str] | None) -> Views | None:
-    """Return the views, which are loaded if they are the path of a capture."""
-    return views if views is None or isinstance(views, Views) else load_views(Path(views))
+def as_views(views: Views | str | PathLike[str] | None, scene: Path | None = None) -> Views | None:
+    """Return the views, which are loaded for the scene in a file if they are the path of a capture."""
+    return views if views is None or isinstance(views, Views) else load_views(Path(views), scene=scene)
 
 
 def _read_capture(path: Path) -> Capture:
@@ -168,6 +184,59 @@ def _of_scale(path: Path) -> tuple[Path, int | None]:
     if prefix == IMAGES and scale.isdecimal() and path.is_dir() and not _has_cameras(path):
         return path.parent, int(scale)
     return path, None
+
+
+@dataclass(frozen=True, slots=True)
+class _Training:
+    """The content of ``cfg_args`` of INRIA's trainer."""
+
+    capture: Path
+    photographs: Path | None  # their folder; None for the usual one
+    white: bool  # whether the background is
+
+
+def _trained_on(folder: Path) -> _Training | None:
+    """Return what INRIA's trainer was given; None of a folder that it has not written, or that has cameras of its own.
+    ``cfg_args`` is Python's text of a ``Namespace``: it is parsed and never evaluated."""
+    file, given = folder / "cfg_args", dict[str, object]()
+    if not file.is_file() or _has_cameras(folder):
+        return None
+    with suppress(SyntaxError, ValueError, RecursionError, MemoryError), open_file(file) as (opened, _):
+        call = ast.parse(opened.read(MAX_ARGUMENTS_BYTES).decode(), mode="eval").body
+        for each in call.keywords if isinstance(call, ast.Call) else ():
+            if isinstance(each.value, ast.Constant):
+                given[str(each.arg)] = each.value.value
+    capture, photographs = given.get("source_path"), given.get("images")
+    if not isinstance(capture, str):
+        raise InvalidViewsError(f"{file} names no source_path; name the folder of the capture")
+    if not Path(capture).exists():
+        raise InvalidViewsError(f"{file} names the capture {capture:.200}, which is not here; name its folder")
+    usual = not isinstance(photographs, str) or photographs == IMAGES or not (Path(capture) / photographs).is_dir()
+    named = None if usual else Path(capture) / str(photographs)
+    return _Training(Path(capture), named, given.get("white_background") is True)
+
+
+def capture_of(path: Path, names: Sequence[str]) -> Path:
+    """Return the capture of a scene: where ``path`` is a folder of captures, the first folder in it with one of these
+    names, else ``path``."""
+    if not holds_captures(path):
+        return path
+    found = next((path / name for name in names if name and (path / name).is_dir()), None)
+    if found is None:
+        wanted = " or ".join(dict.fromkeys(filter(None, names)))
+        raise InvalidViewsError(f"{path} has several captures, but none in a folder {wanted}; name that of the scene")
+    return found
+
+
+def holds_captures(path: Path) -> bool:
+    """Whether a folder without cameras has captures in its folders."""
+    with suppress(OSError, ValueError):
+        return path.is_dir() and not _is_capture(path) and any(_is_capture(each) for each in path.iterdir())
+    return False
+
+
+def _is_capture(folder: Path) -> bool:
+    return _has_cameras(folder) or (folder / "cfg_args").is_file() or _of_scale(folder)[1] is not None
 
 
 def _has_cameras(folder: Path) -> bool:
