@@ -22,7 +22,7 @@ from kissgs.cli.options import (
     chosen,
     count_of,
     open_common_views,
-    open_own_views,
+    open_views,
     output_option,
     share_of,
     with_option_groups,
@@ -108,7 +108,7 @@ def compact(
 
     def work(scene: str, target: Path) -> Result:
         piped = str(target) == "-"
-        capture = open_own_views(training.views, scene, target)
+        capture = open_views(training.views, scene, target)
         with progress_bar(quiet) as bar, stoppable(bar, settings.searches) as progress:
             result = run(
                 source(scene),

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 from typer import Argument, Option
 
+from kissgs.cli.files import is_folder
 from kissgs.core.context import Device
 from kissgs.core.errors import UnsupportedError
 from kissgs.formats import ENDINGS, SCENE_ENDINGS
@@ -411,30 +412,27 @@ def _is_host(word: str) -> bool:
 
 
 def open_views(
-    path: Path | None, scene: Path | None = None, *, scale: int | None = None, images: Path | None = None
+    path: Path | None,
+    scene: str | Path,
+    target: Path | None = None,
+    *,
+    scale: int | None = None,
+    images: Path | None = None,
 ) -> Views | None:
-    """Load the capture at ``path``, if there is one, for the scene in a file."""
-    if path is None:
-        return None
-    from kissgs.cameras.captures.load import load_views
-
-    return load_views(path, scene=scene, scale=scale, images=images)
-
-
-def open_own_views(path: Path | None, scene: str, target: Path) -> Views | None:
     """Load the capture at ``path``, if there is one; of a folder of captures, the one named as the scene's output, the
     scene, or the nearest folder above it."""
     if path is None:
         return None
-    from kissgs.cameras.captures.load import capture_of
+    from kissgs.cameras.captures.load import capture_of, load_views
 
     file = Path(scene).absolute()
-    return open_views(capture_of(path, [target.stem, file.stem, *(each.name for each in file.parents)]), file)
+    names = [*([] if target is None else [target.stem]), file.stem, *(each.name for each in file.parents)]
+    return load_views(capture_of(path, names), scene=file, scale=scale, images=images)
 
 
 def open_common_views(path: Path | None) -> Views | None:
     """Load the capture at ``path`` before any work, so that it is refused once and not for each scene; return None if
-    there is none, or it is a folder of captures."""
-    from kissgs.cameras.captures.load import holds_captures
+    there is none, or it may be a folder of captures."""
+    from kissgs.cameras.captures.load import is_capture, load_views
 
-    return None if path is None or holds_captures(path) else open_views(path)
+    return None if path is None or (is_folder(path) and not is_capture(path)) else load_views(path)

@@ -97,12 +97,8 @@ def scene_root(path: Path) -> Path:
         return path.parent
     if not _is_folder(path):
         return path
-    numbers = {}
-    with suppress(OSError):
-        for scene in path.glob("point_cloud/iteration_*/point_cloud.ply"):
-            number = scene.parent.name.removeprefix("iteration_")
-            numbers[scene] = int(number) if number.isdecimal() and len(number) < 10 else -1
-    return max(numbers, key=lambda scene: (numbers[scene], scene), default=path)
+    scenes = path.glob("point_cloud/iteration_[0-9]*/point_cloud.ply")
+    return max(scenes, key=lambda scene: (len(scene.parent.name), scene), default=path)  # in the order of numbers
 
 
 def is_container(source: Path | bytes) -> bool:

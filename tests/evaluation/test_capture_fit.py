@@ -8,7 +8,7 @@ import pytest
 from helpers.captured_scene import SCENE as CAPTURED
 from helpers.captured_scene import camera
 from helpers.command_line import failure, run
-from helpers.reference_cameras import Pose, point_bytes, write_binary, write_json, write_text
+from helpers.reference_cameras import Pose, point_bytes, write_binary, write_json
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -63,13 +63,13 @@ def write_dataparser(folder, transform=DATAPARSER):
     write_json(folder / "dataparser_transforms.json", {"transform": np.array(transform).tolist(), "scale": SCALE})
 
 
-def write_colmap(folder, write=write_text):
+def write_colmap(folder):
     images = [
         Pose(f"{n}.png", Rotation.from_matrix(each.viewmat[:3, :3]), each.viewmat[:3, 3])
         for n, each in enumerate(CAMERAS)
     ]
     focal = float(CAMERAS[0].K[0, 0])
-    write(folder / "sparse" / "0", {1: ("PINHOLE", *SIZE, (focal, focal, SIZE[0] / 2, SIZE[1] / 2))}, images)
+    write_binary(folder / "sparse" / "0", {1: ("PINHOLE", *SIZE, (focal, focal, SIZE[0] / 2, SIZE[1] / 2))}, images)
 
 
 @pytest.mark.parametrize(
@@ -183,36 +183,29 @@ def gsplat_scene(points, signs):
 POINTS = np.random.default_rng(5).normal((1, -0.5, 2), (4, 0.3, 1.5), (201, 3)) + [(0, 0, n / 99) for n in range(201)]
 
 
-def write_points(folder, ending="txt"):
-    write_colmap(folder, write_binary if ending == "bin" else write_text)
-    if ending == "bin":
-        (folder / "sparse/0/points3D.bin").write_bytes(point_bytes(POINTS))
-        return
-    lines = [f"{n} {x!r} {y!r} {z!r} 1 2 3 0.5 1 0 2 0" for n, (x, y, z) in enumerate(POINTS.tolist())]
-    (folder / "sparse/0/points3D.txt").write_text("\n".join(["# 3D point list", *lines, ""]))
+def write_points(folder, points=POINTS):
+    write_colmap(folder)
+    (folder / "sparse/0/points3D.bin").write_bytes(point_bytes(points))
 
 
-@pytest.mark.parametrize(("signs", "ending"), [(SIGNS[0], "txt"), *((signs, "bin") for signs in SIGNS)])
-def test_cameras_are_moved_into_gsplats_frame_where_the_scene_is_there(tmp_path, signs, ending):
+@pytest.mark.parametrize("signs", SIGNS)
+def test_cameras_are_moved_into_gsplats_frame_where_the_scene_is_there(tmp_path, signs):
     """The signs of its principal axes depend on the library that computes them, and on gsplat's version."""
     write_photos(tmp_path / "images")
-    write_points(tmp_path, ending)
+    write_points(tmp_path)
     scene = gsplat_scene(POINTS, signs)
-    for found in (
-        in_scene_frame(scene, kissgs.load_views(tmp_path)),
-        fitting_views(scene, kissgs.load_views(tmp_path))[0],
-    ):
-        for view in found.all:
-            np.testing.assert_allclose(
-                rendered(scene, view.camera), rendered(SCENE, CAMERAS[int(view.name[0])]), atol=0.02
-            )
-    assert "moved by gsplat's normalisation" in fitting_views(scene, kissgs.load_views(tmp_path))[1]
+    views = kissgs.load_views(tmp_path)
+    fitting, note = fitting_views(scene, views)
+    assert "moved by gsplat's normalisation" in note
+    for view in (*in_scene_frame(scene, views).all, *fitting.all):
+        expected = rendered(SCENE, CAMERAS[int(view.name[0])])
+        np.testing.assert_allclose(rendered(scene, view.camera), expected, atol=0.02)
 
 
 def test_a_scene_in_the_models_coordinates_needs_no_points(tmp_path):
     write_photos(tmp_path / "images")
     write_points(tmp_path)
-    (tmp_path / "sparse/0/points3D.txt").write_text("nothing that could be read")
+    (tmp_path / "sparse/0/points3D.bin").write_bytes(b"nothing that could be read")
     views = kissgs.load_views(tmp_path)
     found, note = fitting_views(SCENE, views)
     assert (found.train, note) == (views.train, "")  # the same objects
@@ -229,19 +222,17 @@ def test_gsplats_frame_is_not_guessed_without_photographs_that_show_the_scene(tm
 
 
 @pytest.mark.parametrize(
-    ("ending", "data", "message"),
+    ("data", "message"),
     [
-        ("bin", point_bytes(POINTS)[:-9], "truncated"),
-        ("bin", point_bytes(POINTS) + b"1", "continues for 1 bytes after its last point"),
-        ("bin", b"\xff" * 80, "declares"),
-        ("txt", b"1 2 3 4\n1 2 x 3 4\n", "line 2: not a point"),
-        ("txt", b"1 2 3\n", "line 1: not a point"),
+        (point_bytes(POINTS)[:-9], "truncated"),
+        (point_bytes(POINTS) + b"1", "continues for 1 bytes after its last point"),
+        (b"\xff" * 80, "declares"),
     ],
 )
-def test_damaged_points_are_named(tmp_path, ending, data, message):
-    path = tmp_path / f"points3D.{ending}"
+def test_damaged_points_are_named(tmp_path, data, message):
+    path = tmp_path / "points3D.bin"
     path.write_bytes(data)
-    with pytest.raises(InvalidViewsError, match=rf"points3D\.{ending}.*{message}"):
+    with pytest.raises(InvalidViewsError, match=rf"points3D\.bin.*{message}"):
         gsplat_similarities(path, [each.viewmat for each in CAMERAS])
 
 

@@ -1,4 +1,4 @@
-"""COLMAP models: ``cameras``, ``images`` and ``points3D``, as ``.bin`` or ``.txt``; how gsplat normalises them."""
+"""COLMAP models: ``cameras`` and ``images``, as ``.bin`` or ``.txt``; how gsplat normalises them."""
 
 from __future__ import annotations
 
@@ -308,7 +308,7 @@ def read_colmap(folder: Path) -> Capture:
     root = _root(folder)
     within = folder.resolve().relative_to(root)  # the files themselves may be links to others
     files = {str(within / path.name): path for path in (cameras_path, images_path)}
-    points = folder / f"points3D.{'bin' if binary else 'txt'}"
+    points = folder / "points3D.bin"
     return Capture(
         tuple(posed_images), root, f"COLMAP model {folder}", files, points=points if points.is_file() else None
     )
@@ -362,25 +362,14 @@ def _viewmat(record: ImageRecord, where: str) -> Float64[np.ndarray, "4 4"]:
 
 
 def read_points(path: Path) -> Float32[np.ndarray, "P 3"]:
-    """Return the positions of all points of a ``points3D.bin`` or ``points3D.txt``."""
-    if path.suffix == ".bin":
-        with open_file(path) as (file, size):
-            reader, found = _Reader(path, file, size), list[float]()
-            for _ in range(reader.count("points", _POINT3D.size)):
-                _, x, y, z, _, images = reader.unpack(_POINT3D)
-                found += (x, y, z)
-                reader.skip(images * _TRACK_BYTES)
-            reader.finish("point")
-        return np.array(found, dtype=np.float32).reshape(-1, 3)
-    found = []
-    for number, line in _lines(path):
-        if _is_comment(line):
-            continue
-        try:
-            _, x, y, z, *_ = line.split(maxsplit=4)
-            found += map(float, (x, y, z))
-        except ValueError as error:
-            raise InvalidViewsError(f"{path}, line {number}: not a point (POINT3D_ID X Y Z …)") from error
+    """Return the positions of all points of a ``points3D.bin``."""
+    with open_file(path) as (file, size):
+        reader, found = _Reader(path, file, size), list[float]()
+        for _ in range(reader.count("points", _POINT3D.size)):
+            _, *position, _, images = reader.unpack(_POINT3D)
+            found += position
+            reader.skip(images * _TRACK_BYTES)
+        reader.finish("point")
     return np.array(found, dtype=np.float32).reshape(-1, 3)
 
 
@@ -388,8 +377,6 @@ def read_points(path: Path) -> Float32[np.ndarray, "P 3"]:
 # up is the mean of the cameras' up axes; the origin and the unit are medians over the cameras; then the axes are the
 # principal ones of the points, of which the largest is x. The signs of principal axes differ by linear algebra library,
 # and newer versions turn the world upside down by another rule than older ones, so all four proper choices are given.
-
-_SIGNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
 def gsplat_similarities(path: Path, viewmats: Sequence[Float64[np.ndarray, "4 4"]]) -> tuple[Similarity, ...]:
@@ -399,29 +386,24 @@ def gsplat_similarities(path: Path, viewmats: Sequence[Float64[np.ndarray, "4 4"
     with np.errstate(all="ignore"):  # of cameras in one place and points in one, which the check finds
         first = _normalised_cameras(np.linalg.inv(np.array(viewmats)))
         moved = points @ first[:3, :3].T + first[:3, 3]
-        if len(points) < 2 or not np.isfinite(moved).all():
-            return ()
-        centre = np.median(moved, axis=0)
-        axes = np.linalg.eigh(np.cov(moved - centre, rowvar=False))[1][:, ::-1].T  # rows, the largest first
+    if len(points) < 2 or not np.isfinite(moved).all():
+        return ()
+    axes = np.linalg.eigh(np.cov(moved, rowvar=False))[1][:, ::-1].T  # rows, the largest first
     axes[0] *= np.sign(np.linalg.det(axes))
-    found = []
-    for signs in _SIGNS:
-        second = np.eye(4)
-        second[:3, :3] = np.array(signs)[:, None] * axes
-        second[:3, 3] = -second[:3, :3] @ centre
-        found.append(Similarity("gsplat's normalisation of the COLMAP model", second @ first))
-    return tuple(found)
+    second = np.eye(4)
+    second[:3, :3], second[:3, 3] = axes, -axes @ np.median(moved, axis=0)
+    source, signs = "gsplat's normalisation of the COLMAP model", ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
+    return tuple(Similarity(source, np.diag([*each, 1.0]) @ second @ first) for each in signs)
 
 
 def _normalised_cameras(poses: Float64[np.ndarray, "C 4 4"]) -> Float64[np.ndarray, "4 4"]:
     """Return the transform by the cameras alone: up becomes -y, the cameras look at the origin, and the median distance
     of their centres from it is 1. NaN or infinite where they determine none."""
-    up = -poses[:, :3, 1].mean(axis=0)
-    up /= np.linalg.norm(up)
-    down = np.array([0.0, -1.0, 0.0])
-    x, y, z = np.cross(up, down)
+    down = poses[:, :3, 1].mean(axis=0)
+    down /= np.linalg.norm(down)
+    x, y, z = np.cross(down, (0, 1, 0))
     skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turn = np.eye(3) + skew + skew @ skew / (1 + up @ down)
+    turn = np.eye(3) + skew + skew @ skew / (1 + down[1])
     centres, forward = poses[:, :3, 3] @ turn.T, poses[:, :3, 2] @ turn.T
     nearest = centres - (forward * centres).sum(axis=1, keepdims=True) * forward  # to the origin, on each axis of view
     shift = -np.median(nearest, axis=0)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import ast
 import io
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path, PurePosixPath
 
@@ -113,7 +112,7 @@ def load_views(
     try:
         training = None if unpacked else _trained_on(path)
         if training is not None:
-            path, images = training.capture, training.photographs if scale is None and images is None else images
+            path, images = training[0], training[1] if scale is None and images is None else images
         if scale is None and images is None and not unpacked:
             path, scale = _of_scale(path)
         path = _uppermost_with_cameras(path) if unpacked else path
@@ -125,8 +124,7 @@ def load_views(
     names = [posed.photo for posed in capture.images]
     photos = find_photos(names, capture.root, scale=scale, images=images, inside=unpacked)
     white = capture.white and (photos is None or read_photo_header(photos[0].path).transparent)
-    if training is not None:
-        white = training.white
+    white = white if training is None else training[2]
     background = np.full(3, float(white), dtype=np.float32)
     limit = DEFAULT_RESOLUTION if resolution is None else resolution
     views = []
@@ -186,57 +184,36 @@ def _of_scale(path: Path) -> tuple[Path, int | None]:
     return path, None
 
 
-@dataclass(frozen=True, slots=True)
-class _Training:
-    """The content of ``cfg_args`` of INRIA's trainer."""
-
-    capture: Path
-    photographs: Path | None  # their folder; None for the usual one
-    white: bool  # whether the background is
-
-
-def _trained_on(folder: Path) -> _Training | None:
-    """Return what INRIA's trainer was given; None of a folder that it has not written, or that has cameras of its own.
-    ``cfg_args`` is Python's text of a ``Namespace``: it is parsed and never evaluated."""
-    file, given = folder / "cfg_args", dict[str, object]()
+def _trained_on(folder: Path) -> tuple[Path, Path | None, bool] | None:
+    """Return what ``cfg_args`` of INRIA's trainer names: the capture, the folder of photographs if it is not the usual
+    one, and whether the background is white; None of a folder without it, or with cameras of its own. It is Python's
+    text of a ``Namespace``, which is parsed and never evaluated."""
+    file, given = folder / "cfg_args", dict[str | None, object]()
     if not file.is_file() or _has_cameras(folder):
         return None
     with suppress(SyntaxError, ValueError, RecursionError, MemoryError), open_file(file) as (opened, _):
         call = ast.parse(opened.read(MAX_ARGUMENTS_BYTES).decode(), mode="eval").body
-        for each in call.keywords if isinstance(call, ast.Call) else ():
-            if isinstance(each.value, ast.Constant):
-                given[str(each.arg)] = each.value.value
-    capture, photographs = given.get("source_path"), given.get("images")
-    if not isinstance(capture, str):
-        raise InvalidViewsError(f"{file} names no source_path; name the folder of the capture")
-    if not Path(capture).exists():
-        raise InvalidViewsError(f"{file} names the capture {capture:.200}, which is not here; name its folder")
-    usual = not isinstance(photographs, str) or photographs == IMAGES or not (Path(capture) / photographs).is_dir()
-    named = None if usual else Path(capture) / str(photographs)
-    return _Training(Path(capture), named, given.get("white_background") is True)
+        keywords = call.keywords if isinstance(call, ast.Call) else []
+        given = {each.arg: each.value.value for each in keywords if isinstance(each.value, ast.Constant)}
+    capture, photographs = Path(str(given.get("source_path"))), str(given.get("images"))
+    if not ("source_path" in given and capture.is_dir()):
+        raise InvalidViewsError(f"{file} names no capture that is here: {capture!s:.200}; name the capture's folder")
+    usual = photographs == IMAGES or not (capture / photographs).is_dir()
+    return capture, None if usual else capture / photographs, given.get("white_background") is True
 
 
-def capture_of(path: Path, names: Sequence[str]) -> Path:
-    """Return the capture of a scene: where ``path`` is a folder of captures, the first folder in it with one of these
-    names, else ``path``."""
-    if not holds_captures(path):
-        return path
-    found = next((path / name for name in names if name and (path / name).is_dir()), None)
-    if found is None:
-        wanted = " or ".join(dict.fromkeys(filter(None, names)))
-        raise InvalidViewsError(f"{path} has several captures, but none in a folder {wanted}; name that of the scene")
-    return found
+def capture_of(path: Path, names: Iterable[str]) -> Path:
+    """Return the capture of a scene: the first folder in ``path`` with cameras and one of these names, if ``path`` has
+    no cameras itself; else ``path``."""
+    own = [] if is_capture(path) else [path / name for name in names if name]
+    return next((each for each in own if is_capture(each)), path)
 
 
-def holds_captures(path: Path) -> bool:
-    """Whether a folder without cameras has captures in its folders."""
+def is_capture(path: Path) -> bool:
+    """Whether a folder has cameras, or names those that INRIA's trainer was given."""
     with suppress(OSError, ValueError):
-        return path.is_dir() and not _is_capture(path) and any(_is_capture(each) for each in path.iterdir())
+        return _has_cameras(path) or (path / "cfg_args").is_file() or _of_scale(path)[1] is not None
     return False
-
-
-def _is_capture(folder: Path) -> bool:
-    return _has_cameras(folder) or (folder / "cfg_args").is_file() or _of_scale(folder)[1] is not None
 
 
 def _has_cameras(folder: Path) -> bool:
