@@ -108,7 +108,7 @@ def compact(
 
     def work(scene: str, target: Path) -> Result:
         piped = str(target) == "-"
-        capture = open_views(training.views, scene, target)
+        capture = open_views(training.views, scene)
         with progress_bar(quiet) as bar, stoppable(bar, settings.searches) as progress:
             result = run(
                 source(scene),

@@ -85,7 +85,7 @@ class SceneCompression(BaseModel):
 
 def compress_here(options: SceneCompression, scene: str, target: Path) -> Result:
     """Compress a scene."""
-    piped, capture = str(target) == "-", open_views(options.views, scene, target)
+    piped, capture = str(target) == "-", open_views(options.views, scene)
     searches = resolved(options.settings, capture).searches
     with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:
         made = options.run(scene, None if piped else target, capture, progress)
@@ -175,7 +175,7 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
         ) from error
     written = Path(attempt) / Path(arguments["target"]).name
     options = SceneCompression.model_validate(arguments["options"])
-    capture = open_views(options.views, str(scene), Path(arguments["target"]))
+    capture = open_views(options.views, scene)
     report = options.run(str(scene), written, capture, progress).report
     table = io.StringIO()
     terminal = {"width": arguments["width"], "force_terminal": arguments["color"]}

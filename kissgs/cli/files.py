@@ -233,18 +233,12 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
 
 
 def _names(inputs: list[str]) -> list[str]:
-    """Return the names of outputs in one folder: those of the inputs; of equal ones, those of the nearest folders above
-    them that all differ."""
-    stems = [_stem(name) for name in inputs]
-    names = list(stems)
-    for stem in {each for each in stems if stems.count(each) > 1}:
-        equal = [n for n, each in enumerate(stems) if each == stem]
-        paths = [Path(os.path.abspath(inputs[n])) for n in equal]  # noqa: PTH100  links keep their names
-        above = [[folder.name for folder in path.parents] for path in paths]
-        differing = next((level for level in zip(*above, strict=False) if len(set(level)) == len(equal)), None)
-        for n, name in zip(equal, differing or [stem] * len(equal), strict=True):
-            names[n] = name
-    return names
+    """Return the names of outputs in one folder: those of the inputs; if two are equal, those of the nearest folders
+    above the inputs that all differ."""
+    paths = [Path(os.path.abspath(name)) for name in inputs]  # noqa: PTH100  links keep their names
+    levels = zip(*([folder.name for folder in path.parents] for path in paths), strict=False)
+    names = [tuple(_stem(name) for name in inputs), *levels]
+    return list(next((each for each in names if len(set(each)) == len(inputs)), names[0]))
 
 
 def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:

@@ -412,21 +412,16 @@ def _is_host(word: str) -> bool:
 
 
 def open_views(
-    path: Path | None,
-    scene: str | Path,
-    target: Path | None = None,
-    *,
-    scale: int | None = None,
-    images: Path | None = None,
+    path: Path | None, scene: str | Path, *, scale: int | None = None, images: Path | None = None
 ) -> Views | None:
-    """Load the capture at ``path``, if there is one; of a folder of captures, the one named as the scene's output, the
-    scene, or the nearest folder above it."""
+    """Load the capture at ``path``, if there is one; of a folder of captures, the one named as the scene, or as the
+    nearest folder above it."""
     if path is None:
         return None
     from kissgs.cameras.captures.load import capture_of, load_views
 
     file = Path(scene).absolute()
-    names = [*([] if target is None else [target.stem]), file.stem, *(each.name for each in file.parents)]
+    names = [file.stem, *(each.name for each in file.parents)]
     return load_views(capture_of(path, names), scene=file, scale=scale, images=images)
 
 

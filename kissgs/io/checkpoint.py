@@ -127,8 +127,6 @@ def _load(source: Path | bytes) -> object:
                 f"{opened.name} is no checkpoint, or holds more than tensors and numbers; the rest could run code, so "
                 "none of it is read: export the scene as .ply"
             ) from error
-        except OSError:
-            raise
         except Exception as error:  # of many kinds where a file is damaged
             raise opened.invalid("is no checkpoint that torch can read") from error
 

@@ -225,15 +225,13 @@ def test_a_folder_of_inrias_trainer_is_its_last_scene(tmp_path):
 
 
 def test_outputs_of_equal_names_are_named_after_the_folders_that_differ(scene, tmp_path):
-    names = ["garden/point_cloud/iteration_9", "bonsai/point_cloud/iteration_9", "room"]
-    for name in names:
-        (tmp_path / name).mkdir(parents=True)
-        shutil.copy(scene, tmp_path / name / "point_cloud.ply")
-    shutil.copy(scene, tmp_path / "other.ply")
-    inputs = [*(f"{name}/point_cloud.ply" for name in names[:2]), "other.ply"]
+    inputs = [f"{name}/point_cloud/iteration_9/point_cloud.ply" for name in ("garden", "bonsai")]
+    for name in inputs:
+        (tmp_path / name).parent.mkdir(parents=True)
+        shutil.copy(scene, tmp_path / name)
     assert run("convert", *inputs, "out/", "--to", "spz", "-q", cwd=tmp_path).returncode == 0
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"garden.spz", "bonsai.spz", "other.spz"}
-    inputs = ["room/point_cloud.ply", "room/../room/point_cloud.ply"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"garden.spz", "bonsai.spz"}
+    inputs = [inputs[0], f"garden/../{inputs[0]}"]
     assert "would become one file" in failure("convert", *inputs, "out/", "--to", "spz", cwd=tmp_path)
 
 

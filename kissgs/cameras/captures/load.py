@@ -75,11 +75,8 @@ def load_views(
 
     Cameras are in the coordinates of the camera file. nerfstudio trains scenes in others: its
     ``dataparser_transforms.json``, in the folder of the run that ``scene`` is from, in the capture's folder or beside
-    the camera file, is read for those who compare the views with a scene (:attr:`Views.similarities`); gsplat's frame
-    follows from the points of a COLMAP model (:attr:`Views.points`).
-
-    A folder that INRIA's trainer has written stands for the capture, the folder of photographs and the background that
-    its ``cfg_args`` names.
+    the camera file, is read for those who compare the views with a scene (:attr:`Views.similarities`). A folder of
+    INRIA's trainer stands for the capture, the folder of photographs and the background that its ``cfg_args`` names.
 
     If there is no folder of photographs, views have cameras only, without distortion, and ``note`` says so. If only
     some photographs are missing, an error is raised, because results from fewer views could pass for those of all.
