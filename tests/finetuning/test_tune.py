@@ -78,6 +78,14 @@ def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree, rate_weight, 
     assert len(decompress(encoded.files)) == 150
 
 
+@pytest.mark.cuda
+def test_a_gpu_fine_tunes_as_well_as_the_cpu():
+    works = [replace(tuner(cloud(150, 2), steps=100), context=Context(1, device)) for device in ("cpu", "cuda")]
+    on_cpu, on_gpu = (tuned(cloud(150, 2), work=work)[1] for work in works)
+    assert on_gpu.psnr_before == pytest.approx(on_cpu.psnr_before, abs=0.02)
+    assert on_gpu.psnr_after == pytest.approx(on_cpu.psnr_after, abs=0.3)
+
+
 @pytest.mark.parametrize(
     ("preset", "weights", "stage"), [("balanced", (0.3, 5.0), "finetune"), ("paper", (0.2, 0.0), "compact")]
 )
