@@ -68,7 +68,7 @@ def recognise(source: Path | bytes | Mapping[str, bytes], *, name: str | None = 
         return by_content
     ending = Path(name).suffix
     of_ending = next((kind for kind, each in FORMATS.items() if ending in each.endings), "ply")
-    if FORMATS[of_ending].by_ending and (FORMATS[of_ending].is_zip or head[:4] not in ZIP_MAGICS):
+    if FORMATS[of_ending].by_ending and (FORMATS[of_ending].is_pickle or head[:4] not in ZIP_MAGICS):
         return of_ending
     if is_container(source):
         return _packed_format(source, "sog" if of_ending == "sog" else "sogxt")
