@@ -74,11 +74,12 @@ def in_scene_frame(splats: Splats, views: Views, context: Context = DEFAULT_CONT
     :attr:`Views.similarities` is tried, and the best is kept if it is better than none: the one with the highest median
     PSNR to some photographs; without photographs, the one whose cameras show most of the scene. Where the photographs
     still do not show the scene, gsplat's normalisation of the world is tried, and kept if they then do."""
-    if not (views.similarities or views.points) or not views.all:
+    samples = _samples(views) if views.similarities or views.points else []
+    if not views.all or not (views.similarities or samples):
         return _moved(views, None, splats.origin)
     load_kernels(context.progress)
     context.progress("cameras", 0.0)
-    moved, _, note = _best(splats, views, _samples(views), context.threads)
+    moved, _, note = _best(splats, views, samples, context.threads)
     return replace(moved, note="; ".join(filter(None, [views.note, note])))
 
 
