@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,28 +36,45 @@ def read_checkpoint(
     """Read a scene without cleaning it: quaternions of any length are kept. The files of other ranks beside the source
     are read too, in their order."""
     progress("read", 0.0)
+    files, parts = _parts(source)
+    refuse_more_than(reading.max_compressed, _count(parts), _name(source))
+    splats = _scene(parts, _name(source))
+    progress("read", 1.0)
+    note = f"read from {listed([_name(file) for file in files])}"
+    return replace(splats, notes=(note,)) if len(files) > 1 else splats
+
+
+def _describe(source: Path | bytes, level: int) -> Facts:
+    parts = _parts(source)[1]
+    first = _scene([{name: tensor[:1] for name, tensor in parts[0].items()}], _name(source))
+    return Facts(title="checkpoint of a trainer", count=_count(parts), sh_degree=first.sh_degree)
+
+
+def _parts(source: Path | bytes) -> tuple[list[Path] | list[bytes], list[dict[str, Tensor]]]:
+    """Return the files of all ranks, and the tensors of each."""
     files: list[Path] | list[bytes] = [source] if isinstance(source, bytes) else _ranks(source)
-    parts, name = [_tensors(file) for file in files], _name(source)
-    refuse_more_than(reading.max_compressed, sum(len(part["means"]) for part in parts), name)
+    return files, [_tensors(file) for file in files]
+
+
+def _count(parts: Sequence[Mapping[str, Tensor]]) -> int:
+    return sum(len(part["means"]) for part in parts)
+
+
+def _scene(parts: Sequence[Mapping[str, Tensor]], name: str) -> Splats:
+    """Return the scene of the tensors of all ranks."""
     arrays: dict[str, Any] = {}
     try:
         for each in ATTRIBUTES:
             arrays[each] = np.concatenate([part[each].float().numpy() for part in parts])
         arrays["opacities"] = arrays["opacities"].reshape(-1)
         arrays["sh0"] = arrays["sh0"].reshape(-1, 3)
-        splats = Splats(**arrays, notes=(f"read from {listed([_name(file) for file in files])}",) * (len(files) > 1))
+        splats = Splats(**arrays)
     except (InvalidSceneError, ValueError) as error:  # ValueError: ranks or shapes that do not belong together
         raise InvalidSceneError(f"{name} has attributes that make no scene: {error}; save it again") from error
     if "features_dc" in parts[0] and splats.sh_degree == 0:  # splatfacto's colours are sigmoids, then
         with np.errstate(over="ignore"):
             splats.sh0[:] = (1 / (1 + np.exp(-splats.sh0)) - 0.5) / SH_C0
-    progress("read", 1.0)
     return splats
-
-
-def _describe(source: Path | bytes, level: int) -> Facts:
-    splats = read_checkpoint(source)
-    return Facts(title="checkpoint of a trainer", count=len(splats), sh_degree=splats.sh_degree)
 
 
 def _name(source: Path | bytes) -> str:

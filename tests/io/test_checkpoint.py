@@ -104,6 +104,7 @@ def test_the_limit_is_checked_before_memory_is_taken(tmp_path):
     path = saved(tmp_path / "a.pt", document)
     with pytest.raises(UnsupportedError, match=r"10,000,000,000 Gaussians; the limit is 20,000,000"):
         read_checkpoint(path)
+    assert kissgs.read_scene_info(path).count == 10**10
     with pytest.raises(UnsupportedError, match="the limit is 2"):
         read_checkpoint(saved(path, gsplat_document(made_scene(3, 0))), ReadOptions(max_gaussians=2))
 
