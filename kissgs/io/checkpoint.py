@@ -7,7 +7,6 @@ GPUs trained a scene, gsplat gives each of them a share of the Gaussians and a f
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -31,29 +30,24 @@ _MOST_VALUES = 45  # of a Gaussian in any attribute: a tensor may claim more val
 
 
 def read_checkpoint(
-    source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
+    source: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS, threads: int = 0, progress: Progress = silent
 ) -> Splats:
     """Read a scene without cleaning it: quaternions of any length are kept. The files of other ranks beside the source
     are read too, in their order."""
     progress("read", 0.0)
-    files, parts = _parts(source)
-    refuse_more_than(reading.max_compressed, _count(parts), _name(source))
-    splats = _scene(parts, _name(source))
+    files = _ranks(source)
+    parts = [_tensors(file) for file in files]
+    refuse_more_than(reading.max_compressed, _count(parts), source.name)
+    splats = _scene(parts, source.name)
     progress("read", 1.0)
-    note = f"read from {listed([_name(file) for file in files])}"
+    note = f"read from {listed([file.name for file in files])}"
     return replace(splats, notes=(note,)) if len(files) > 1 else splats
 
 
-def _describe(source: Path | bytes, level: int) -> Facts:
-    parts = _parts(source)[1]
-    first = _scene([{name: tensor[:1] for name, tensor in parts[0].items()}], _name(source))
+def _describe(source: Path, level: int) -> Facts:
+    parts = [_tensors(file) for file in _ranks(source)]
+    first = _scene([{name: tensor[:1] for name, tensor in parts[0].items()}], source.name)
     return Facts(title="checkpoint of a trainer", count=_count(parts), sh_degree=first.sh_degree)
-
-
-def _parts(source: Path | bytes) -> tuple[list[Path] | list[bytes], list[dict[str, Tensor]]]:
-    """Return the files of all ranks, and the tensors of each."""
-    files: list[Path] | list[bytes] = [source] if isinstance(source, bytes) else _ranks(source)
-    return files, [_tensors(file) for file in files]
 
 
 def _count(parts: Sequence[Mapping[str, Tensor]]) -> int:
@@ -77,17 +71,14 @@ def _scene(parts: Sequence[Mapping[str, Tensor]], name: str) -> Splats:
     return splats
 
 
-def _name(source: Path | bytes) -> str:
-    return "the data" if isinstance(source, bytes) else source.name
-
-
 def _ranks(path: Path) -> list[Path]:
     """Return the files of all ranks of the same step, in their order; the path itself where there is one only."""
     named = _RANK.fullmatch(path.name)
     if named is None or not path.is_file():
         return [path]
     matches = [_RANK.fullmatch(each.name) for each in path.parent.iterdir()]
-    found = {int(each[2]): path.with_name(each.string) for each in matches if each and each[1] == named[1]}
+    same = [each for each in matches if each and each.group(1, 3) == named.group(1, 3)]
+    found = {int(each[2]): path.with_name(each.string) for each in same}
     if missing := set(range(max(found))) - set(found):
         raise InvalidSceneError(
             f"{path.name} holds a share of the Gaussians, and that of rank {min(missing)} is not beside it; put the "
@@ -96,13 +87,13 @@ def _ranks(path: Path) -> list[Path]:
     return [found[rank] for rank in sorted(found)]
 
 
-def _tensors(source: Path | bytes) -> dict[str, Tensor]:
+def _tensors(source: Path) -> dict[str, Tensor]:
     """Return the tensors of a file by attribute, of splatfacto also by its own names; their values stay in the file."""
     try:
         import torch
     except ImportError as error:
         raise UnsupportedError("a checkpoint needs torch, which is missing: pip install 'kissgs[train]'") from error
-    name, document = _name(source), _load(source)
+    name, document = source.name, _load(source)
     found = document.get("splats", document.get("pipeline")) if isinstance(document, Mapping) else None
     if not (isinstance(document, Mapping) and isinstance(found, Mapping)):
         raise InvalidSceneError(
@@ -127,7 +118,7 @@ def _tensors(source: Path | bytes) -> dict[str, Tensor]:
     return tensors
 
 
-def _load(source: Path | bytes) -> object:
+def _load(source: Path) -> object:
     from pickle import UnpicklingError
 
     import torch
@@ -137,8 +128,6 @@ def _load(source: Path | bytes) -> object:
     safe: list[Any] = [np.dtype, type(np.dtype(np.float64)), scalar, (scalar, "numpy.core.multiarray.scalar")]
     with open_scene_file(source) as opened, torch.serialization.safe_globals(safe):
         try:
-            if isinstance(source, bytes):
-                return torch.load(io.BytesIO(source), map_location="cpu", weights_only=True)
             return torch.load(source, map_location="cpu", weights_only=True, mmap=True)
         except UnpicklingError as error:
             raise InvalidSceneError(

@@ -52,7 +52,6 @@ def test_gsplat(tmp_path, degree):
     scene.quats[:] *= np.float32(3)
     path = saved(tmp_path / "ckpt_29999.pt", gsplat_document(scene))
     assert_equal(read_checkpoint(path), scene)
-    assert_equal(read_checkpoint(path.read_bytes()), scene)
     assert kissgs.read_scene_info(path) == kissgs.SceneInfo(format="checkpoint", count=30, sh_degree=degree)
     np.testing.assert_allclose(np.linalg.norm(kissgs.load(path).quats, axis=1), 1, atol=1e-6)
 
@@ -77,6 +76,7 @@ def test_all_ranks_of_a_step_are_read(tmp_path):
         document = gsplat_document(scene.select(slice(end - rank, end)))
         saved(tmp_path / f"ckpt_29999_rank{rank}.pt", document)
     saved(tmp_path / "ckpt_6999_rank0.pt", gsplat_document(made_scene(4, 1)))
+    (tmp_path / "ckpt_6999_rank1.txt").write_text("another program's")
     for rank in (0, 10):
         found = read_checkpoint(tmp_path / f"ckpt_29999_rank{rank}.pt")
         assert_equal(found, scene)
@@ -154,9 +154,8 @@ def test_other_contents(tmp_path, change, message):
 def test_files_that_are_none(tmp_path, data):
     path = tmp_path / "a.ckpt"
     path.write_bytes(data)
-    for source in (path, data):
-        with pytest.raises(InvalidSceneError):
-            read_checkpoint(source)
+    with pytest.raises(InvalidSceneError):
+        read_checkpoint(path)
     with pytest.raises(InvalidSceneError, match=r"cannot read .*b\.ckpt: there is no such file"):
         read_checkpoint(tmp_path / "b.ckpt")
 
