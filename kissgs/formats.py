@@ -28,6 +28,7 @@ class Format:
     is_container: bool = False  # whether the metadata describes a scene without decoding an image
     manifest: str | None = None  # name of the manifest of a scene in levels of detail
     by_ending: bool = False  # whether the ending decides before the content, which has no mark
+    is_pickle: bool = False  # whether a file is a pickle: a zip that is no container, which no service takes
 
     @property
     def codec(self) -> Codec:
@@ -48,6 +49,7 @@ FORMATS = {
     "splat": Format(module="kissgs.io.splat", endings=(".splat",), written=(".splat",), by_ending=True),
     "ksplat": Format(module="kissgs.io.ksplat", endings=(".ksplat",), by_ending=True),
     "gltf": Format(module="kissgs.io.gltf", endings=(".glb", ".gltf"), written=(".glb", ".spz.glb")),
+    "checkpoint": Format(module="kissgs.io.checkpoint", endings=(".pt", ".ckpt"), by_ending=True, is_pickle=True),
 }
 """All formats by name. "ply" stands for unknown content too, about which its reader has the best messages."""
 
@@ -72,7 +74,7 @@ WRITTEN = tuple(ending for each in FORMATS.values() if not each.is_container for
 
 OUTPUT_FORMATS = tuple(ending.removeprefix(".") for ending in WRITTEN)  # what these endings stand for
 
-UPLOADS = {name: each.endings[0] for name, each in FORMATS.items() if each.endings}
+UPLOADS = {name: each.endings[0] for name, each in FORMATS.items() if each.endings and not each.is_pickle}
 """Formats of one file, which can be sent to a service, and their usual endings."""
 
 DOUBLE_ENDINGS = tuple(ending for ending in WRITTEN if ending.count(".") > 1)

@@ -1,5 +1,6 @@
 """Fixtures and shape checks for all tests, and which tests ``make test`` runs."""
 
+import functools
 import os
 import zlib
 from collections import defaultdict
@@ -93,6 +94,16 @@ def shared_data():
 
 
 @pytest.hookimpl(optionalhook=True)
+@functools.cache
+def cuda_is_missing():
+    """Return what tests on CUDA lack here; None if nothing."""
+    if find_spec("torch") is None or find_spec("gsplat") is None:
+        return "torch or gsplat is not installed"
+    import torch
+
+    return None if torch.cuda.is_available() else "no CUDA device here"
+
+
 def pytest_xdist_auto_num_workers():
     """Return one worker more than there are processors, because a quarter of the time of tests is waiting."""
     from kissgs.core.resources import processors  # after the hook
@@ -115,6 +126,8 @@ def pytest_addoption(parser):
 def pytest_collection_modifyitems(config, items):
     """Mark as exhaustive all but n sets of parameters of ``quick(n)``; with ``--sixth``, leave out five of six."""
     sets = defaultdict[str, list[pytest.Item]](list)
+    for item in (each for each in items if each.get_closest_marker("cuda") and (reason := cuda_is_missing())):
+        item.add_marker(pytest.mark.skip(reason=reason))
     for item in items:
         if item.get_closest_marker("quick"):
             sets[item.nodeid.partition("[")[0]].append(item)

@@ -186,6 +186,8 @@ class Views:
         note: clause about an unexpected property of the capture, for messages; empty if there is none.
         similarities: from the cameras' coordinates to others that the scene may have, according to the capture's files;
             which of them are the scene's, its renderings tell (:func:`kissgs.evaluation.evaluate.in_scene_frame`).
+        points: points of the COLMAP model, in the cameras' coordinates, from which gsplat's normalisation of the world
+            follows; None if there are none.
         origin: point of the world at which the cameras' coordinates are zero, as for :class:`kissgs.Splats`.
     """
 
@@ -195,6 +197,7 @@ class Views:
     source: str
     note: str = ""
     similarities: tuple[Similarity, ...] = ()
+    points: Path | None = None
     origin: Origin = WORLD
 
     @property

@@ -130,7 +130,7 @@ def bench(
     runs = {str(name): chosen(name, None) for name in presets or []}
     runs |= {f"in {limit}": chosen("balanced", None, time=limit) for limit in times or []}
     files = {} if output is None else _outputs(output, force)
-    capture = open_views(views)
+    capture = open_views(views, scene)
     rows, failed = list[Row](), False
     try:
         with progress_bar(False) as progress:

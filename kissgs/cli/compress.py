@@ -21,6 +21,7 @@ from kissgs.cli.options import (
     TrainingOptions,
     chosen,
     count_of,
+    open_common_views,
     open_views,
     output_option,
     share_of,
@@ -103,10 +104,11 @@ def compact(
     training.refuse_without_training(settings)
     if output is None:
         raise UnsupportedError("missing -o: by default the output would overwrite the input")
-    capture = open_views(training.views)
+    open_common_views(training.views)
 
     def work(scene: str, target: Path) -> Result:
         piped = str(target) == "-"
+        capture = open_views(training.views, scene)
         with progress_bar(quiet) as bar, stoppable(bar, settings.searches) as progress:
             result = run(
                 source(scene),
@@ -186,9 +188,8 @@ def compress(
     renders = (
         encoding.evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
     )
-    capture = open_views(training.views)
-    training.refuse_without_training(resolved(settings, capture))
-    if capture is not None and not renders and not common.quiet:
+    training.refuse_without_training(resolved(settings, open_common_views(training.views)))
+    if training.views is not None and not renders and not common.quiet:
         sys.stderr.write(
             f"kissgs: --views has no effect: the preset {encoding.preset} renders no images; add --evaluate\n"
         )
@@ -206,7 +207,7 @@ def compress(
         device=training.device,
         quiet=common.quiet or as_json,
     )
-    work: Work = partial(compress_scenes.compress_here, each, capture)
+    work: Work = partial(compress_scenes.compress_here, each)
     during, ending = None, "" if unpacked else ending_of(kind)
     if manifest is not None:
         compress_scenes.refuse_options(manifest, each, container=encoding.container, unpacked=unpacked)

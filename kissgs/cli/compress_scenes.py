@@ -32,6 +32,7 @@ from kissgs.io.files import move_into_place, open_scene_file, reason_of
 from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline.choice import resolved
 from kissgs.pipeline.pipeline import Compressed, compress
+from kissgs.pipeline.scene_files import scene_root
 from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of
 from kissgs.settings import Settings
 from kissgs.sogxt.container import check_destination
@@ -82,9 +83,9 @@ class SceneCompression(BaseModel):
 # ``kissgs compress`` of one scene, in this process.
 
 
-def compress_here(options: SceneCompression, capture: Views | None, scene: str, target: Path) -> Result:
+def compress_here(options: SceneCompression, scene: str, target: Path) -> Result:
     """Compress a scene."""
-    piped = str(target) == "-"
+    piped, capture = str(target) == "-", open_views(options.views, scene)
     searches = resolved(options.settings, capture).searches
     with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:
         made = options.run(scene, None if piped else target, capture, progress)
@@ -174,7 +175,8 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
         ) from error
     written = Path(attempt) / Path(arguments["target"]).name
     options = SceneCompression.model_validate(arguments["options"])
-    report = options.run(str(scene), written, open_views(options.views), progress).report
+    capture = open_views(options.views, scene)
+    report = options.run(str(scene), written, capture, progress).report
     table = io.StringIO()
     terminal = {"width": arguments["width"], "force_terminal": arguments["color"]}
     Console(file=table, highlight=False, markup=False, **terminal).print(report_table(report, arguments["target"]))
@@ -251,8 +253,9 @@ class ClusterCompression:
         work = self._work[target] = target.parent / f".kissgs.{digest[:16]}.part"
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(mode=0o700)
-        size = scene.stat().st_size if scene.is_file() else 0
-        resources = with_memory(runner, requested, self._memory(scene, size))
+        file = scene_root(scene)
+        size = file.stat().st_size if file.is_file() else 0
+        resources = with_memory(runner, requested, self._memory(file, size))
         console = output()
         arguments = {
             "scene": str(scene),

@@ -60,7 +60,7 @@ def evaluate(
     quiet, threads = common.quiet or as_json, common.threads
     if html is not None:
         refuse_existing(html, overwrite=force)
-    views = capture.open()
+    views = capture.open(reference)
     with progress_bar(quiet, [("read", 1.0), ("cameras", 2.0), ("evaluate", 5.0), ("html", 2.0)]) as progress:
         sides = _sides_of((reference, candidate), common, progress)
         sides[1] = replace(sides[1], splats=with_origin(sides[1].splats, sides[0].splats.origin))

@@ -222,8 +222,7 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
     if output is not None and "-" in inputs:
         raise OutputError(f"-o {output} is a folder, but standard input has no name; give -o NAME{suffix}")
     targets = []
-    for name in inputs:
-        stem = _stem(name)
+    for name, stem in zip(inputs, _names(inputs) if output is not None else map(_stem, inputs), strict=True):
         if not stem:
             raise OutputError(f"{name} has no name to derive the output from; give the output with -o")
         folder = output if output is not None else Path(name).parent
@@ -231,6 +230,15 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
     if len(set(targets)) < len(targets):
         raise OutputError("two inputs have the same name and would become one file; process them one by one")
     return targets
+
+
+def _names(inputs: list[str]) -> list[str]:
+    """Return the names of outputs in one folder: those of the inputs; if two are equal, those of the nearest folders
+    above the inputs that all differ."""
+    paths = [Path(os.path.abspath(name)) for name in inputs]  # noqa: PTH100  links keep their names
+    levels = zip(*([folder.name for folder in path.parents] for path in paths), strict=False)
+    names = [tuple(_stem(name) for name in inputs), *levels]
+    return list(next((each for each in names if len(set(each)) == len(inputs)), names[0]))
 
 
 def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 from typer import Argument, Option
 
+from kissgs.cli.files import is_folder
 from kissgs.core.context import Device
 from kissgs.core.errors import UnsupportedError
 from kissgs.formats import ENDINGS, SCENE_ENDINGS
@@ -336,15 +337,15 @@ class CaptureOptions:
         Option(metavar="NAME", parser=one_of("--device", "cpu", "cuda"), help="Device of the rasteriser: cpu or cuda."),
     ] = "cpu"
 
-    def open(self) -> Views | None:
-        """Load the capture; return None if there is none, and refuse options of its photographs then."""
+    def open(self, scene: Path) -> Views | None:
+        """Load the capture of a scene; return None if there is none, and refuse options of its photographs then."""
         if self.views is None:
             for name, value in (("--scale", self.scale), ("--images", self.images)):
                 if value is not None:
                     raise UnsupportedError(
                         f"{name} only applies to the photographs of a capture; give one with --views"
                     )
-        return open_views(self.views, scale=self.scale, images=self.images)
+        return open_views(self.views, scene, scale=self.scale, images=self.images)
 
 
 # Settings and captures that options stand for.
@@ -410,10 +411,23 @@ def _is_host(word: str) -> bool:
     return "://" in word or ("/" not in word and Path(word).suffix.lower() not in (*ENDINGS, *SCENE_ENDINGS, ".json"))
 
 
-def open_views(path: Path | None, *, scale: int | None = None, images: Path | None = None) -> Views | None:
-    """Load the capture at ``path``, if there is one."""
+def open_views(
+    path: Path | None, scene: str | Path, *, scale: int | None = None, images: Path | None = None
+) -> Views | None:
+    """Load the capture at ``path``, if there is one; of a folder of captures, the one named as the scene, or as the
+    nearest folder above it."""
     if path is None:
         return None
-    from kissgs.cameras.captures.load import load_views
+    from kissgs.cameras.captures.load import capture_of, load_views
 
-    return load_views(path, scale=scale, images=images)
+    file = Path(scene).absolute()
+    names = [file.stem, *(each.name for each in file.parents)]
+    return load_views(capture_of(path, names), scene=file, scale=scale, images=images)
+
+
+def open_common_views(path: Path | None) -> Views | None:
+    """Load the capture at ``path`` before any work, so that it is refused once and not for each scene; return None if
+    there is none, or it may be a folder of captures."""
+    from kissgs.cameras.captures.load import is_capture, load_views
+
+    return None if path is None or (is_folder(path) and not is_capture(path)) else load_views(path)

@@ -274,7 +274,7 @@ def render(
 
     suffix, threads, quiet = _suffix(file, output), common.threads, common.quiet or as_json
     image.refuse_contradictions(capture.views)
-    size, background, views = image.pixels(), image.colour(), capture.open()
+    size, background, views = image.pixels(), image.colour(), capture.open(Path(file))
 
     def work(name: str, target: Path) -> Result:
         for path in (target, image.save_camera):

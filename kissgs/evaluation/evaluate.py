@@ -11,6 +11,7 @@ from typing import cast
 
 import numpy as np
 
+from kissgs.cameras.captures.colmap import gsplat_similarities
 from kissgs.cameras.captures.load import as_views
 from kissgs.cameras.photographs import orientation
 from kissgs.cameras.views import Similarity, View, Views
@@ -71,12 +72,14 @@ class _Fit:
 def in_scene_frame(splats: Splats, views: Views, context: Context = DEFAULT_CONTEXT) -> Views:
     """Return views with cameras in the coordinates of the scene; their note says if there was a choice. Each of
     :attr:`Views.similarities` is tried, and the best is kept if it is better than none: the one with the highest median
-    PSNR to some photographs; without photographs, the one whose cameras show most of the scene."""
-    if not views.similarities or not views.all:
+    PSNR to some photographs; without photographs, the one whose cameras show most of the scene. Where the photographs
+    still do not show the scene, gsplat's normalisation of the world is tried, and kept if they then do."""
+    samples = _samples(views) if views.similarities or views.points else []
+    if not views.all or not (views.similarities or samples):
         return _moved(views, None, splats.origin)
     load_kernels(context.progress)
     context.progress("cameras", 0.0)
-    moved, _, note = _best(splats, views, _samples(views), context.threads)
+    moved, _, note = _best(splats, views, samples, context.threads)
     return replace(moved, note="; ".join(filter(None, [views.note, note])))
 
 
@@ -96,7 +99,8 @@ def fitting_views(
     if samples and not force and refused:
         raise InvalidViewsError(
             f"{problem}: give the capture of this scene, with dataparser_transforms.json beside it if nerfstudio "
-            "trained the scene, or --force-views (in Python force_views) to use it all the same"
+            "trained the scene, or the points of its COLMAP model if gsplat did, or --force-views (in Python "
+            "force_views) to use it all the same"
         )
     return views, "; ".join(filter(None, [note, problem]))
 
@@ -134,6 +138,11 @@ def _best(splats: Splats, views: Views, samples: Sequence[_Sample], threads: int
         found = fit(similarity)
         if found.quality > best.quality:
             best, chosen = found, similarity
+    if samples and best.quality < USUAL_PSNR and views.points is not None:
+        for similarity in gsplat_similarities(views.points, [view.camera.viewmat for view in views.all]):
+            found = fit(similarity)
+            if found.quality >= max(best.quality, USUAL_PSNR):
+                best, chosen = found, similarity
     files = ", ".join(dict.fromkeys(similarity.source for similarity in views.similarities))
     views = _moved(views, chosen, splats.origin)
     if chosen is None:
@@ -149,7 +158,7 @@ def _moved(views: Views, similarity: Similarity | None, origin: Origin) -> Views
     def moved(part: tuple[View, ...]) -> tuple[View, ...]:
         return tuple((similarity.moved(view) if similarity else view).relative_to((x, y, z)) for view in part)
 
-    return replace(views, train=moved(views.train), test=moved(views.test), similarities=(), origin=origin)
+    return replace(views, train=moved(views.train), test=moved(views.test), similarities=(), points=None, origin=origin)
 
 
 def _fit_to_photos(splats: Splats, samples: Sequence[_Sample], threads: int) -> _Fit:

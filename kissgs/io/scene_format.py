@@ -97,7 +97,7 @@ Write = Callable[[BinaryWriter, Splats, bool, Progress], Notes]
 class Codec:
     """Code of one format."""
 
-    info: Callable[[Path | bytes, int], Facts]  # describe a file, or a level of detail of a streamed scene
+    info: Callable[[Any, int], Facts]  # describe a file or its bytes, or a level of detail of a streamed scene
     read: Read
     sniff: Callable[[bytes, int], Match] = lambda head, size: Match.NO  # from a file's first bytes and its size
     write: Mapping[str, Write] = field(default_factory=dict)  # writers by ending; all but .ply get a clean scene

@@ -113,8 +113,8 @@ SH_OF_BYTE = ((_BYTE - 128) / 128).astype(np.float32)  # other SH coefficients
 SH_STEPS = (4, 8)
 """Steps of the codes that are written, in the first band and above: 6 and 5 bits. Readers need not know them.
 
-The format's own library writes 5 and 4 bits by default, which lose two decibels of fox to its photographs; the figures
-are in docs/reference/formats.md.
+The format's own library writes 5 and 4 bits by default, which take a fifth fewer bytes of fox and lose 1.5 decibels to
+its photographs.
 """
 
 

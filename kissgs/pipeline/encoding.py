@@ -14,26 +14,60 @@ import numpy as np
 from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
-from kissgs.core.context import Context, Device, load_kernels
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Device, load_kernels
 from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.core.resources import TORCH_MISSING, blas_workers, has_torch, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
+from kissgs.core.splats import ATTRIBUTES, NOTHING_CLEANED, Cleaned, Splats
 from kissgs.formats import ContainerName
 from kissgs.io.files import atomic_file, reason_of, refuse_existing
-from kissgs.pipeline.containers import DECODERS, MODELS, write_files
 from kissgs.pipeline.goal import Container
 from kissgs.planning.encoding_plan import Encoded, EncodingPlan
 from kissgs.planning.planner import plan_encoding, refine_order
+from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
 from kissgs.planning.rate_distortion import ColorRefit
 from kissgs.rendering.rasterizer import need_cuda
 from kissgs.settings import EncodeSettings, FinetuneSettings, Settings
+from kissgs.sog import encode as sog
+from kissgs.sog.decode import decode as decode_sog
+from kissgs.sog.encode import SOG
+from kissgs.sogxt import encode as sogxt
+from kissgs.sogxt.container import FILES as SOGXT_FILES
+from kissgs.sogxt.decode import decode as decode_sogxt
 
 if TYPE_CHECKING:
     from kissgs.compaction.popspa import Popspa
     from kissgs.finetuning.tune import Tuner
     from kissgs.pipeline.limited_time import SearchTime
     from kissgs.rendering.sensitivity import WeightedCameras
+
+
+# The containers that ``compress`` writes: what each can hold, and how its files are made.
+
+MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}  # for the planner
+DECODERS = {"sogxt": decode_sogxt, "sog": decode_sog}  # decoder of each container
+FILES = frozenset({*SOGXT_FILES, *sog.FILES})  # a folder with no others may be replaced by a container
+
+
+def write_files(
+    container: ContainerName,
+    plan: EncodingPlan,
+    settings: EncodeSettings,
+    context: Context = DEFAULT_CONTEXT,
+    *,
+    cleaned: Cleaned = NOTHING_CLEANED,
+    compacted: int = 0,
+    finetune_steps: int = 0,
+) -> Encoded:
+    """Make the files of a plan for a container; the counts are for the metadata of SOG-XT."""
+    if container == "sog":
+        return sog.write_files(plan, settings, context)
+    return sogxt.write_files(
+        plan, settings, context, cleaned=cleaned, compacted=compacted, finetune_steps=finetune_steps
+    )
+
+
+# Sensitivity in a file.
 
 
 def read_sensitivity(path: Path, key: str) -> Sensitivity | None:

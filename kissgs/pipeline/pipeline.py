@@ -21,7 +21,7 @@ from kissgs.finetuning.result import FinetuneReport
 from kissgs.formats import ContainerName, named_container
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.choice import choose, resolved
-from kissgs.pipeline.containers import FILES
+from kissgs.pipeline.encoding import FILES, Work, check_finetuning, encode, make_tuner, measure, plan, write
 from kissgs.pipeline.goal import Attempt
 from kissgs.pipeline.limited_time import Expected
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
@@ -31,7 +31,6 @@ from kissgs.training.checkpoint import delete_checkpoints, finetune_checkpoint_p
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
-    from kissgs.pipeline.encoding import Work
     from kissgs.pipeline.goal import Container
 
 
@@ -196,7 +195,7 @@ def compact(
     """
     from kissgs.compaction.budget import compact_scene
 
-    views = _loaded(views)
+    views = _loaded(views, source)
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_ply(target, overwrite=overwrite)
@@ -278,9 +277,7 @@ def compress(
     Raises:
         KissgsError: one of its subclasses, with a message for the user.
     """
-    from kissgs.pipeline.encoding import Work
-
-    views = _loaded(views)
+    views = _loaded(views, source)
     requested, keep_all = settings or Settings(), sensitivity is not None
     settings = resolved(requested, views, keep_all=keep_all)
     target, kind = None if destination is None else Path(destination), named_container(container, destination)
@@ -363,13 +360,13 @@ def compress(
     return Compressed(encoded.files, order, report, remaining, kind)
 
 
-def _loaded(views: Views | AnyPath | None) -> Views | None:
-    """Return the views, loaded if they are the path of a capture."""
+def _loaded(views: Views | AnyPath | None, source: Splats | AnyPath | bytes) -> Views | None:
+    """Return the views, loaded for the scene if they are the path of a capture."""
     if views is None:
         return None
     from kissgs.cameras.captures.load import as_views
 
-    return as_views(views)
+    return as_views(views, None if isinstance(source, Splats | bytes) else Path(source))
 
 
 def _fitting(splats: Splats, views: Views | None, context: Context, *, force: bool) -> tuple[Views | None, str]:
@@ -391,8 +388,6 @@ def _check(
     device: Device,
 ) -> None:
     """Refuse what cannot be done, before any work."""
-    from kissgs.pipeline.encoding import check_finetuning
-
     if target is not None:
         check_destination(target, overwrite=overwrite, names=FILES)
     if checkpoint is not None and settings.time_limit is not None:
@@ -432,7 +427,6 @@ def _search(work: Work, *, time_only: bool) -> tuple[Container, tuple[Attempt, .
 def _encode_once(work: Work, checkpoint: Path | None, *, disposable: bool) -> Container:
     """Plan, fine-tune if the settings say so, and write the files. A disposable scene that is not fine-tuned is
     forgotten once it is planned, so that its memory is free for the files."""
-    from kissgs.pipeline.encoding import encode, make_tuner, measure, plan, write
     from kissgs.pipeline.goal import Container
 
     settings, compacted = work.settings.encode, len(work.original) - len(work.splats)

@@ -40,8 +40,8 @@ _STREAMED = {each.manifest: name for name, each in FORMATS.items() if each.manif
 def recognise(source: Path | bytes | Mapping[str, bytes], *, name: str | None = None, size: int | None = None) -> str:
     """Return the format of a scene: a file, a folder, the bytes of a file, or a container's files in memory.
 
-    The metadata file of a container and the manifest of a streamed scene stand for their folder. ``.splat`` is
-    recognised by its name only.
+    The metadata file of a container and the manifest of a streamed scene stand for their folder, the folder of INRIA's
+    trainer for the scene in it. ``.splat`` is recognised by its name only, checkpoints too.
 
     Args:
         source: the scene, or the first 512 bytes of a file, of which every zip then counts as "sogxt".
@@ -55,16 +55,20 @@ def recognise(source: Path | bytes | Mapping[str, bytes], *, name: str | None = 
         return _container_format(MemorySource(source), "sogxt")
     name = ("" if isinstance(source, bytes) else source.name) if name is None else name
     name = name.lower()
-    if isinstance(source, Path) and (_is_folder(source) or scene_root(source) != source):
-        _check_folder(scene_root(source))
-        return _STREAMED.get(name) or _packed_format(scene_root(source), "sogxt")
+    if isinstance(source, Path):
+        root = scene_root(source)
+        if _is_folder(root):
+            _check_folder(root)
+            return _STREAMED.get(name) or _packed_format(root, "sogxt")
+        if _is_folder(source):
+            source, name = root, root.name
     head, found_size = _beginning(source)
     match, by_content = _by_content(head, found_size if size is None else size)
     if match == Match.SURE:
         return by_content
     ending = Path(name).suffix
     of_ending = next((kind for kind, each in FORMATS.items() if ending in each.endings), "ply")
-    if FORMATS[of_ending].by_ending and head[:4] not in ZIP_MAGICS:
+    if FORMATS[of_ending].by_ending and (FORMATS[of_ending].is_pickle or head[:4] not in ZIP_MAGICS):
         return of_ending
     if is_container(source):
         return _packed_format(source, "sog" if of_ending == "sog" else "sogxt")
@@ -87,8 +91,14 @@ def _by_content(head: bytes, size: int) -> tuple[Match, str]:
 
 
 def scene_root(path: Path) -> Path:
-    """Return the folder of a container or streamed scene if ``path`` is its metadata or manifest, else ``path``."""
-    return path.parent if path.name in (META_NAME, *_STREAMED) and path.is_file() else path
+    """Return what a path stands for: the folder of a container or streamed scene for its metadata or manifest, the last
+    scene in a folder that INRIA's trainer has written; else the path itself."""
+    if path.name in (META_NAME, *_STREAMED) and path.is_file():
+        return path.parent
+    if not _is_folder(path):
+        return path
+    scenes = path.glob("point_cloud/iteration_[0-9]*/point_cloud.ply")
+    return max(scenes, key=lambda scene: (len(scene.parent.name), scene), default=path)  # in the order of numbers
 
 
 def is_container(source: Path | bytes) -> bool:
@@ -111,12 +121,12 @@ def _is_folder(path: Path) -> bool:
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse a folder that is no container, and name the scenes in it, or below it where INRIA's trainer puts them."""
+    """Refuse a folder that is no container, and name the scenes in it."""
     try:
         if any((folder / name).is_file() for name in (YAML_NAME, META_NAME, *_STREAMED)):
             return
-        found = [path for pattern in ("*", "point_cloud/iteration_*/*") for path in sorted(folder.glob(pattern))]
-        scenes = [path for path in found if path.suffix.lower() in (*ENDINGS, *SCENE_ENDINGS) and path.is_file()]
+        endings = (*ENDINGS, *SCENE_ENDINGS)
+        scenes = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in endings and path.is_file()]
     except (OSError, ValueError):
         return  # the reader says why
     if scenes:
@@ -214,7 +224,8 @@ def load(
 
     Args:
         path: ``.ply``, ``.spz``, ``.splat``, ``.ksplat``, ``.glb`` or ``.gltf``; a SOG-XT or SOG container (zip,
-            folder, or its ``meta.json``); a streamed scene (zip, folder, or its ``lod-meta.json`` or ``levels.json``).
+            folder, or its ``meta.json``); a streamed scene (zip, folder, or its ``lod-meta.json`` or ``levels.json``);
+            a checkpoint of gsplat (``.pt``) or splatfacto (``.ckpt``); the folder of INRIA's trainer.
         max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
         level: level of detail of a streamed scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
@@ -308,6 +319,8 @@ def read_scene(
         found = "sogxt"  # whose reader says what is wrong
     refuse_level(found, root, reading.level)
     splats = reading.marked(FORMATS[found].codec.read(root, reading, threads, progress))
+    if isinstance(source, Path) and isinstance(root, Path) and source in root.parents:
+        splats = replace(splats, notes=(f"the scene is {root.relative_to(source)}", *splats.notes))
     return centred(splats) if reading.origin == "auto" else splats
 
 

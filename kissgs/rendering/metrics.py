@@ -6,7 +6,6 @@ import http.client
 import importlib
 import itertools
 import math
-import warnings
 
 import numpy as np
 
@@ -198,15 +197,12 @@ class Lpips:
     def __init__(self, device: str = "cpu") -> None:
         """Load the network, whose weights (528 MB) torchvision downloads on first use."""
         try:
-            package = importlib.import_module("lpips")
+            package = importlib.import_module("torchmetrics.image.lpip")
+            self._network = package.LearnedPerceptualImagePatchSimilarity(net_type="vgg").to(device)
         except ModuleNotFoundError as error:
             raise UnsupportedError(
                 f"LPIPS needs packages that are not installed ({error}): pip install 'kissgs[lpips]'"
             ) from error
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # lpips loads weights by a deprecated function of torchvision
-                self._network = package.LPIPS(net="vgg", verbose=False).to(device)
         except (OSError, RuntimeError, http.client.HTTPException) as error:
             raise UnsupportedError(
                 f"LPIPS could not load the weights of its network, vgg16, which torchvision downloads on first use "
@@ -223,6 +219,8 @@ class Lpips:
         height, width, _ = pair[0].shape
         if min(height, width) < 16:  # the network halves its input four times
             raise UnsupportedError(f"LPIPS needs images of at least 16x16 pixels, not {width}x{height}")
+        if any(np.isnan(array).any() for array in pair):  # the package refuses NaN
+            return float("nan")
         first, second = (torch.from_numpy(array).to(self._device).permute(2, 0, 1)[None] for array in pair)
         with torch.no_grad():
             return float(self._network(first, second).item())

@@ -22,8 +22,7 @@ from kissgs.core.positions import STREAMED_REMEDY, WORLD, Cuts, cuts_without_coa
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, clean, concatenate, sampled_rows
 from kissgs.formats import ContainerName
-from kissgs.pipeline.containers import MODELS, write_files
-from kissgs.pipeline.encoding import VIEW_UNCERTAINTY
+from kissgs.pipeline.encoding import MODELS, VIEW_UNCERTAINTY, write_files
 from kissgs.pipeline.scene_files import reading_notes
 from kissgs.planning.planner import plan_encoding, visible_gaussians
 from kissgs.rendering.camera import Camera

@@ -20,7 +20,7 @@ from kissgs.io.files import reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.limited_time import speed
-from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_level, stored_bytes
+from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_level, scene_root, stored_bytes
 from kissgs.runners import Resources, Runner, WorkItem, error_of
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.streaming import build
@@ -250,6 +250,7 @@ def _check_settings(settings: Settings) -> None:
 def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, int, int]:
     """Return a function that reads the scene in blocks, the number of its Gaussians, and their SH degree."""
     if recognise(source) == "ply":
+        source = scene_root(source)
         refuse_level("ply", source, reading.level)
         info = read_ply_info(source)
         if not info.compressed:

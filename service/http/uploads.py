@@ -20,7 +20,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect, Request
 
 import kissgs
-from kissgs.formats import DOUBLE_ENDINGS, UPLOADS, alternatives
+from kissgs.formats import DOUBLE_ENDINGS, FORMATS, UPLOADS, alternatives
 
 from ..core.problems import ProblemError, disk_full, invalid
 from ..core.settings import ServiceSettings
@@ -291,7 +291,8 @@ class Spool:
             kind = kissgs.recognise(self._path, name=name)
             if kind not in UPLOADS:
                 wanted = alternatives(tuple(UPLOADS.values()))
-                raise ProblemError("unsupported", f"the upload is a zip file, but not a .sog; send a {wanted}")
+                what = "a checkpoint of a trainer" if FORMATS[kind].is_pickle else "a zip file, but not a .sog"
+                raise ProblemError("unsupported", f"the upload is {what}; send a {wanted}")
             with self._path.open("rb") as file:  # JSON is as large as the upload, and would be parsed in this process
                 if kind == "gltf" and file.read(4) != b"glTF":
                     raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")

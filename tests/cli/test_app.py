@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -10,6 +11,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from helpers.captured_scene import SCENE, write_capture
 from helpers.command_line import KISSGS, failure, run
 
 import kissgs
@@ -199,14 +201,54 @@ def test_names_of_folders(scene, tmp_path):
 
 
 def test_a_folder_that_is_no_container_is_named_with_what_to_give(scene, tmp_path):
-    trained = "point_cloud/iteration_7000/point_cloud.ply"
-    for path in (tmp_path / "trained" / trained, tmp_path / "adir" / "scene.ply", tmp_path / "notes" / "a.txt"):
+    for path in (tmp_path / "adir" / "scene.ply", tmp_path / "notes" / "a.txt"):
         path.parent.mkdir(parents=True)
         path.write_bytes(scene.read_bytes())
     for command in ("compress", "decompress", "info", "render"):
         assert "adir is a folder, not a scene; name a file in it: scene.ply" in failure(command, "adir", cwd=tmp_path)
-        assert f"it: {trained}" in failure(command, tmp_path / "trained")
         assert "notes is a folder without a scene" in failure(command, "notes", cwd=tmp_path)
+
+
+def test_a_folder_of_inrias_trainer_is_its_last_scene(tmp_path):
+    for iteration, count in ((7000, 30), (30000, 50), ("best", 10)):
+        path = tmp_path / f"runs/garden/point_cloud/iteration_{iteration}/point_cloud.ply"
+        path.parent.mkdir(parents=True)
+        kissgs.save(kissgs.sample_scene(count), path)
+    (tmp_path / "runs/garden/cameras.json").write_text("[]")
+    model = tmp_path / "runs/garden"
+    assert (len(kissgs.load(model)), kissgs.read_scene_info(model).count, kissgs.recognise(model)) == (50, 50, "ply")
+    done = run("compress", model, "-p", "fast")
+    assert b"the scene is point_cloud/iteration_30000/point_cloud.ply" in done.stdout
+    assert kissgs.read_scene_info(tmp_path / "runs/garden.zip").count == 50
+    run("compress", model, "-o", tmp_path / "levels.sogxt/", "-p", "fast")
+    assert kissgs.read_scene_info(tmp_path / "levels.sogxt").count == 50
+
+
+def test_outputs_of_equal_names_are_named_after_the_folders_that_differ(scene, tmp_path):
+    inputs = [f"{name}/point_cloud/iteration_9/point_cloud.ply" for name in ("garden", "bonsai")]
+    for name in inputs:
+        (tmp_path / name).parent.mkdir(parents=True)
+        shutil.copy(scene, tmp_path / name)
+    assert run("convert", *inputs, "out/", "--to", "spz", "-q", cwd=tmp_path).returncode == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"garden.spz", "bonsai.spz"}
+    inputs = [inputs[0], f"garden/../{inputs[0]}"]
+    assert "would become one file" in failure("convert", *inputs, "out/", "--to", "spz", cwd=tmp_path)
+
+
+def test_each_scene_has_the_capture_of_its_name(tmp_path):
+    for name, photographs in (("garden", ("a.png", "b.png")), ("bonsai", ("a.png", "b.png", "c.png", "d.png"))):
+        write_capture(tmp_path / "data" / name, photographs)
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        kissgs.save(SCENE, tmp_path / "runs" / name / "point_cloud.ply")
+    command = ["compress", *(f"runs/{name}/point_cloud.ply" for name in ("garden", "bonsai"))]
+    command += ["--views", "data", "-p", "fast", "--evaluate", "--json"]
+    for outputs in ([], ["-o", "out/"]):
+        done = run(*command, *outputs, cwd=tmp_path)
+        found = [report["evaluation"]["source"] for report in json.loads(done.stdout)]
+        assert ["data/garden" in found[0], "data/bonsai" in found[1]] == [True, True]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"garden.zip", "bonsai.zip"}
+    done = run(*command, "--views", "nowhere", cwd=tmp_path)
+    assert done.stderr == b"kissgs: there is no folder nowhere; name the folder of a capture\n", "once for all scenes"
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])

@@ -380,7 +380,7 @@ def test_a_scene_that_no_camera_sees():
     assert same(result.splats, far.select(result.index))
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.cuda
 def test_a_gpu_trains_as_well_as_the_cpu():
     scene, views = cloud(200), five_views()
     on_cpu, on_gpu = (Popspa(scene, settings(), views, Context(device=device))(60) for device in ("cpu", "cuda"))

@@ -8,11 +8,12 @@ import pytest
 from helpers.captured_scene import SCENE as CAPTURED
 from helpers.captured_scene import camera
 from helpers.command_line import failure, run
-from helpers.reference_cameras import Pose, write_json, write_text
+from helpers.reference_cameras import Pose, point_bytes, write_binary, write_json
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import kissgs
+from kissgs.cameras.captures.colmap import gsplat_similarities
 from kissgs.cameras.views import View, Views, black
 from kissgs.core.errors import InvalidViewsError
 from kissgs.evaluation.evaluate import fitting_views, in_scene_frame
@@ -26,13 +27,13 @@ SIZE = (60, 40)
 CAMERAS = [camera(0.3 * n, SIZE) for n in range(4)]
 
 
-def moved_scene():
+def moved_scene(turn=TURN, shift=SHIFT, scale=SCALE):
     """Return the scene in nerfstudio's coordinates, s (R p + t)."""
-    quats = TURN * Rotation.from_quat(SCENE.quats[:, [1, 2, 3, 0]])
+    quats = turn * Rotation.from_quat(SCENE.quats[:, [1, 2, 3, 0]])
     return replace(
         SCENE,
-        means=np.float32(SCALE * (TURN.apply(SCENE.means) + SHIFT)),
-        scales=np.float32(SCENE.scales + np.log(SCALE)),
+        means=np.float32(scale * (turn.apply(SCENE.means) + shift)),
+        scales=np.float32(SCENE.scales + np.log(scale)),
         quats=np.float32(quats.as_quat()[:, [3, 0, 1, 2]]),
     )
 
@@ -68,7 +69,7 @@ def write_colmap(folder):
         for n, each in enumerate(CAMERAS)
     ]
     focal = float(CAMERAS[0].K[0, 0])
-    write_text(folder / "sparse" / "0", {1: ("PINHOLE", *SIZE, (focal, focal, SIZE[0] / 2, SIZE[1] / 2))}, images)
+    write_binary(folder / "sparse" / "0", {1: ("PINHOLE", *SIZE, (focal, focal, SIZE[0] / 2, SIZE[1] / 2))}, images)
 
 
 @pytest.mark.parametrize(
@@ -101,6 +102,22 @@ def test_cameras_are_moved_into_nerfstudios_frame_where_the_scene_is_there(tmp_p
     for view in found.all:
         expected = rendered(SCENE, CAMERAS[int(view.name.removeprefix("images/")[0])])
         np.testing.assert_allclose(rendered(moved_scene(), view.camera), expected, atol=0.02)
+
+
+def test_the_run_of_a_scene_has_nerfstudios_frame(tmp_path):
+    """nerfstudio writes the transform beside the folder of checkpoints, not into the capture."""
+    write_photos(tmp_path / "data/images")
+    write_transforms(tmp_path / "data")
+    run_folder = tmp_path / "outputs/data/splatfacto/2026-01-01"
+    (run_folder / "nerfstudio_models").mkdir(parents=True)
+    write_dataparser(run_folder)
+    for scene in (run_folder / "nerfstudio_models/step-000029999.ckpt", run_folder / "splat.ply"):
+        views = kissgs.load_views(tmp_path / "data", scene=scene)
+        assert "moved by dataparser_transforms.json" in fitting_views(moved_scene(), views)[1]
+    kissgs.save(moved_scene(), scene)
+    settings = kissgs.Settings.from_preset("fast")
+    report = kissgs.compress(scene, settings=settings, evaluate=True, views=tmp_path / "data").report
+    assert "moved by dataparser_transforms.json" in report.note
 
 
 def test_evaluate_moves_cameras_too(tmp_path):
@@ -139,6 +156,83 @@ def test_a_damaged_file_of_transforms_is_named(tmp_path, content):
     (tmp_path / "dataparser_transforms.json").write_text(content)
     with pytest.raises(InvalidViewsError, match=r"dataparser_transforms\.json"):
         kissgs.load_views(tmp_path)
+
+
+def gsplat_scene(points, signs):
+    """Return the scene as gsplat's trainer normalises it: its examples/datasets/normalize.py in other words."""
+    poses = [np.linalg.inv(each.viewmat) for each in CAMERAS]
+    up = -np.mean([pose[:3, 1] for pose in poses], axis=0)
+    axis = np.cross(up, (0, -1, 0))
+    angle = np.arctan2(np.linalg.norm(axis), -up[1])
+    upright = Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle)
+    centres = upright.apply([pose[:3, 3] for pose in poses])
+    views = upright.apply([pose[:3, 2] for pose in poses])
+    middle = np.median([c - v * (v @ c) for c, v in zip(centres, views, strict=True)], axis=0)
+    scale = 1 / np.median(np.linalg.norm(centres - middle, axis=1))
+    points = scale * (upright.apply(points) - middle)
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    axes *= np.array(signs)[:, None] * (-1 if np.linalg.det(axes) < 0 else 1)
+    turn = Rotation.from_matrix(axes) * upright
+    shift = Rotation.from_matrix(axes).apply(-middle - np.median(points, axis=0) / scale)
+    return moved_scene(turn, shift, scale)
+
+
+POINTS = np.random.default_rng(5).normal((1, -0.5, 2), (4, 0.3, 1.5), (201, 3)) + [(0, 0, n / 99) for n in range(201)]
+
+
+def write_points(folder):
+    write_colmap(folder)
+    (folder / "sparse/0/points3D.bin").write_bytes(point_bytes(POINTS))
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
+def test_cameras_are_moved_into_gsplats_frame_where_the_scene_is_there(tmp_path, signs):
+    """The signs of its principal axes depend on the library that computes them, and on gsplat's version."""
+    write_photos(tmp_path / "images")
+    write_points(tmp_path)
+    scene = gsplat_scene(POINTS, signs)
+    views = kissgs.load_views(tmp_path)
+    fitting, note = fitting_views(scene, views)
+    assert "moved by gsplat's normalisation" in note
+    for view in (*in_scene_frame(scene, views).all, *fitting.all):
+        expected = rendered(SCENE, CAMERAS[int(view.name[0])])
+        np.testing.assert_allclose(rendered(scene, view.camera), expected, atol=0.02)
+
+
+def test_a_scene_in_the_models_coordinates_needs_no_points(tmp_path):
+    write_photos(tmp_path / "images")
+    write_points(tmp_path)
+    (tmp_path / "sparse/0/points3D.bin").write_bytes(b"nothing that could be read")
+    views = kissgs.load_views(tmp_path)
+    found, note = fitting_views(SCENE, views)
+    assert (found.train, note) == (views.train, "")  # the same objects
+
+
+def test_gsplats_frame_is_not_guessed_without_photographs_that_show_the_scene(tmp_path):
+    """Cameras around a scene show as much of it when they are turned by half."""
+    write_points(tmp_path)
+    scene = gsplat_scene(POINTS, (1, 1, 1))
+    assert "gsplat's" not in fitting_views(scene, kissgs.load_views(tmp_path))[1]
+    write_photos(tmp_path / "images", OTHERS["noise"])
+    with pytest.raises(InvalidViewsError, match="or the points of its COLMAP model if gsplat did"):
+        fitting_views(scene, kissgs.load_views(tmp_path))
+
+
+@pytest.mark.parametrize("data", [point_bytes(POINTS)[:-9], point_bytes(POINTS) + b"1", b"\xff" * 80])
+def test_damaged_points_are_named(tmp_path, data):
+    path = tmp_path / "points3D.bin"
+    path.write_bytes(data)
+    with pytest.raises(InvalidViewsError, match=r"points3D\.bin.* (truncated|last point|declares)"):
+        gsplat_similarities(path, [each.viewmat for each in CAMERAS])
+
+
+@pytest.mark.parametrize("points", [POINTS[:1], POINTS[:0], POINTS * np.nan])
+def test_points_and_cameras_that_determine_no_frame(tmp_path, points):
+    (tmp_path / "points3D.bin").write_bytes(point_bytes(points))
+    upright, upside_down = CAMERAS[0].viewmat, np.diag([-1, -1, 1, 1.0]) @ CAMERAS[0].viewmat
+    for viewmats in ([each.viewmat for each in CAMERAS], [upright, upside_down]):
+        assert gsplat_similarities(tmp_path / "points3D.bin", viewmats) == ()
+        (tmp_path / "points3D.bin").write_bytes(point_bytes(POINTS))
 
 
 def noisy(amount):

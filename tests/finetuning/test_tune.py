@@ -20,7 +20,7 @@ from kissgs.core.splats import ATTRIBUTES
 from kissgs.evaluation.evaluate import evaluate
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.tune import Tuner, _Result
-from kissgs.pipeline.containers import DECODERS, MODELS, write_files
+from kissgs.pipeline.encoding import DECODERS, MODELS, write_files
 from kissgs.pipeline.scene_files import describe
 from kissgs.planning import rotation_forms
 from kissgs.rendering.sensitivity import measure_sensitivity
@@ -76,6 +76,14 @@ def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree, rate_weight, 
     assert report.bytes_after == len(zip_bytes(encoded.files))
     assert report.target_source == "renderings"
     assert len(decompress(encoded.files)) == 150
+
+
+@pytest.mark.cuda
+def test_a_gpu_fine_tunes_as_well_as_the_cpu():
+    works = [replace(tuner(cloud(150, 2), steps=100), context=Context(1, device)) for device in ("cpu", "cuda")]
+    on_cpu, on_gpu = (tuned(cloud(150, 2), work=work)[1] for work in works)
+    assert on_gpu.psnr_before == pytest.approx(on_cpu.psnr_before, abs=0.02)
+    assert on_gpu.psnr_after == pytest.approx(on_cpu.psnr_after, abs=0.3)
 
 
 @pytest.mark.parametrize(

@@ -70,6 +70,13 @@ def image_bytes(images):
     return data
 
 
+def point_bytes(points):
+    data = struct.pack("<Q", len(points))
+    for number, point in enumerate(points, start=1):
+        data += struct.pack("<Q3d3BdQ", number, *point, 9, 8, 7, 0.5, number % 3) + bytes(8) * (number % 3)
+    return data
+
+
 def write_text(folder, cameras, images):
     folder.mkdir(parents=True, exist_ok=True)
     lines = ["# Camera list with one line of data per camera:", ""]

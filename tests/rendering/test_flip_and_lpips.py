@@ -1,6 +1,7 @@
 """FLIP and LPIPS. Oracle: values of FLIP's published algorithm, computed once in float64 with convolutions of SciPy.
 
-LPIPS has a fake package of the interface of lpips 0.1.4 that records its calls.
+LPIPS has a fake package of the interface of torchmetrics that records its calls. With the same random weights of the
+network, torchmetrics 1.4 and 1.9 return the distances of the package lpips 0.1.4.
 """
 
 import importlib.util
@@ -8,7 +9,6 @@ import math
 import sys
 import types
 import urllib.error
-import warnings
 
 import numpy as np
 import pytest
@@ -74,7 +74,7 @@ def test_images_of_different_sizes_have_no_flip():
         Flip()(np.zeros((16, 16, 3), dtype=np.float32), np.zeros((16, 17, 3), dtype=np.float32))
 
 
-@pytest.mark.parametrize(("metric", "package"), [(Flip, "flip_evaluator"), (Lpips, "lpips")])
+@pytest.mark.parametrize(("metric", "package"), [(Flip, "flip_evaluator"), (Lpips, "torchmetrics")])
 def test_an_error_names_the_extra_if_the_package_is_missing(monkeypatch, metric, package):
     monkeypatch.setitem(sys.modules, package, None)
     extra = metric.__name__.lower()
@@ -85,36 +85,39 @@ def test_an_error_names_the_extra_if_the_package_is_missing(monkeypatch, metric,
 
 
 class FakeNetwork(torch.nn.Module):
-    """A module with the interface of lpips.LPIPS: from two (N, 3, H, W) tensors to (N, 1, 1, 1)."""
+    """A module with the interface of LearnedPerceptualImagePatchSimilarity: from two (N, 3, H, W) tensors to a mean."""
 
-    def __init__(self, net, verbose):
+    def __init__(self, net_type="alex", reduction="mean", normalize=False):
         super().__init__()
-        warnings.warn("The parameter 'pretrained' is deprecated", UserWarning, stacklevel=2)
-        self.chosen, self.verbose, self.calls = net, verbose, []
+        self.chosen, self.normalize, self.calls = net_type, normalize, []
 
-    def forward(self, first, second, retPerLayer=False, normalize=False):
-        self.calls.append((first, second, normalize, torch.is_grad_enabled()))
-        return (first - second).square().mean(dim=(1, 2, 3), keepdim=True)
+    def forward(self, first, second):
+        if not first.min() >= -1:
+            raise ValueError("Expected both input arguments to be normalized tensors")
+        self.calls.append((first, second, torch.is_grad_enabled()))
+        return (first - second).square().mean()
 
 
 @pytest.fixture
 def package(monkeypatch):
-    module = types.ModuleType("lpips")
-    module.LPIPS = FakeNetwork
-    monkeypatch.setitem(sys.modules, "lpips", module)
+    module = types.ModuleType("torchmetrics.image.lpip")
+    module.LearnedPerceptualImagePatchSimilarity = FakeNetwork
+    for name in ("torchmetrics", "torchmetrics.image"):
+        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
     return module
 
 
 def test_the_network_gets_images_as_in_the_evaluation_of_3dgs(package):
-    """VGG, channels first, in [0, 1] and not rescaled to [-1, 1]; warnings are suppressed."""
+    """VGG, channels first, in [0, 1] and not rescaled to [-1, 1]."""
     rng = np.random.default_rng(0)
     image, reference = rng.random((2, 20, 33, 3), dtype=np.float32)
     metric = Lpips()
     distance = metric(image, reference)
     assert distance == pytest.approx(np.mean((image - reference) ** 2))
     network = metric._network
-    ((first, second, normalize, gradients),) = network.calls
-    assert (network.chosen, network.verbose, normalize, gradients) == ("vgg", False, False, False)
+    ((first, second, gradients),) = network.calls
+    assert (network.chosen, network.normalize, gradients) == ("vgg", False, False)
     for tensor, array in ((first, image), (second, reference)):
         assert tensor.shape == (1, 3, 20, 33)
         assert (tensor[0].permute(1, 2, 0).numpy() == array).all()
@@ -145,7 +148,7 @@ def test_an_error_says_how_to_get_the_weights(package, monkeypatch, reason):
     def offline(**options):
         raise reason
 
-    monkeypatch.setattr(package, "LPIPS", offline)
+    monkeypatch.setattr(package, "LearnedPerceptualImagePatchSimilarity", offline)
     with pytest.raises(UnsupportedError, match="weights of its network, vgg16, which torchvision downloads") as caught:
         Lpips()
     assert str(reason) in str(caught.value)

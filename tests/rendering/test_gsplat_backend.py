@@ -128,3 +128,11 @@ def test_rendering_does_not_need_torch():
     command = [sys.executable, "-c", CODE, str(Path(__file__).parents[1])]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
+def test_the_check_of_cuda_says_what_is_missing():
+    script = Path(__file__).parents[2] / "scripts" / "check_cuda.py"
+    done = subprocess.run([sys.executable, script], check=False, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("nothing was checked: torch ")

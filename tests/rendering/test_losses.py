@@ -138,7 +138,7 @@ def test_nan_is_not_hidden(weight):
     assert torch.isfinite(gradient[20:]).all()
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.cuda
 def test_a_gpu_computes_the_same():
     """The accuracy is that of float32; TF32 would lose the variances."""
     image, target = pair(64, 70, 3)

@@ -22,19 +22,7 @@ from kissgs.rendering.cpu.frame import Gradients
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.rasterizer import BLACK, render, tensors_of
 
-
-def _cuda_is_missing():
-    if not torch.cuda.is_available():
-        return "no CUDA device here"
-    try:
-        import gsplat  # noqa: F401
-    except ImportError:
-        return "gsplat is not installed"
-    return None
-
-
-CUDA = pytest.param("cuda", marks=pytest.mark.skipif(_cuda_is_missing() is not None, reason=str(_cuda_is_missing())))
-devices = pytest.mark.parametrize("device", ["cpu", CUDA])
+devices = pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 
 
 def clamp_of(device):

@@ -64,6 +64,7 @@ TEXT = json.dumps({**ROOT, "buffers": [{"byteLength": len(BUFFER), "uri": data_u
 REFUSED = {  # what is damaged is tested in tests/io; here, that the sentence names the upload and not its path
     **{f"a zip of levels, {name}": ("a.zip", zip_of(kind.files([[SCENE]]))) for name, kind in KINDS.items()},
     "a container": ("a.zip", kissgs.compress(SCENE, settings=Settings.from_preset("fast")).to_zip()),
+    "a checkpoint, which needs torch": ("a.ckpt", zip_of({"archive/data.pkl": b""})),
     "text with the name of a .glb": ("a.glb", TEXT),
     "a .splat without its name": ("a.bin", splat_bytes(SCENE)),
     "half a .sog": ("a.sog", FILES["a.sog"][1][:-40]),

@@ -1,4 +1,4 @@
-"""COLMAP models: ``cameras`` and ``images``, as ``.bin`` or ``.txt``."""
+"""COLMAP models: ``cameras`` and ``images``, as ``.bin`` or ``.txt``; how gsplat normalises them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import codecs
 import io
 import re
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +23,8 @@ from kissgs.cameras.captures.photos import (
     quoted,
 )
 from kissgs.cameras.photographs import Distortion
-from kissgs.cameras.views import rotation_matrices
-from kissgs.core.array_types import Float64
+from kissgs.cameras.views import Similarity, rotation_matrices
+from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
 MAX_NAME_BYTES = 4096  # maximum bytes of an image's name; no file system has longer paths
@@ -49,6 +49,8 @@ _MODELS = {
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
+_POINT3D = struct.Struct("<Q3d3xdQ")  # without its track
+_TRACK_BYTES = 8
 _POINT_BYTES = 24
 _MIN_CAMERA_BYTES = _CAMERA.size + 3 * 8
 _MIN_IMAGE_BYTES = _IMAGE.size + 1 + _COUNT.size
@@ -240,7 +242,8 @@ class _Reader:
         return InvalidViewsError(f"{self.path} is truncated; copy or export it again")
 
 
-# COLMAP models: ``cameras`` and ``images``, as ``.bin`` or ``.txt``. Points, rigs and frames are not read.
+# COLMAP models: ``cameras`` and ``images``, as ``.bin`` or ``.txt``. Rigs and frames are not read, points only for
+# gsplat's normalisation.
 #
 # Source: https://colmap.github.io/format.html. The conventions are those of ``Camera``: world to camera, x right, y
 # down, z forward, the centre of the first pixel at (0.5, 0.5). World coordinates are those of the model, which INRIA's
@@ -305,7 +308,10 @@ def read_colmap(folder: Path) -> Capture:
     root = _root(folder)
     within = folder.resolve().relative_to(root)  # the files themselves may be links to others
     files = {str(within / path.name): path for path in (cameras_path, images_path)}
-    return Capture(tuple(posed_images), root, f"COLMAP model {folder}", files)
+    points = folder / "points3D.bin"
+    return Capture(
+        tuple(posed_images), root, f"COLMAP model {folder}", files, points=points if points.is_file() else None
+    )
 
 
 def _is_model(folder: Path, suffix: str) -> bool:
@@ -353,3 +359,55 @@ def _viewmat(record: ImageRecord, where: str) -> Float64[np.ndarray, "4 4"]:
     viewmat[:3, :3] = rotation_matrices(quat / np.linalg.norm(quat))
     viewmat[:3, 3] = record.translation
     return viewmat
+
+
+def read_points(path: Path) -> Float32[np.ndarray, "P 3"]:
+    """Return the positions of all points of a ``points3D.bin``."""
+    with open_file(path) as (file, size):
+        reader, found = _Reader(path, file, size), list[float]()
+        for _ in range(reader.count("points", _POINT3D.size)):
+            _, *position, _, images = reader.unpack(_POINT3D)
+            found += position
+            reader.skip(images * _TRACK_BYTES)
+        reader.finish("point")
+    return np.array(found, dtype=np.float32).reshape(-1, 3)
+
+
+# gsplat's trainer normalises the world (``examples/datasets/normalize.py``, unless ``normalize_world_space`` is false):
+# up is the mean of the cameras' up axes; the origin and the unit are medians over the cameras; then the axes are the
+# principal ones of the points, of which the largest is x. The signs of principal axes differ by linear algebra library,
+# and newer versions turn the world upside down by another rule than older ones, so all four proper choices are given.
+
+
+def gsplat_similarities(path: Path, viewmats: Sequence[Float64[np.ndarray, "4 4"]]) -> tuple[Similarity, ...]:
+    """Return the transforms by which gsplat may have normalised a COLMAP model with these points and world-to-camera
+    transforms of all images; none where they determine no such transform."""
+    points = read_points(path)
+    with np.errstate(all="ignore"):  # of cameras in one place and points in one, which the check finds
+        first = _normalised_cameras(np.linalg.inv(np.array(viewmats)))
+        moved = points @ first[:3, :3].T + first[:3, 3]
+    if len(points) < 2 or not np.isfinite(moved).all():
+        return ()
+    axes = np.linalg.eigh(np.cov(moved, rowvar=False))[1][:, ::-1].T  # rows, the largest first
+    axes[0] *= np.sign(np.linalg.det(axes))
+    second = np.eye(4)
+    second[:3, :3], second[:3, 3] = axes, -axes @ np.median(moved, axis=0)
+    source, signs = "gsplat's normalisation of the COLMAP model", ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
+    return tuple(Similarity(source, np.diag([*each, 1.0]) @ second @ first) for each in signs)
+
+
+def _normalised_cameras(poses: Float64[np.ndarray, "C 4 4"]) -> Float64[np.ndarray, "4 4"]:
+    """Return the transform by the cameras alone: up becomes -y, the cameras look at the origin, and the median distance
+    of their centres from it is 1. NaN or infinite where they determine none."""
+    down = poses[:, :3, 1].mean(axis=0)
+    down /= np.linalg.norm(down)
+    x, y, z = np.cross(down, (0, 1, 0))
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turn = np.eye(3) + skew + skew @ skew / (1 + down[1])
+    centres, forward = poses[:, :3, 3] @ turn.T, poses[:, :3, 2] @ turn.T
+    nearest = centres - (forward * centres).sum(axis=1, keepdims=True) * forward  # to the origin, on each axis of view
+    shift = -np.median(nearest, axis=0)
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = turn, shift
+    transform[:3] /= np.median(np.linalg.norm(centres + shift, axis=1))
+    return transform

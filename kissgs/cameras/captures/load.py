@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import io
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path, PurePosixPath
 
@@ -46,6 +48,7 @@ published results depend; INRIA's code limits only the width, so that portrait p
 
 HOLD_OUT = 8  # every eighth view, starting with the first, is held out: the protocol of 3DGS and Mip-NeRF 360
 JSONS = ("transforms.json", "transforms_train.json")
+MAX_ARGUMENTS_BYTES = 1 << 16  # of cfg_args that are read; INRIA's trainer writes 300
 MAX_ASPECT_ERROR = 0.01  # relative difference of aspect ratios of photograph and camera; scaled copies round sides
 
 
@@ -56,6 +59,7 @@ def load_views(
     images: Path | None = None,
     resolution: int | None = None,
     hold_out: int = HOLD_OUT,
+    scene: Path | None = None,
     unpacked: bool = False,
 ) -> Views:
     """Load the views of a capture; of its photographs, only the headers are read.
@@ -70,8 +74,9 @@ def load_views(
     are loaded.
 
     Cameras are in the coordinates of the camera file. nerfstudio trains scenes in others: its
-    ``dataparser_transforms.json``, in the capture's folder or beside the camera file, is read for those who compare the
-    views with a scene (:attr:`Views.similarities`).
+    ``dataparser_transforms.json``, in the folder of the run that ``scene`` is from, in the capture's folder or beside
+    the camera file, is read for those who compare the views with a scene (:attr:`Views.similarities`). A folder of
+    INRIA's trainer stands for the capture, the folder of photographs and the background that its ``cfg_args`` names.
 
     If there is no folder of photographs, views have cameras only, without distortion, and ``note`` says so. If only
     some photographs are missing, an error is raised, because results from fewer views could pass for those of all.
@@ -86,6 +91,7 @@ def load_views(
         resolution: maximum of the longer side, pixels; None for 1600.
         hold_out: every ``hold_out``-th view in order of names, starting with the first, is held out; 0 for none. A
             split that the capture defines takes precedence.
+        scene: file of the scene that the views are for.
         unpacked: ``path`` is the folder of an archive from elsewhere. The capture is its uppermost folder with cameras,
             and photographs are looked for in it only, wherever a camera file says they are.
 
@@ -101,16 +107,21 @@ def load_views(
         raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
     path = archive = Path(path)
     try:
+        training = None if unpacked else _trained_on(path)
+        if training is not None:
+            path, images = training[0], training[1] if scale is None and images is None else images
         if scale is None and images is None and not unpacked:
             path, scale = _of_scale(path)
         path = _uppermost_with_cameras(path) if unpacked else path
         capture, folder = _read_capture(path), path if path.is_dir() else path.parent
-        moves = similarities(dataparser_file((folder, capture.root)), capture.applied)
+        run = [] if scene is None else list(scene.absolute().parents)[:2]
+        moves = similarities(dataparser_file((*run, folder, capture.root)), capture.applied)
     except OSError as error:  # even testing for a path fails without permission or if a name is too long
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
     names = [posed.photo for posed in capture.images]
     photos = find_photos(names, capture.root, scale=scale, images=images, inside=unpacked)
     white = capture.white and (photos is None or read_photo_header(photos[0].path).transparent)
+    white = white if training is None else training[2]
     background = np.full(3, float(white), dtype=np.float32)
     limit = DEFAULT_RESOLUTION if resolution is None else resolution
     views = []
@@ -125,16 +136,16 @@ def load_views(
         source = source.replace(f"{archive}/", "").replace(f"{archive}", "the archive")
     if photos is not None:
         source = f"{source}, photographs of {_folders(photos)}"
-        return Views(train, test, background, source, similarities=moves)
+        return Views(train, test, background, source, similarities=moves, points=capture.points)
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
     note = "the archive has no photographs" if unpacked else note
     return Views(train, test, background, f"{source}, no photographs", note, moves)
 
 
-def as_views(views: Views | str | PathLike[str] | None) -> Views | None:
-    """Return the views, which are loaded if they are the path of a capture."""
-    return views if views is None or isinstance(views, Views) else load_views(Path(views))
+def as_views(views: Views | str | PathLike[str] | None, scene: Path | None = None) -> Views | None:
+    """Return the views, which are loaded for the scene in a file if they are the path of a capture."""
+    return views if views is None or isinstance(views, Views) else load_views(Path(views), scene=scene)
 
 
 def _read_capture(path: Path) -> Capture:
@@ -168,6 +179,38 @@ def _of_scale(path: Path) -> tuple[Path, int | None]:
     if prefix == IMAGES and scale.isdecimal() and path.is_dir() and not _has_cameras(path):
         return path.parent, int(scale)
     return path, None
+
+
+def _trained_on(folder: Path) -> tuple[Path, Path | None, bool] | None:
+    """Return what ``cfg_args`` of INRIA's trainer names: the capture, the folder of photographs if it is not the usual
+    one, and whether the background is white; None of a folder without it, or with cameras of its own. It is Python's
+    text of a ``Namespace``, which is parsed and never evaluated."""
+    file, given = folder / "cfg_args", dict[str | None, object]()
+    if not file.is_file() or _has_cameras(folder):
+        return None
+    with suppress(SyntaxError, ValueError, RecursionError, MemoryError), open_file(file) as (opened, _):
+        call = ast.parse(opened.read(MAX_ARGUMENTS_BYTES).decode(), mode="eval").body
+        keywords = call.keywords if isinstance(call, ast.Call) else []
+        given = {each.arg: each.value.value for each in keywords if isinstance(each.value, ast.Constant)}
+    capture, photographs = Path(str(given.get("source_path"))), str(given.get("images"))
+    if not ("source_path" in given and capture.is_dir()):
+        raise InvalidViewsError(f"{file} names no capture that is here: {capture!s:.200}; name the capture's folder")
+    usual = photographs == IMAGES or not (capture / photographs).is_dir()
+    return capture, None if usual else capture / photographs, given.get("white_background") is True
+
+
+def capture_of(path: Path, names: Iterable[str]) -> Path:
+    """Return the capture of a scene: the first folder in ``path`` with cameras and one of these names, if ``path`` has
+    no cameras itself; else ``path``."""
+    own = [] if is_capture(path) else [path / name for name in names if name]
+    return next((each for each in own if is_capture(each)), path)
+
+
+def is_capture(path: Path) -> bool:
+    """Whether a folder has cameras, or names those that INRIA's trainer was given."""
+    with suppress(OSError, ValueError):
+        return _has_cameras(path) or (path / "cfg_args").is_file() or _of_scale(path)[1] is not None
+    return False
 
 
 def _has_cameras(folder: Path) -> bool:

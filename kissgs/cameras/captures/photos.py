@@ -113,6 +113,7 @@ class Capture:
     files: dict[str, Path]  # these files by their names relative to ``root``, under which any capture may have them
     white: bool = False  # whether transparent pixels are composited over white
     applied: Float64[np.ndarray, "4 4"] | None = None  # rotation and translation from a former model to the poses
+    points: Path | None = None  # points of its COLMAP model
 
 
 def _focal(length: float | None, angle: float | None, side: int) -> float | None:

@@ -1,11 +1,14 @@
 """Oracle: small captures written by hand, the README of fox, and independent code for the rules of INRIA and COLMAP."""
 
+from argparse import Namespace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers.reference_cameras import PINHOLE, assert_camera, frames, poses, write_json, write_photo, write_text
 from PIL import Image
 
-from kissgs.cameras.captures.load import load_views
+from kissgs.cameras.captures.load import capture_of, load_views, pack_capture
 from kissgs.core.errors import InvalidViewsError
 
 NAMES = [f"{letter}.jpg" for letter in "jihgfedcba"]
@@ -222,3 +225,68 @@ def test_no_capture(tmp_path):
 )
 def test_arguments_out_of_range(tmp_path, options, sentence):
     assert message(tmp_path, **options) == sentence
+
+
+def trained(folder, **arguments):
+    """Write the ``cfg_args`` of INRIA's trainer as it does, with values that are no literals."""
+    folder.mkdir(parents=True, exist_ok=True)
+    usual = {"sh_degree": 3, "model_path": Path("out"), "images": "images", "resolution": -1, "eval": True}
+    (folder / "cfg_args").write_text(str(Namespace(**{**usual, **arguments})))
+
+
+@pytest.mark.parametrize("white", [True, False])
+def test_a_folder_of_inrias_trainer_stands_for_what_it_was_given(tmp_path, white):
+    capture(tmp_path / "data", size=(120, 80))
+    capture(tmp_path / "data", photos="images_2", size=(60, 40))
+    trained(tmp_path / "model", source_path=str(tmp_path / "data"), images="images_2", white_background=white)
+    views = load_views(tmp_path / "model")
+    assert views.source == f"COLMAP model {tmp_path}/data/sparse/0, photographs of images_2"
+    assert views.background.tolist() == [float(white)] * 3
+    assert load_views(tmp_path / "model", scale=1).source.endswith("photographs of images")
+    trained(tmp_path / "model", source_path=str(tmp_path / "data"))
+    assert load_views(tmp_path / "model").source.endswith("photographs of images")
+
+
+def test_a_synthetic_scene_has_the_background_that_it_was_trained_on(tmp_path):
+    document = {"camera_angle_x": 0.7, "frames": frames(poses(["a.png"]), "")}
+    write_json(tmp_path / "data/transforms_train.json", document)
+    Image.new("RGBA", (20, 20)).save(tmp_path / "data/a.png")
+    assert load_views(tmp_path / "data").background.tolist() == [1, 1, 1]
+    trained(tmp_path / "model", source_path=str(tmp_path / "data"), white_background=False)
+    assert load_views(tmp_path / "model").background.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("Namespace(source_path='/no/such/data')", "names no capture that is here: /no/such/data; name the"),
+        ("Namespace(source_path=open('ran', 'w'))", "names no capture"),
+        ("__import__('os').mkdir('ran')", "names no capture"),
+        ("Namespace(", "names no capture"),
+        ("(" * 5000, "names no capture"),
+        ("\0", "names no capture"),
+    ],
+)
+def test_arguments_of_inrias_trainer_are_not_evaluated(tmp_path, monkeypatch, text, sentence):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cfg_args").write_text(text)
+    assert sentence in message(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["cfg_args"]
+
+
+def test_archives_from_elsewhere_name_no_capture_of_this_machine(tmp_path):
+    capture(tmp_path / "data", size=(120, 80))
+    trained(tmp_path / "model", source_path=str(tmp_path / "data"))
+    assert "has no cameras" in message(tmp_path / "model", unpacked=True)
+    with pytest.raises(InvalidViewsError, match="has no cameras"):
+        pack_capture(tmp_path / "model", tmp_path / "packed.zip")
+
+
+def test_the_capture_of_each_scene(tmp_path):
+    for name in ("garden", "bonsai"):
+        capture(tmp_path / "data" / name)
+    (tmp_path / "data" / "notes").mkdir()
+    found = capture_of(tmp_path / "data", ["", "notes", "garden", "runs", "bonsai"])
+    assert found == tmp_path / "data/garden"
+    assert capture_of(found, ["sparse"]) == found, "it has cameras itself"
+    assert capture_of(tmp_path / "data", ["stump"]) == tmp_path / "data"
