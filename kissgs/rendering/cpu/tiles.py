@@ -35,31 +35,23 @@ def _sort_list(keys: np.ndarray, rows: np.ndarray, spans: np.ndarray, scratch: n
     order, other = scratch[0], scratch[1]
     for i in range(count):
         order[i] = np.uint32(i)
-    if count <= 32:
-        for i in range(1, count):
-            key, j = keys[i], i
-            while j > 0 and keys[order[j - 1]] > key:
-                order[j] = order[j - 1]
-                j -= 1
-            order[j] = np.uint32(i)
-    else:
-        differing = np.uint32(0)
-        for i in range(1, count):
-            differing |= keys[i] ^ keys[0]
-        for shift in range(0, 32, 8):
-            if (differing >> np.uint32(shift)) & np.uint32(255) == 0:
-                continue
-            counts[:] = 0
-            for i in range(count):
-                counts[(keys[i] >> np.uint32(shift)) & np.uint32(255)] += 1
-            total = 0
-            for digit in range(256):
-                total, counts[digit] = total + counts[digit], total
-            for i in range(count):
-                digit = (keys[order[i]] >> np.uint32(shift)) & np.uint32(255)
-                other[counts[digit]] = order[i]
-                counts[digit] += 1
-            order, other = other, order
+    differing = np.uint32(0)
+    for i in range(1, count):
+        differing |= keys[i] ^ keys[0]
+    for shift in range(0, 32, 8):
+        if (differing >> np.uint32(shift)) & np.uint32(255) == 0:
+            continue
+        counts[:] = 0
+        for i in range(count):
+            counts[(keys[i] >> np.uint32(shift)) & np.uint32(255)] += 1
+        total = 0
+        for digit in range(256):
+            total, counts[digit] = total + counts[digit], total
+        for i in range(count):
+            digit = (keys[order[i]] >> np.uint32(shift)) & np.uint32(255)
+            other[counts[digit]] = order[i]
+            counts[digit] += 1
+        order, other = other, order
     moved_rows, moved_spans = scratch[2], scratch[3]
     for i in range(count):
         moved_rows[i], moved_spans[i] = rows[i], spans[i]
