@@ -17,6 +17,7 @@ import numpy as np
 
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.resources import TORCH_MISSING
 from kissgs.core.splats import ATTRIBUTES, SH_C0, Splats
 from kissgs.io.files import listed, open_scene_file, refuse_more_than
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions
@@ -92,7 +93,7 @@ def _tensors(source: Path) -> dict[str, Tensor]:
     try:
         import torch
     except ImportError as error:
-        raise UnsupportedError("a checkpoint needs torch, which is missing: pip install 'kissgs[train]'") from error
+        raise UnsupportedError(f"a checkpoint needs {TORCH_MISSING}") from error
     name, document = source.name, _load(source)
     found = document.get("splats", document.get("pipeline")) if isinstance(document, Mapping) else None
     if not (isinstance(document, Mapping) and isinstance(found, Mapping)):

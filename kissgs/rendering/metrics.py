@@ -176,7 +176,7 @@ class Flip:
             self._package = importlib.import_module("flip_evaluator")
         except ModuleNotFoundError as error:
             raise UnsupportedError(
-                f"FLIP needs a package that is not installed ({error}): pip install 'kissgs[flip]'"
+                f"FLIP needs a package that is missing ({error}): pip install flip-evaluator"
             ) from error
 
     def __call__(self, image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
@@ -201,7 +201,7 @@ class Lpips:
             self._network = package.LearnedPerceptualImagePatchSimilarity(net_type="vgg").to(device)
         except ModuleNotFoundError as error:
             raise UnsupportedError(
-                f"LPIPS needs packages that are not installed ({error}): pip install 'kissgs[lpips]'"
+                f"LPIPS needs packages that are missing ({error}): pip install torchmetrics torchvision"
             ) from error
         except (OSError, RuntimeError, http.client.HTTPException) as error:
             raise UnsupportedError(

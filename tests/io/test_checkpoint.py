@@ -175,7 +175,7 @@ def test_damaged_copies_are_a_scene_or_refused(tmp_path):
 def test_without_torch(tmp_path, monkeypatch):
     path = saved(tmp_path / "a.pt", gsplat_document(made_scene(3, 1)))
     monkeypatch.setitem(sys.modules, "torch", None)
-    assert "needs torch, which is missing: pip install 'kissgs[train]'" in failure("info", path)
+    assert "needs torch, which is missing: pip install torch" in failure("info", path)
 
 
 def test_commands_take_checkpoints(tmp_path):
