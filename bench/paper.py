@@ -529,9 +529,10 @@ def plot(path: Path, found: Sequence[Point], published: Sequence[Point]) -> None
     """Draw the curves of one data set, published ones dashed."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15, 5), layout="constrained")
+    drawn = {name: label for name, label in METRICS.items() if any(point.quality(name) is not None for point in found)}
+    figure = Figure(figsize=(5 * len(drawn), 5), layout="constrained")
     names = list(dict.fromkeys(point.series for point in (*found, *published)))
-    for axes, (metric, label) in zip(figure.subplots(1, 3), METRICS.items(), strict=True):
+    for axes, (metric, label) in zip(figure.subplots(1, len(drawn), squeeze=False)[0], drawn.items(), strict=True):
         for number, series in enumerate(names):
             for points, form in ((found, "o-"), (published, "o--")):
                 curve = sorted((p for p in points if p.series == series), key=lambda point: point.bytes)
