@@ -10,7 +10,6 @@ import helpers.examples  # registers the profiles of Hypothesis
 import helpers.shape_checks  # the hook names it
 import pytest
 from helpers.compile_once import compile_once
-from helpers.servers import ray_cluster  # noqa: F401
 from jaxtyping import install_import_hook
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command has it: torch's threads spin otherwise
