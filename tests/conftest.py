@@ -54,7 +54,7 @@ install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "h
 
 
 WITH_FEWER_CAMERAS = ("io", "sog", "sogxt", "extremes", "finetuning")
-SMALLER_UNLESS_EXHAUSTIVE = ("cli", "compaction", "evaluation", "pipeline", "planning", "streaming")
+SMALLER_UNLESS_EXHAUSTIVE = ("cli", "compaction", "evaluation", "pipeline", "planning", "service", "streaming")
 AS_USERS_HAVE_IT = {
     "test_bench",  # measures in another process
     "test_promises",
@@ -74,13 +74,15 @@ def fewer_and_smaller_images(request, monkeypatch):
     folder = request.path.parent.name
     exhaustive = request.node.get_closest_marker("exhaustive")
     thorough = exhaustive or {request.path.stem, request.function.__name__} & AS_USERS_HAVE_IT
-    if not exhaustive and folder != "core":  # one thread each, as the processes of tests have all processors; else those that a test names
+    if not exhaustive and folder != "core":  # where no number of threads is given: other tests have the processors
         monkeypatch.setattr("kissgs.core.resources.processors", lambda: 1)
-    if folder in WITH_FEWER_CAMERAS or (folder in SMALLER_UNLESS_EXHAUSTIVE and not thorough):
+    smaller = folder in SMALLER_UNLESS_EXHAUSTIVE and not thorough
+    if folder in WITH_FEWER_CAMERAS or smaller:
         from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
 
-        try_fewer(monkeypatch)
-        if folder in SMALLER_UNLESS_EXHAUSTIVE:
+        if folder != "service":  # where tests share containers
+            try_fewer(monkeypatch)
+        if smaller:
             evaluate_smaller(monkeypatch, searches=folder == "pipeline")
 
 

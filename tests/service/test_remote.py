@@ -96,13 +96,6 @@ def unreachable():
         yield f"http://127.0.0.1:{unused.getsockname()[1]}"
 
 
-@pytest.mark.quick(0)
-def test_an_unreachable_service(unreachable, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(client, "RETRY_SECONDS", 0.0)
-    with kissgs.Remote(unreachable) as remote, pytest.raises(kissgs.RemoteError, match="cannot reach"):
-        remote.compress(scene, tmp_path / "x.zip")
-
-
 def test_the_note_about_a_service_that_is_down_leaves_its_address_to_the_command(unreachable, scene, tmp_path):
     """Regression: the command printed the address before the note, which had it once more."""
 
