@@ -27,10 +27,10 @@ serve: setup
 	@.venv/bin/kissgs-serve
 
 test: setup-dev
-	@.venv/bin/pytest -q -n auto --dist worksteal $(if $(SIXTH),--sixth=$(SIXTH),-m "not exhaustive")
+	@.venv/bin/pytest -q -n auto $(if $(SIXTH),--sixth=$(SIXTH),-m "not exhaustive")
 
 test-all: setup-dev
-	@.venv/bin/pytest -q -n auto --dist worksteal --hypothesis-profile=thorough
+	@.venv/bin/pytest -q -n auto --hypothesis-profile=thorough
 
 lint: setup-dev
 	@.venv/bin/ruff format --check .
