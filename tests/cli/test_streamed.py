@@ -103,7 +103,7 @@ FIRST, SECOND, PARTITIONED, *LATER = HOOKS
         *(([PARTITIONED, moment], "the same command goes on where it was") for moment in LATER),
     ],
 )
-@pytest.mark.quick(3)
+@pytest.mark.quick(2)
 def test_an_interruption_says_what_is_left_and_the_same_command_completes_it(scene, tmp_path, moments, left):
     call = [str(KISSGS), "compress", str(scene), "-o", "city/lod-meta.json", "-p", "fast"]
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}

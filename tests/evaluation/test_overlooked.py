@@ -103,7 +103,7 @@ def test_the_loss_of_any_object_is_visible(fifty):
     views = evaluation_views(scene)
     assert 20 < sum(view.added for view in views.test) <= MAX_ADDED
     reference_images, unseen = {}, []
-    for removed in range(0, 50, 12):
+    for removed in range(0, 50, 20):
         rest = scene.select(np.flatnonzero(removed != object_of))
         found = compare_images(scene, rest, views, reference_images=reference_images)
         assert found.worst.comparison.candidate_vs_reference.psnr < 20

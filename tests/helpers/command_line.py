@@ -2,6 +2,7 @@
 
 import contextlib
 import faulthandler
+import functools
 import os
 import signal
 import subprocess
@@ -9,12 +10,17 @@ import sys
 import tempfile
 from pathlib import Path
 
+import typer.main
+
 from kissgs.cli.main import main
 
 KISSGS = Path(sys.executable).with_name("kissgs")
 
 TIMEOUT_SECONDS = 900.0
 """A command that takes longer hangs: it ends its test process, after a traceback of all threads."""
+
+
+typer.main.get_command = functools.cache(typer.main.get_command)  # which takes longer than many commands
 
 
 def run(*words, stdin=b"", cwd=None, encoding="utf-8"):

@@ -12,11 +12,15 @@ def try_fewer(patch, azimuths=8, radii=(1.1, 2.6)):
 
 
 def evaluate_smaller(patch, *, searches):
-    """Reduce the images of evaluations, and where ``searches`` also those that a search compares, and their number."""
-    from kissgs.evaluation import cameras
+    """Reduce the images of evaluations, and where ``searches`` also those that a search compares, and their number.
+
+    The sample in which separate parts of a scene are found is smaller, too.
+    """
+    from kissgs.evaluation import cameras, scene_parts
 
     patch.setattr(cameras, "WIDTH", 96)
     patch.setattr(cameras, "HEIGHT", 72)
+    patch.setattr(scene_parts, "SAMPLE_SIZE", 500)  # of whose positions a tree is made
     if searches:
         from kissgs.compaction import search_evaluation
 

@@ -116,7 +116,7 @@ def far_sky():
 
 
 SCENES = {
-    "two, 50 apart": lambda: two(50),
+    "two, 50 apart": lambda: two(50, count=2000),
     "two, 200 apart": lambda: two(200),
     "two, 1000 apart": lambda: two(1000),
     "two, 10000 apart": lambda: two(10_000),

@@ -206,15 +206,6 @@ def test_no_job_starts_without_a_node_that_is_large_enough(on_the_cluster, whole
         wait_until(lambda: f"no job is started: {expected}" in service.log.read_text())
 
 
-@pytest.mark.quick(0)  # with a cluster of its own making, in tests/service/test_outcomes.py
-def test_training_without_the_gpu_that_it_requests_fails_and_does_not_wait(on_the_cluster, tmp_path):
-    with Service(tmp_path / "data", **on_the_cluster, KISSGS_JOB_GPUS=1) as service:
-        status = service.ended(service.submit(SMALL, json.dumps({"preset": "fast", "finetune": {"enabled": True}})))
-        assert (status["state"], status["problem"]["code"]) == ("failed", "unsupported")
-        assert "no node has 1 CPUs and 1 GB of memory and 1 GPUs" in status["problem"]["detail"]
-        assert result_of(service, service.submit()) == compressed(SMALL)
-
-
 def test_a_cluster_that_cannot_be_reached_is_a_problem_of_the_settings(tmp_path):
     pytest.importorskip("ray")
     with pytest.raises(SettingsError, match=r"no Ray cluster answers at 127\.0\.0\.1:1"):

@@ -12,7 +12,7 @@ import kissgs
 def service(tmp_path_factory):
     """Service shared by tests that do not restart it."""
     folder = tmp_path_factory.mktemp("shared") / "data"
-    with Service(folder, KISSGS_MAX_UPLOAD_BYTES="4MB", KISSGS_MAX_GAUSSIANS=20000) as it:
+    with Service(folder, KISSGS_MAX_UPLOAD_BYTES="4MB", KISSGS_MAX_GAUSSIANS=20000, max_capture_files=300) as it:
         yield it
 
 

@@ -87,14 +87,21 @@ ARCHIVES = {
 }
 
 
-@pytest.mark.parametrize("kind", ARCHIVES)
-def test_the_bytes_are_those_of_a_local_compression(service, folder, scene, expected, kind):
-    status = submitted(service, scene, ARCHIVES[kind](files_of(folder)))
+def test_the_bytes_are_those_of_a_local_compression(service, folder, scene, expected):
+    status = submitted(service, scene, zipped(files_of(folder)))
     assert service.only_result(status) == expected
     assert status["options"]["capture"].startswith("sha256:")
-    stored = service.folder / "jobs" / status["id"] / "capture"
-    names = {path.name for path in stored.rglob("*") if path.is_file()}
-    assert names == {"unpacked.json", "transforms.json", *(f"{n}.png" for n in range(9))}
+
+
+@pytest.mark.parametrize("kind", ARCHIVES)
+def test_what_is_needed_of_an_archive_is_stored(service, folder, scene, kind):
+    files = files_of(folder)
+    status = submitted(service, scene, ARCHIVES[kind](files), {"preset": "fast"})
+    assert service.ended(status)["state"] == "succeeded"
+    stored = files_of(service.folder / "jobs" / status["id"] / "capture")
+    found = {name.removeprefix("my statue/").removeprefix("a/b/"): data for name, data in stored.items()}
+    needed = ("transforms.json", *(f"images/{n}.png" for n in range(9)))
+    assert found == {"unpacked.json": found["unpacked.json"], **{name: files[name] for name in needed}}
 
 
 TRAINED = {
@@ -212,8 +219,8 @@ HOSTILE = {
     "no archive": (lambda files: b"hello" * 1000, "neither zip nor tar"),
     "a bomb": (lambda files: zipped({"images/0.bmp": bytes(100 << 20)}), "more than .* bytes when it is unpacked"),
     "a tar bomb": (lambda files: tarred({"images/0.bmp": bytes(100 << 20)}, "w:gz"), "more than .* bytes when"),
-    "entries": (lambda files: zipped({**files, **{f"{n}": b"" for n in range(100_000)}}), "more than 20,000 entries"),
-    "tar entries": (lambda files: tarred({f"{n}": b"" for n in range(20_001)}, "w:gz"), "more than 20,000 entries"),
+    "entries": (lambda files: zipped({**files, **{f"{n}": b"" for n in range(300)}}), "more than 300 entries"),
+    "tar entries": (lambda files: tarred({f"{n}": b"" for n in range(301)}, "w:gz"), "more than 300 entries"),
     "above": (lambda files: zipped({"../../0.png": b"x"}), "'../../0.png', which is outside its folder"),
     "backslashes": (lambda files: zipped({"..\\0.png": b"x"}), "which is outside its folder"),
     "absolute": (lambda files: tarred({"/tmp/0.png": b"x"}), "'/tmp/0.png', which is outside its folder"),
@@ -237,8 +244,8 @@ HOSTILE = {
     "a tar without end": (lambda files: tarred(files).rstrip(b"\0"), "damaged"),
     "a damaged header": (with_header_damaged, "damaged"),
     "nested folders": (
-        lambda files: zipped({f"{n}" + "/a" * 100 + "/0.png": b"" for n in range(200)}),
-        "more than 20,000 entries",
+        lambda files: zipped({f"{n}" + "/a" * 100 + "/0.png": b"" for n in range(3)}),
+        "more than 300 entries",
     ),
     "other endings": (lambda files: zipped(without_endings(files)), "no photographs that can be used, but 'images/."),
     "another folder": (

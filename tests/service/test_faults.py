@@ -22,21 +22,6 @@ BIG = scene_bytes(20_000, 3)
 MEDIUM = scene_bytes(6_000, 2)
 
 
-@pytest.mark.quick(0)
-def test_the_job_process_is_killed_twice(start, local):
-    service = start(processes=True)
-    job, next_one = service.submit(BIG, SLOW), service.submit()
-    for start_number in (1, 2):
-        while service.running(job)["starts"] != start_number:
-            time.sleep(0.02)
-        os.kill(service.children()[0], signal.SIGKILL)
-    status = service.ended(job)
-    assert (status["state"], status["starts"]) == ("failed", 2)
-    assert (status["problem"]["code"], status["problem"]["retryable"]) == ("crashed", True)
-    assert "SIGKILL" in status["problem"]["detail"]
-    assert service.only_result(next_one) == local.to_zip()
-
-
 @pytest.fixture
 def tiny_disk(tmp_path):
     """File system of 3 MB."""

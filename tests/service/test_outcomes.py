@@ -120,7 +120,9 @@ def test_the_pause_after_a_lost_start_grows(context, monkeypatch):
         job = context.store.claim()
         assert job.starts == start
         pauses.append(run(context, job, LOST))
-    assert context.store.get(job_id).state == State.FAILED
+    failed = context.store.get(job_id)
+    assert (failed.state, failed.problem["code"]) == (State.FAILED, "crashed")
+    assert "the machine was lost" in failed.problem["detail"]
     assert all(pause >= 0.02 * 2**start for start, pause in enumerate(pauses[:-1]))
 
 

@@ -96,13 +96,6 @@ def unreachable():
         yield f"http://127.0.0.1:{unused.getsockname()[1]}"
 
 
-@pytest.mark.quick(0)
-def test_an_unreachable_service(unreachable, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(client, "RETRY_SECONDS", 0.0)
-    with kissgs.Remote(unreachable) as remote, pytest.raises(kissgs.RemoteError, match="cannot reach"):
-        remote.compress(scene, tmp_path / "x.zip")
-
-
 def test_the_note_about_a_service_that_is_down_leaves_its_address_to_the_command(unreachable, scene, tmp_path):
     """Regression: the command printed the address before the note, which had it once more."""
 
@@ -116,7 +109,9 @@ def test_the_note_about_a_service_that_is_down_leaves_its_address_to_the_command
 
 
 def newest(service):
-    return service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
+    """Return the latest job, or one without a state where there is none yet."""
+    found = service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"]
+    return found[0] if found else {"state": None}
 
 
 def test_cancellation_by_either_side(service, scene, tmp_path):

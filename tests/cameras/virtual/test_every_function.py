@@ -57,6 +57,7 @@ def test_cameras_are_the_same_for_any_number_of_threads(place):
         (40, 1e-6, 1e6, -3, -5),
     ],
 )
+@pytest.mark.quick(17)  # each other one, and of the last two places the others
 def test_any_scene_gets_cameras(place, count, size, offset, log_scale, opacity):
     rng = np.random.default_rng(0)
     splats = Splats(
