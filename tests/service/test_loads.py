@@ -164,7 +164,7 @@ def test_an_upload_while_the_service_stops(start, more):
 
 
 def test_a_second_signal_at_once_is_no_failure(start, caplog):
-    """That of ``timeout make serve``: make passes on the signal that its group gets as well."""
+    """``timeout make serve`` sends one: make passes on the signal that its group gets as well."""
     service = start()
     service.interrupt()
     service.interrupt()
