@@ -180,9 +180,9 @@ def gsplat_scene(points, signs):
 POINTS = np.random.default_rng(5).normal((1, -0.5, 2), (4, 0.3, 1.5), (201, 3)) + [(0, 0, n / 99) for n in range(201)]
 
 
-def write_points(folder):
+def write_points(folder, points=POINTS):
     write_colmap(folder)
-    (folder / "sparse/0/points3D.bin").write_bytes(point_bytes(POINTS))
+    (folder / "sparse/0/points3D.bin").write_bytes(point_bytes(points))
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
@@ -216,6 +216,26 @@ def test_gsplats_frame_is_not_guessed_without_photographs_that_show_the_scene(tm
     write_photos(tmp_path / "images", OTHERS["noise"])
     with pytest.raises(InvalidViewsError, match="or the points of its COLMAP model if gsplat did"):
         fitting_views(scene, kissgs.load_views(tmp_path))
+
+
+def test_a_wrong_scene_does_not_pass_in_gsplats_frame_for_parts_of_its_images(tmp_path):
+    """A small object in front of walls once passed, since only the pixels that it covers were compared."""
+    write_photos(tmp_path / "images", lambda image: 0 * image + 0.7)
+    write_points(tmp_path, POINTS + 50)  # in whose frame the model's own cameras see nothing of the scene
+    scene, views = gsplat_scene(POINTS + 50, (1, 1, 1)), kissgs.load_views(tmp_path)
+    with pytest.raises(InvalidViewsError, match="shows any of the scene"):
+        fitting_views(replace(scene, sh0=np.full_like(scene.sh0, 0.7)).select(slice(1400, None)), views)
+
+
+def test_damaged_points_stop_only_a_scene_that_nothing_else_shows(tmp_path):
+    write_photos(tmp_path / "images")
+    write_points(tmp_path)
+    (tmp_path / "sparse/0/points3D.bin").write_bytes(b"nothing that could be read")
+    views, scene = kissgs.load_views(tmp_path), moved_scene()
+    with pytest.raises(InvalidViewsError, match=r"points3D\.bin.*--force-views"):
+        fitting_views(scene, views)
+    assert fitting_views(scene, views, force=True)[0].train == views.train
+    assert "points3D.bin" in in_scene_frame(scene, views).note
 
 
 @pytest.mark.parametrize("data", [point_bytes(POINTS)[:-9], point_bytes(POINTS) + b"1", b"\xff" * 80])
