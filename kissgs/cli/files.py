@@ -149,7 +149,9 @@ def for_each_input(
     processed; the exit code is then 2. A folder that is made for the outputs stays if all fail: another command may be
     about to write into it. The context of ``during``, which gets all inputs with their outputs, encloses the work. A
     slash at the end of ``output`` names a folder."""
-    inputs = expand(names)
+    from kissgs.io.checkpoint import one_per_step
+
+    inputs = one_per_step(expand(names))
     if writes and output is None:
         _refuse_output_as_input(inputs, suffix)
     if writes and as_json and str(output) == "-":

@@ -101,8 +101,9 @@ def fitting_views(
     problem = _problem(fit, source, samples)
     refused = not fit.seen or (fit.psnr < LEAST_PSNR and fit.psnr_inside < USUAL_PSNR)
     if samples and not force and refused:
+        problem = "; ".join(filter(None, [fit.unread, problem]))
         raise InvalidViewsError(
-            f"{'; '.join(filter(None, [fit.unread, problem]))}: give the capture of this scene, with dataparser_transforms.json beside it if nerfstudio "
+            f"{problem}: give the capture of this scene, with dataparser_transforms.json beside it if nerfstudio "
             "trained the scene, or the points of its COLMAP model if gsplat did, or --force-views (in Python "
             "force_views) to use it all the same"
         )

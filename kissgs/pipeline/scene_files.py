@@ -17,6 +17,7 @@ from kissgs.core.errors import InvalidContainerError, OutputError, UnsupportedEr
 from kissgs.core.positions import WORLD, centred, in_world, origin_for, relative_to, world_positions
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, clean
 from kissgs.formats import ENDINGS, FORMATS, LEVELS_NAME, LOD_NAME, SCENE_ENDINGS, output_format
+from kissgs.io.checkpoint import ranks
 from kissgs.io.containers import (
     MAX_METADATA_BYTES,
     META_NAME,
@@ -317,6 +318,8 @@ def read_scene(
     root = scene_root(source) if isinstance(source, Path) else source
     if only_containers and found == "ply":
         found = "sogxt"  # whose reader says what is wrong
+    if found == "sogxt" and isinstance(root, Path | bytes) and b"/data.pkl" in _beginning(root)[0]:
+        raise UnsupportedError("a checkpoint of a trainer is read from a file whose name ends in .pt or .ckpt only")
     refuse_level(found, root, reading.level)
     splats = reading.marked(FORMATS[found].codec.read(root, reading, threads, progress))
     if isinstance(source, Path) and isinstance(root, Path) and source in root.parents:
@@ -344,11 +347,11 @@ def reading_notes(splats: Splats) -> list[str]:
 
 
 def stored_bytes(path: Path) -> int:
-    """Return the size of a file, or of all files in a folder and below it, in bytes."""
+    """Return the size of a file, with other ranks' of a checkpoint, or of all files in a folder and below, in bytes."""
     try:
         root = scene_root(path)
         if not root.is_dir():
-            return root.stat().st_size
+            return sum(file.stat().st_size for file in ranks(root))
         return sum(entry.stat().st_size for entry in root.rglob("*") if entry.is_file())
     except OSError as error:
         raise InvalidContainerError(f"cannot read {path}: {reason_of(error)}") from error
