@@ -152,11 +152,11 @@ def _best(
             guesses = gsplat_similarities(views.points, [view.camera.viewmat for view in views.all])
         except InvalidViewsError as error:  # in points that other trainers' scenes do not need
             guesses, best = (), replace(best, unread=str(error))
-        found = sorted(((fit(each), each) for each in guesses), key=lambda pair: pair[0].psnr, reverse=True)
-        if found and found[0][0].seen:
-            second = max(best.psnr, found[1][0].psnr)
-            if found[0][0].psnr >= max(USUAL_PSNR, second + FRAME_MARGIN):
-                best, chosen = found[0]
+        ordered = sorted(((fit(each), each) for each in guesses), key=lambda pair: pair[0].psnr, reverse=True)
+        if ordered and ordered[0][0].seen:
+            second = max(best.psnr, ordered[1][0].psnr)
+            if ordered[0][0].psnr >= max(USUAL_PSNR, second + FRAME_MARGIN):
+                best, chosen = ordered[0]
     files = ", ".join(dict.fromkeys(similarity.source for similarity in views.similarities))
     views = _moved(views, chosen, splats.origin)
     if chosen is None:

@@ -96,10 +96,21 @@ def scene_root(path: Path) -> Path:
     scene in a folder that INRIA's trainer has written; else the path itself."""
     if path.name in (META_NAME, *_STREAMED) and path.is_file():
         return path.parent
-    if not _is_folder(path):
+    if not _is_folder(path) or _has_metadata(path):
         return path
-    scenes = path.glob("point_cloud/iteration_[0-9]*/point_cloud.ply")
-    return max(scenes, key=lambda scene: (len(scene.parent.name), scene), default=path)  # in the order of numbers
+    scenes = dict[int, Path]()
+    with suppress(OSError, ValueError):
+        for scene in path.glob("point_cloud/iteration_*/point_cloud.ply"):
+            iteration = scene.parent.name.removeprefix("iteration_")
+            if iteration.isdecimal() and scene.is_file():
+                scenes[int(iteration)] = scene
+    return scenes[max(scenes)] if scenes else path
+
+
+def _has_metadata(folder: Path) -> bool:
+    with suppress(OSError, ValueError):
+        return any((folder / name).is_file() for name in (YAML_NAME, META_NAME, *_STREAMED))
+    return False
 
 
 def is_container(source: Path | bytes) -> bool:
@@ -122,12 +133,12 @@ def _is_folder(path: Path) -> bool:
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse a folder that is no container, and name the scenes in it."""
+    """Refuse a folder that is no container, and name the scenes in it, or below it where INRIA's trainer puts them."""
+    if _has_metadata(folder):
+        return
     try:
-        if any((folder / name).is_file() for name in (YAML_NAME, META_NAME, *_STREAMED)):
-            return
-        endings = (*ENDINGS, *SCENE_ENDINGS)
-        scenes = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in endings and path.is_file()]
+        found = [path for pattern in ("*", "point_cloud/iteration_*/*") for path in sorted(folder.glob(pattern))]
+        scenes = [path for path in found if path.suffix.lower() in (*ENDINGS, *SCENE_ENDINGS) and path.is_file()]
     except (OSError, ValueError):
         return  # the reader says why
     if scenes:

@@ -111,9 +111,15 @@ def test_the_run_of_a_scene_has_nerfstudios_frame(tmp_path):
     run_folder = tmp_path / "outputs/data/splatfacto/2026-01-01"
     (run_folder / "nerfstudio_models").mkdir(parents=True)
     write_dataparser(run_folder)
+    (run_folder / "config.yml").touch()
     for scene in (run_folder / "nerfstudio_models/step-000029999.ckpt", run_folder / "splat.ply"):
         views = kissgs.load_views(tmp_path / "data", scene=scene)
         assert "moved by dataparser_transforms.json" in fitting_views(moved_scene(), views)[1]
+    for text in ("no JSON", '{"transform": [[1,0,0,9],[0,1,0,9],[0,0,1,9]], "scale": 3}'):
+        write_dataparser(tmp_path / "data")
+        (run_folder / "dataparser_transforms.json").write_text(text)
+        views = kissgs.load_views(tmp_path / "data", scene=scene)
+        assert "moved by dataparser_transforms.json" in fitting_views(moved_scene(), views)[1], "the capture's own"
     kissgs.save(moved_scene(), scene)
     settings = kissgs.Settings.from_preset("fast")
     report = kissgs.compress(scene, settings=settings, evaluate=True, views=tmp_path / "data").report

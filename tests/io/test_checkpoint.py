@@ -90,7 +90,10 @@ def test_all_ranks_of_a_step_are_read(tmp_path):
     assert describe(files[3]).bytes == sum(file.stat().st_size for file in files)
     inputs = [*files, tmp_path / "ckpt_6999_rank0.pt"]
     run("convert", *inputs, f"{tmp_path}/out/", "--to", "splat")
-    assert sorted(os.listdir(tmp_path / "out")) == ["ckpt_29999_rank0.splat", "ckpt_6999_rank0.splat"]
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [
+        "ckpt_29999_rank0.splat",
+        "ckpt_6999_rank0.splat",
+    ]
     (tmp_path / "ckpt_29999_rank05.pt").touch()
     with pytest.raises(InvalidSceneError, match=r"the same rank's .*ckpt_29999_rank05\.pt, .*; remove one"):
         read_checkpoint(files[0])
