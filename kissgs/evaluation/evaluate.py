@@ -34,9 +34,7 @@ LEAST_PSNR, USUAL_PSNR = 12.0, 18.0
 """Median PSNR, decibels, below which a capture is refused, and below which a note says so. Images of different scenes
 have about 8 to 12 dB; renderings of a trained scene have 20 to 35."""
 
-FRAME_MARGIN = 3.0
-"""Decibels by which a frame that no file states must be better than all others; photographs of walls look alike."""
-
+FRAME_MARGIN = 3.0  # decibels by which a frame that no file states must be better than all others
 COMPARED, SIDE = 5, 160  # photographs that are compared, and pixels on the longer side of each
 CAMERAS = 16  # number of cameras that tell, where there are no photographs, how much of the scene they show
 GAINS = 0.25, 4.0  # by which a photograph may be darker or brighter than renderings of the same scene

@@ -133,23 +133,18 @@ def _tensors(source: Path) -> dict[str, Tensor]:
         if tensor is None:
             missing.append(stored)
             continue
-        if not (isinstance(tensor, torch.Tensor) and _is_usable(tensor := torch.Tensor.detach(tensor))):
+        # Of the class, as a parameter in a file may have attributes of these names; anything else counts as integers.
+        plain = torch.Tensor.detach(tensor) if isinstance(tensor, torch.Tensor) else torch.zeros(1, dtype=torch.int64)
+        usable = plain.layout == torch.strided and plain.device.type == "cpu" and not plain.is_nested
+        usable = usable and plain.is_floating_point() and plain.ndim > 0
+        if not (usable and plain.numel() <= _MOST_VALUES * len(plain)):
             raise InvalidSceneError(f"{name}: {stored} is no array of floating-point numbers; save the scene again")
-        tensors[own] = tensors[attribute] = tensor.resolve_neg()
+        tensors[own] = tensors[attribute] = plain.resolve_neg()
     if missing:
         remedy = "save all attributes of a scene that was trained without app_opt"
         remedy = "nerfstudio before 1.1 wrote it: export the scene as .ply" if "_model.means" in found else remedy
         raise InvalidSceneError(f"{name} has no {listed(missing)}; {remedy}")
     return tensors
-
-
-def _is_usable(tensor: Tensor) -> bool:
-    """Whether a detached tensor, which has no attributes of the file's own, is an array of numbers in the file."""
-    import torch
-
-    if tensor.is_nested or tensor.layout != torch.strided or tensor.device.type != "cpu":
-        return False
-    return tensor.is_floating_point() and tensor.ndim > 0 and tensor.numel() <= _MOST_VALUES * len(tensor)
 
 
 def _load(source: Path) -> object:

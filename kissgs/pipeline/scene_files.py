@@ -98,13 +98,9 @@ def scene_root(path: Path) -> Path:
         return path.parent
     if not _is_folder(path) or _has_metadata(path):
         return path
-    scenes = dict[int, Path]()
-    with suppress(OSError, ValueError):
-        for scene in path.glob("point_cloud/iteration_*/point_cloud.ply"):
-            iteration = scene.parent.name.removeprefix("iteration_")
-            if iteration.isdecimal() and scene.is_file():
-                scenes[int(iteration)] = scene
-    return scenes[max(scenes)] if scenes else path
+    scenes = path.glob("point_cloud/iteration_[0-9]*/point_cloud.ply")
+    in_order = sorted(scenes, key=lambda scene: (len(scene.parent.name), scene))  # of the numbers
+    return next((scene for scene in reversed(in_order) if scene.is_file()), path)
 
 
 def _has_metadata(folder: Path) -> bool:

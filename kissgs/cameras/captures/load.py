@@ -40,7 +40,7 @@ from kissgs.core.array_types import Float32
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidViewsError
 from kissgs.formats import MAX_PACKED_NAME, PHOTOGRAPHS, is_packable
-from kissgs.io.files import atomic_file
+from kissgs.io.files import atomic_file, listed
 from kissgs.rendering.camera import Camera
 
 DEFAULT_RESOLUTION = 1600
@@ -109,8 +109,8 @@ def load_views(
         raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
     path = archive = Path(path)
     try:
-        path, scale, images, training = (path, None, None, None) if unpacked else _resolved(path, scale, images)
-        path = _uppermost_with_cameras(path) if unpacked else path
+        place = _Place(_uppermost_with_cameras(path)) if unpacked else _place(path, scale, images)
+        path, scale, images = place[:3]
         capture = _read_capture(path)
         near = sorted(file.parent for file in archive.rglob(DATAPARSER_TRANSFORMS)) if unpacked else _run(scene)
         moves = similarities(dataparser_files(_own(path, capture), near), capture.applied)
@@ -118,7 +118,7 @@ def load_views(
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
     names = [posed.photo for posed in capture.images]
     photos = find_photos(names, capture.root, scale=scale, images=images, inside=unpacked)
-    white = _is_white(capture, photos or ()) if training is None else training.white
+    white = _is_white(capture, photos or ()) if place.white is None else place.white
     background = np.full(3, float(white), dtype=np.float32)
     limit = DEFAULT_RESOLUTION if resolution is None else resolution
     views = []
@@ -133,8 +133,9 @@ def load_views(
         source = source.replace(f"{archive}/", "").replace(f"{archive}", "the archive")
     if photos is not None:
         source = f"{source}, photographs of {_folders(photos)}"
-        note = EVERY_EIGHTH if training is not None and not training.held_out and test else ""
-        return Views(train, test, background, source, note, similarities=moves, points=capture.points)
+        return Views(
+            train, test, background, source, place.note if test else "", similarities=moves, points=capture.points
+        )
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
     note = "the archive has no photographs" if unpacked else note
@@ -179,25 +180,24 @@ def _of_scale(path: Path) -> tuple[Path, int | None]:
     return path, None
 
 
-class _Training(NamedTuple):
-    """What INRIA's trainer was given."""
+class _Place(NamedTuple):
+    """Place of a capture, and INRIA's choices for it."""
 
-    capture: Path
-    images: Path | None  # folder of photographs, if it is not the usual one
-    white: bool  # whether the background is
-    held_out: bool  # whether it trained without every eighth photograph
+    path: Path
+    scale: int | None = None
+    images: Path | None = None
+    white: bool | None = None  # whether the background is; None: as the capture says
+    note: str = ""
 
 
-def _resolved(
-    path: Path, scale: int | None, images: Path | None
-) -> tuple[Path, int | None, Path | None, _Training | None]:
+def _place(path: Path, scale: int | None = None, images: Path | None = None) -> _Place:
     """Return the capture for which a path stands, with the scale or the folder of its photographs."""
-    training = _trained_on(path)
-    if training is not None:
-        path, images = training.capture, training.images if scale is None and images is None else images
+    trained = _trained_on(path)
+    if trained is not None:
+        path, images = trained.path, trained.images if scale is None and images is None else images
     if scale is None and images is None:
         path, scale = _of_scale(path)
-    return path, scale, images, training
+    return (trained or _Place(path))._replace(path=path, scale=scale, images=images)
 
 
 def _is_white(capture: Capture, photos: Sequence[FoundPhoto]) -> bool:
@@ -214,7 +214,7 @@ def _run(scene: Path | None) -> list[Path]:
     return [folder for folder in folders if (folder / "config.yml").is_file()]
 
 
-def _trained_on(folder: Path) -> _Training | None:
+def _trained_on(folder: Path) -> _Place | None:
     """Return what ``cfg_args`` of INRIA's trainer names; None of a folder without it, or with cameras of its own. It is
     Python's text of a ``Namespace``, which is parsed and never evaluated."""
     file, given = folder / "cfg_args", dict[str | None, object]()
@@ -232,8 +232,8 @@ def _trained_on(folder: Path) -> _Training | None:
         remedy = "name the capture's folder with --views"
         raise InvalidViewsError(f"{file} names no capture that is here: {quoted(named)}{cameras}; {remedy}")
     usual = photographs == IMAGES or not (capture / photographs).is_dir()
-    white, held_out = given.get("white_background") is True, given.get("eval") is not False
-    return _Training(capture, None if usual else capture / photographs, white, held_out)
+    white, note = given.get("white_background") is True, EVERY_EIGHTH if given.get("eval") is False else ""
+    return _Place(capture, images=None if usual else capture / photographs, white=white, note=note)
 
 
 def capture_of(path: Path, scene: Path | None) -> Path:
@@ -243,14 +243,17 @@ def capture_of(path: Path, scene: Path | None) -> Path:
     Raises:
         InvalidViewsError: ``path`` is a folder of other folders, none of which is the scene's capture.
     """
-    if scene is None or is_capture(path) or not path.is_dir():
+    folders = list[Path]()  # none where the path is no folder that can be read, of which loading it tells
+    with suppress(OSError):
+        folders = [] if scene is None or is_capture(path) else list(path.iterdir())
+    if scene is None or not any(map(is_capture, folders)):
         return path
-    names = list(dict.fromkeys([scene.stem, *(folder.name for folder in scene.absolute().parents[:3])]))
-    found = next((path / name for name in names if name and is_capture(path / name)), None)
-    if found is None and any(is_capture(each) for each in path.iterdir()):
-        wanted = ", ".join(quoted(name) for name in names if name)
+    names = [name for name in (scene.stem, *(folder.name for folder in scene.absolute().parents[:3])) if name]
+    found = next((path / name for name in names if is_capture(path / name)), None)
+    if found is None:
+        wanted = listed([quoted(name) for name in names])
         raise InvalidViewsError(f"{path} has no capture of {scene}: no folder in it is named {wanted}, and has cameras")
-    return found or path
+    return found
 
 
 def is_capture(path: Path) -> bool:
@@ -359,12 +362,12 @@ def pack_capture(path: Path, destination: Path, progress: Progress = silent, *, 
     """Pack what :func:`load_views` uses of a capture for a scene into a zip, from which a service reads the same views:
     its camera files, and the photographs of its views, those that are used reduced without further loss. Equal captures
     make equal files."""
-    views = load_views(path, scene=scene)  # refuses what a service would refuse
-    path, scale, images, training = _resolved(path, None, None)
+    load_views(path, scene=scene)  # refuses what a service would refuse
+    path, scale, images, white, _ = _place(path)
     capture = _read_capture(path)
     names = [posed.photo for posed in capture.images]
     photos = find_photos(names, capture.root, scale=scale, images=images) or ()
-    if training is not None and bool(views.background[0]) != _is_white(capture, photos):
+    if white not in (None, _is_white(capture, photos)):
         raise InvalidViewsError(
             f"the background that cfg_args names for {path} cannot be sent to a service; compress the scene here"
         )
