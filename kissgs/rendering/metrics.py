@@ -198,11 +198,13 @@ class Lpips:
         """Load the network, whose weights (528 MB) torchvision downloads on first use."""
         try:
             package = importlib.import_module("torchmetrics.image.lpip")
-            self._network = package.LearnedPerceptualImagePatchSimilarity(net_type="vgg").to(device)
-        except ModuleNotFoundError as error:
+            importlib.import_module("torchvision")
+        except (ImportError, RuntimeError, OSError) as error:  # RuntimeError: torchvision for another build of torch
             raise UnsupportedError(
-                f"LPIPS needs packages that are missing ({error}): pip install torchmetrics torchvision"
+                f"LPIPS needs torchmetrics, and torchvision of the same build as torch ({error}): pip install both"
             ) from error
+        try:
+            self._network = package.LearnedPerceptualImagePatchSimilarity(net_type="vgg").to(device)
         except (OSError, RuntimeError, http.client.HTTPException) as error:
             raise UnsupportedError(
                 f"LPIPS could not load the weights of its network, vgg16, which torchvision downloads on first use "
@@ -221,6 +223,7 @@ class Lpips:
             raise UnsupportedError(f"LPIPS needs images of at least 16x16 pixels, not {width}x{height}")
         if any(np.isnan(array).any() for array in pair):  # the package refuses NaN
             return float("nan")
-        first, second = (torch.from_numpy(array).to(self._device).permute(2, 0, 1)[None] for array in pair)
+        clamped = (torch.from_numpy(np.clip(array, 0, 1)) for array in pair)
+        first, second = (array.to(self._device).permute(2, 0, 1)[None] for array in clamped)
         with torch.no_grad():
             return float(self._network(first, second).item())
