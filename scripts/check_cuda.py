@@ -17,7 +17,7 @@ ROOMS = ("rendering", "compaction", "finetuning")  # that have such tests
 
 
 class Table:
-    """What became of each test."""
+    """Collect what became of each test."""
 
     def __init__(self) -> None:
         """Begin with no test."""

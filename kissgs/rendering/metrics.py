@@ -175,9 +175,7 @@ class Flip:
         try:
             self._package = importlib.import_module("flip_evaluator")
         except ModuleNotFoundError as error:
-            raise UnsupportedError(
-                f"FLIP needs a package that is missing ({error}): pip install flip-evaluator"
-            ) from error
+            raise UnsupportedError("FLIP needs flip-evaluator, which is missing: pip install flip-evaluator") from error
 
     def __call__(self, image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
         """Return the mean over all pixels of two sRGB images, clamped to [0, 1]; NaN if either has a NaN."""
@@ -198,18 +196,16 @@ class Lpips:
         """Load the network, whose weights (528 MB) torchvision downloads on first use."""
         try:
             package = importlib.import_module("torchmetrics.image.lpip")
-            importlib.import_module("torchvision")
-        except (ImportError, RuntimeError, OSError) as error:  # RuntimeError: torchvision for another build of torch
-            raise UnsupportedError(
-                f"LPIPS needs torchmetrics, and torchvision of the same build as torch ({error}): pip install both"
-            ) from error
-        try:
             self._network = package.LearnedPerceptualImagePatchSimilarity(net_type="vgg").to(device)
+        except ModuleNotFoundError as error:
+            raise UnsupportedError(
+                f"LPIPS needs torchmetrics and torchvision ({error}): pip install torchmetrics torchvision"
+            ) from error
         except (OSError, RuntimeError, http.client.HTTPException) as error:
             raise UnsupportedError(
-                f"LPIPS could not load the weights of its network, vgg16, which torchvision downloads on first use "
-                f"({error}): construct kissgs.rendering.metrics.Lpips once while online, or copy the file into the "
-                f"folder checkpoints of torch.hub.get_dir()"
+                f"LPIPS could not load its network, vgg16 ({error}): torchvision must be of torch's build; it downloads "
+                "the weights on first use: construct kissgs.rendering.metrics.Lpips once while online, or "
+                "copy the file into the folder checkpoints of torch.hub.get_dir()"
             ) from error
         self._device = device
 
