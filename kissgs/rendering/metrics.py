@@ -203,8 +203,8 @@ class Lpips:
             ) from error
         except (OSError, RuntimeError, http.client.HTTPException) as error:
             raise UnsupportedError(
-                f"LPIPS could not load its network, vgg16 ({error}): torchvision must be of torch's build; it downloads "
-                "the weights on first use: construct kissgs.rendering.metrics.Lpips once while online, or "
+                f"LPIPS could not load its network, vgg16 ({error}): torchvision must be of torch's build; it "
+                "downloads the weights on first use: construct kissgs.rendering.metrics.Lpips once while online, or "
                 "copy the file into the folder checkpoints of torch.hub.get_dir()"
             ) from error
         self._device = device
