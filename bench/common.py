@@ -41,11 +41,15 @@ def positive(text: str) -> int:
 
 
 def run(study: Callable[[], None]) -> None:
-    """Run a study; an error of the library or the system becomes one sentence."""
+    """Run a study; an error of the library or the system becomes one sentence, and exit status 2."""
     try:
         study()
+    except KeyboardInterrupt:
+        sys.stderr.write("stopped; run it again to go on\n")
+        raise SystemExit(130) from None
     except (KissgsError, OSError) as error:
-        raise SystemExit(f"{Path(sys.argv[0]).name}: {error}") from error
+        sys.stderr.write(f"{Path(sys.argv[0]).name}: {error}\n")
+        raise SystemExit(2) from error
 
 
 def at_quality_offset(settings: Settings, decibels: float) -> Settings:
@@ -86,7 +90,11 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def _line(cells: Sequence[object]) -> str:
-    return "| " + " | ".join(f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in cells) + " |"
+    return (
+        "| "
+        + " | ".join(f"{cell:,}" if isinstance(cell, int) else str(cell).replace("|", "\\|") for cell in cells)
+        + " |"
+    )
 
 
 def signed(value: float | None, digits: int = 2) -> str:
