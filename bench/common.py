@@ -1,10 +1,12 @@
-"""Arguments of studies, and tables in Markdown."""
+"""Arguments and inputs of studies, and tables in Markdown."""
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 from kissgs import EncodeSettings, KissgsError, Settings, Views, load_views
@@ -30,6 +32,29 @@ def capture(path: str) -> Views:
         return load_views(Path(path))
     except KissgsError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
+
+
+views_of = cache(load_views)
+
+
+@cache
+def digest_of(path: Path) -> str:
+    """Return the hash of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@cache
+def digest_of_capture(path: Path) -> str:
+    """Return the hash of all cameras and photographs of a capture, and of what else renderings depend on."""
+    views = views_of(path)
+    digest = hashlib.sha256(f"{views.background} {[each.matrix.tolist() for each in views.similarities]}".encode())
+    for role, each in (("train", views.train), ("test", views.test)):
+        for view in each:
+            photo = "" if view.photo is None else digest_of(view.photo)
+            geometry = view.camera.viewmat.tolist(), view.camera.K.tolist(), view.undistortion, view.background
+            digest.update(f"{role} {view.name} {photo} {geometry}".encode())
+    return digest.hexdigest()
 
 
 def positive(text: str) -> int:

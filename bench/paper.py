@@ -33,6 +33,7 @@ from pathlib import Path
 
 from bench.common import markdown, parser_of, percent, run, signed, write
 from bench.curves import MEAN, METRICS, Point, append_point, gaps, means, ranks, read_points, reduction, resumed_points
+from bench.external import version_of
 from bench.paper_parts import PARTS, PUBLISHED_BYTES
 from bench.paper_points import (
     BASE,
@@ -43,15 +44,44 @@ from bench.paper_points import (
     Job,
     Manifest,
     Work,
-    check_request,
     read_manifest,
-    works,
+    variants,
 )
 from kissgs import KissgsError, Preset, UnsupportedError
 from kissgs.core.context import Context
 from kissgs.evaluation.evaluate import compare_images
 
 # The points of a run.
+
+
+def check_request(manifest: Manifest, given: argparse.Namespace) -> None:
+    """Check, before any work, that the manifest has the scenes and tiers, and that its settings allow the studies."""
+    scenes = {name for each in manifest.datasets.values() for name in each}
+    tiers = {tier for each in manifest.datasets.values() for scene in each.values() for tier in scene.tiers}
+    for option, words, known in (("--scenes", given.scenes, scenes), ("--tiers", given.tiers, tiers)):
+        for word in words or []:
+            if word not in known:
+                raise UnsupportedError(f"{option}: the manifest has no {word!r}; it has {', '.join(sorted(known))}")
+    if given.splat_transform:
+        version_of(given.splat_transform)
+    usual = manifest.with_changes()
+    if "ablation" in given.studies and usual.encode.rate_distortion:
+        raise UnsupportedError(f"the ablation leaves out parts of preset paper, not of {manifest.preset}")
+    trained = [name for name in given.strategies if STRATEGIES[name][0] != "untrained"]
+    if "compaction" in given.studies and trained and not usual.compact.trains:
+        raise UnsupportedError(f"{trained[0]!r} needs training steps, which preset {manifest.preset} does not have")
+    if "sensitivity" in given.studies:
+        for changes in variants(manifest).values():
+            manifest.with_changes(encode=changes.get("encode", {}), finetune=changes.get("finetune", {}))
+
+
+def works(manifest: Manifest, given: argparse.Namespace) -> Iterator[Work]:
+    """Return the works of a manifest that are wanted."""
+    for dataset, scenes in manifest.datasets.items():
+        for name, scene in scenes.items():
+            for tier, checkpoint in scene.tiers.items():
+                if name in (given.scenes or [name]) and tier in (REFERENCE, *(given.tiers or [tier])):
+                    yield Work(dataset, name, tier, scene, checkpoint, manifest, given)
 
 
 def points_of(manifest: Manifest, given: argparse.Namespace, failed: list[str]) -> list[Point]:
@@ -91,29 +121,13 @@ def said(what: str, failed: list[str]) -> Iterator[None]:
 
 def measured(work: Work, job: Job) -> Point:
     """Make a file, and compare what it shows with the held-out photographs."""
-    made, context = job.make(), Context(device=work.given.device)
+    made, context, images, lpips = job.make(), Context(device=work.given.device), work.images, work.given.lpips
     found = compare_images(
-        work.original,
-        made.splats,
-        work.evaluation_views,
-        context,
-        reference_images=work.images,
-        lpips=work.given.lpips,
+        work.original, made.splats, work.evaluation_views, context, reference_images=images, lpips=lpips
     ).mean.candidate
-    return Point(
-        series=job.series,
-        dataset=work.dataset,
-        scene=work.name,
-        tier=work.tier,
-        bytes=made.bytes,
-        psnr=found.psnr,
-        ssim=found.ssim,
-        lpips=found.lpips,
-        seconds=made.seconds,
-        cpu_seconds=made.cpu_seconds,
-        stages=made.stages,
-        key=job.key,
-    )
+    place = {"series": job.series, "dataset": work.dataset, "scene": work.name, "tier": work.tier, "key": job.key}
+    quality = {"psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips}
+    return Point.model_validate({**place, **quality, **made.values})
 
 
 # Tables and plots.
@@ -205,6 +219,8 @@ def plot(path: Path, found: Sequence[Point], published: Sequence[Point]) -> None
     from matplotlib.figure import Figure
 
     drawn = {name: label for name, label in METRICS.items() if any(point.quality(name) is not None for point in found)}
+    if not drawn:
+        return
     figure = Figure(figsize=(5 * len(drawn), 5), layout="constrained")
     names = list(dict.fromkeys(point.series for point in (*found, *published)))
     for axes, (metric, label) in zip(figure.subplots(1, len(drawn), squeeze=False)[0], drawn.items(), strict=True):

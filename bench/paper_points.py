@@ -6,23 +6,21 @@ import argparse
 import hashlib
 import json
 import os
-import re
 import shlex
-import subprocess
 import time
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, NamedTuple
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
 import kissgs
-from bench.curves import MEAN
-from bench.external import convert
+from bench.common import digest_of, digest_of_capture, views_of
+from bench.external import convert, version_of
 from bench.paper_parts import OF_CODEBOOK, PARTS, LeaveOut, encode_parts
 from kissgs import KissgsError, Preset, Settings, Splats, UnsupportedError, Views
 from kissgs.compaction.merging import merge_gaussians
@@ -37,57 +35,29 @@ from kissgs.training.supervision import SCORING_STRIDE, supervision_views, train
 REFERENCE, BASE = "reference", "inria-ply"
 """Tier and series of the scene that has the quality at which bytes are compared."""
 
-# The manifest. Its names are names of folders.
+# The manifest. Its names are those of folders.
 
 
 def _in_folder(path: Path, info: ValidationInfo) -> Path:
-    try:
-        return Path(info.context or "", path.expanduser())
-    except RuntimeError as error:  # ~ of a user that there is not
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _name(name: str) -> str:
-    if name == MEAN or not re.fullmatch(r"[\w ()-][\w .()-]{0,99}", name):
-        raise ValueError(
-            f"{name!r} is no name: use at most 100 letters, digits, spaces and . _ - ( ), not {MEAN}, and no . to begin"
-        )
-    return name
-
-
-def _tier(name: str) -> str:
-    if name == REFERENCE:
-        raise ValueError(f"{name!r} is the tier of the reference; choose another name")
-    return _name(name)
-
-
-def _ply(path: Path) -> Path:
-    if path.suffix != ".ply" or path.name.endswith(".compressed.ply"):
-        raise ValueError(f"{path} is no plain .ply, whose bytes are those of a series; save it as one")
-    return path
+    return Path(info.context or "", os.path.expanduser(path))  # noqa: PTH111 (Path.expanduser fails for unknown users)
 
 
 ManifestPath = Annotated[Path, AfterValidator(_in_folder)]
-Name = Annotated[str, AfterValidator(_name)]
-Tier = Annotated[str, AfterValidator(_tier)]
+Name = Annotated[str, Field(pattern=r"^[^\W_][\w .()-]{0,99}$")]
 
 
-class Checkpoint(BaseModel):
-    """A scene that is encoded, and to how many Gaussians it is compacted before."""
+class Part(BaseModel):
+    """A part of a manifest."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    scene: ManifestPath
-    count: Annotated[int, Field(gt=0)] | None = None
-    ratio: Annotated[float, Field(gt=0, le=1)] | None = None
 
-    @model_validator(mode="after")
-    def _is_unambiguous(self) -> Self:
-        if len(self.budget) > 1:
-            raise ValueError("count and ratio cannot both be met; give one")
-        if not self.budget:
-            _ply(self.scene)
-        return self
+class Checkpoint(Part):
+    """A scene that is encoded, and to how many Gaussians it is compacted before."""
+
+    scene: ManifestPath
+    count: int | None = None
+    ratio: float | None = None
 
     @property
     def budget(self) -> dict[str, object]:
@@ -95,52 +65,56 @@ class Checkpoint(BaseModel):
         return self.model_dump(exclude={"scene"}, exclude_none=True)
 
 
-class Scene(BaseModel):
+class Scene(Part):
     """A scene of a data set."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     capture: ManifestPath
     training: ManifestPath | None = None
-    reference: Annotated[ManifestPath, AfterValidator(_ply)] | None = None
-    checkpoints: dict[Tier, Checkpoint] = {}
+    reference: ManifestPath | None = None
+    checkpoints: dict[Name, Checkpoint] = {}
+
+    @property
+    def tiers(self) -> dict[str, Checkpoint]:
+        """The reference, if there is one, and all checkpoints."""
+        reference = {} if self.reference is None else {REFERENCE: Checkpoint(scene=self.reference)}
+        return reference | self.checkpoints
 
 
-class Manifest(BaseModel):
+class Changes(Part):
+    """Values of a preset to change, by group."""
+
+    compact: dict[str, Any] = {}
+    encode: dict[str, Any] = {}
+    finetune: dict[str, Any] = {}
+
+
+class Manifest(Part):
     """Scenes by data set, and how they are compressed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     datasets: dict[Name, dict[Name, Scene]]
     preset: Preset = Preset.PAPER
-    settings: dict[Literal["compact", "encode", "finetune"], dict[str, Any]] = {}
+    settings: Changes = Changes()
 
-    def with_changes(
-        self,
-        *,
-        compact: Mapping[str, object] = {},
-        encode: Mapping[str, object] = {},
-        finetune: Mapping[str, object] = {},
-    ) -> Settings:
+    def with_changes(self, **changes: Mapping[str, object]) -> Settings:
         """Return the settings with changes by group; UnsupportedError says what is wrong with them."""
-        given = self.settings
-        return Settings.research(
-            self.preset,
-            compact={**given.get("compact", {}), **compact},
-            finetune={**given.get("finetune", {}), **finetune},
-            **{**given.get("encode", {}), **encode},
-        )
+        compact = {**self.settings.compact, **changes.get("compact", {})}
+        encode = {**self.settings.encode, **changes.get("encode", {})}
+        finetune = {**self.settings.finetune, **changes.get("finetune", {})}
+        return Settings.research(self.preset, compact=compact, finetune=finetune, **encode)
 
-    def check_settings(self) -> None:
-        """Check the settings, and those of all checkpoints; raise UnsupportedError if something is wrong."""
-        for name in BUDGETS:
-            if name in self.settings.get("compact", {}):
-                raise UnsupportedError(f"settings.compact: give count or ratio to a checkpoint instead of {name}")
+    def check(self) -> None:
+        """Raise UnsupportedError if settings are wrong, or scenes whose bytes count are no ``.ply``."""
         self.with_changes(finetune={"enabled": True})
-        for scenes in self.datasets.values():
-            for scene in scenes.values():
-                for checkpoint in scene.checkpoints.values():
-                    self.with_changes(compact=checkpoint.budget)
+        if any(name in self.settings.compact for name in BUDGETS):
+            raise UnsupportedError("settings.compact has a budget; give count or ratio to checkpoints instead")
+        for scene in (scene for scenes in self.datasets.values() for scene in scenes.values()):
+            if REFERENCE in scene.checkpoints:
+                raise UnsupportedError(f"{REFERENCE!r} is the tier of the reference; choose another name")
+            for checkpoint in scene.tiers.values():
+                self.with_changes(compact=checkpoint.budget)
+                path = checkpoint.scene
+                if not checkpoint.budget and (path.suffix != ".ply" or path.name.endswith(".compressed.ply")):
+                    raise UnsupportedError(f"{path} is no plain .ply, whose bytes are to be compared; save it as one")
 
 
 class _UniqueKeys(yaml.SafeLoader):
@@ -160,6 +134,7 @@ PROBLEMS = {
     "dict_type": "must be a mapping",
     "model_type": "must be a mapping",
     "string_type": "must be text; put quotes around it",
+    "string_pattern_mismatch": "is no name: write up to 100 letters, digits, spaces and . _ - ( ), not first",
 }
 """What is wrong with a value, by pydantic's type of error; of others, pydantic's message is plain."""
 
@@ -173,12 +148,11 @@ def read_manifest(path: Path) -> Manifest:
     try:
         document = yaml.load(path.read_text(encoding="utf-8-sig"), _UniqueKeys)
         manifest = Manifest.model_validate(document, context=path.parent)
-        manifest.check_settings()
+        manifest.check()
     except ValidationError as error:
         problem = error.errors()[0]
         place = ".".join(str(each) for each in problem["loc"] if each != "[key]") or "the file"
-        message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-        reason = PROBLEMS.get(problem["type"], message)
+        reason = PROBLEMS.get(problem["type"], problem["msg"].replace("Input should be", "must be"))
         raise KissgsError(f"{path}: {place}: {reason}; --help shows a manifest") from error
     except UnsupportedError as error:
         raise KissgsError(f"{path}: {error}") from error
@@ -193,19 +167,14 @@ Make = Callable[[Path, Path], Mapping[str, float] | None]
 """Writes a file, the second, from another; returns the seconds of the stages of that, if it has any."""
 
 
-@dataclass(frozen=True, slots=True)
-class Made:
-    """A scene that a decoder gets, the bytes that it needs, and the times of making them as in a :class:`Point`."""
+class Made(NamedTuple):
+    """A scene that a decoder gets, and values of its :class:`Point`: the bytes that it needs, times of making them."""
 
     splats: Splats
-    bytes: int
-    seconds: float | None = None
-    cpu_seconds: float | None = None
-    stages: str = ""
+    values: Mapping[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Job:
+class Job(NamedTuple):
     """A point that is to be made, unless there is one with the same key."""
 
     series: str
@@ -261,8 +230,8 @@ class Work:
     def key(self, *parts: BaseModel | str) -> str:
         """Return what stands for the scene, its views, the device, and settings or texts."""
         texts = [part.model_dump_json() if isinstance(part, BaseModel) else part for part in parts]
-        files = map(digest_of, (self.checkpoint.scene, self.scene.capture, self.training))
-        inputs = [kissgs.__version__, self.given.device, *files, *texts]
+        captures = [digest_of_capture(self.scene.capture), digest_of_capture(self.training)]
+        inputs = [kissgs.__version__, self.given.device, digest_of(self.checkpoint.scene), *captures, *texts]
         return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:16]
 
     def path(self, key: str, ending: str) -> Path:
@@ -297,13 +266,12 @@ def failing_once(make: Callable[[], Made]) -> Callable[[], Made]:
     failures = list[str]()
 
     def attempt() -> Made:
-        if failures:
-            raise KissgsError(failures[0])
         try:
-            return make()
+            if not failures:
+                return make()
         except (KissgsError, OSError) as error:
             failures.append(str(error))
-            raise
+        raise KissgsError(failures[0])
 
     return attempt
 
@@ -323,8 +291,7 @@ def stored(path: Path, make: Make, source: Callable[[], Path]) -> Made:
         found = {"bytes": path.stat().st_size, "seconds": wall, "cpu_seconds": cpu, "stages": text}
         with atomic_file(record, overwrite=True) as file:
             file.write(json.dumps(found).encode())
-    splats = kissgs.load(path, raw_axes=True)
-    return Made(splats, found["bytes"], found["seconds"], found["cpu_seconds"], found["stages"])
+    return Made(kissgs.load(path, raw_axes=True), found)
 
 
 def _record_of(path: Path, record: Path) -> dict[str, Any] | None:
@@ -334,35 +301,6 @@ def _record_of(path: Path, record: Path) -> dict[str, Any] | None:
         return found if path.stat().st_size == found["bytes"] else None
     except (OSError, ValueError, LookupError, TypeError):
         return None
-
-
-views_of = cache(kissgs.load_views)
-
-
-@cache
-def digest_of(path: Path) -> str:
-    """Return the hash of a file, or of a capture: of all its cameras and photographs."""
-    if path.is_file() and path.suffix != ".json":
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    views = views_of(path)
-    digest = hashlib.sha256(f"{views.background} {[each.matrix.tolist() for each in views.similarities]}".encode())
-    for role, each in (("train", views.train), ("test", views.test)):
-        for view in each:
-            photo = "" if view.photo is None else digest_of(view.photo)
-            geometry = view.camera.viewmat.tolist(), view.camera.K.tolist(), view.undistortion, view.background
-            digest.update(f"{role} {view.name} {photo} {geometry}".encode())
-    return digest.hexdigest()
-
-
-def works(manifest: Manifest, given: argparse.Namespace) -> Iterator[Work]:
-    """Return the works of a manifest that are wanted."""
-    for dataset, scenes in manifest.datasets.items():
-        for name, scene in scenes.items():
-            checkpoints = {} if scene.reference is None else {REFERENCE: Checkpoint(scene=scene.reference)}
-            for tier, checkpoint in (checkpoints | scene.checkpoints).items():
-                if name in (given.scenes or [name]) and tier in (REFERENCE, *(given.tiers or [tier])):
-                    yield Work(dataset, name, tier, scene, checkpoint, manifest, given)
 
 
 # Rate and distortion: the checkpoint compacted, encoded, fine-tuned, and in other formats.
@@ -388,18 +326,13 @@ def compaction(work: Work) -> Job:
     source = work.checkpoint.scene
     if not work.checkpoint.budget:
         series = BASE if work.tier == REFERENCE else "popspa-ply"
-        return Job(series, work.key(), lambda: Made(work.original, source.stat().st_size))
+        return Job(series, work.key(), lambda: Made(work.original, {"bytes": source.stat().st_size}))
     settings = work.manifest.with_changes(compact=work.checkpoint.budget)
 
     def make(source: Path, path: Path) -> Mapping[str, float]:
+        views, checkpoint, device = work.training_views, path.with_suffix(".checkpoint"), work.given.device
         report = kissgs.compact(
-            source,
-            path,
-            settings=settings,
-            views=work.training_views,
-            checkpoint=path.with_suffix(".checkpoint"),
-            overwrite=True,
-            device=work.given.device,
+            source, path, settings=settings, views=views, checkpoint=checkpoint, overwrite=True, device=device
         ).report
         stages = defaultdict[str, float](float)
         for step in report.steps:
@@ -415,14 +348,9 @@ def encoding(work: Work, series: str, ending: str = ".zip", **changes: Mapping[s
     used = [settings.encode, *([settings.finetune] if settings.finetune.enabled else [])]
 
     def make(source: Path, path: Path) -> Mapping[str, float]:
+        views, checkpoint, device = work.training_views, path.with_suffix(".checkpoint"), work.given.device
         return kissgs.compress(
-            source,
-            path,
-            settings=settings,
-            views=work.training_views,
-            checkpoint=path.with_suffix(".checkpoint"),
-            overwrite=True,
-            device=work.given.device,
+            source, path, settings=settings, views=views, checkpoint=checkpoint, overwrite=True, device=device
         ).report.seconds
 
     return work.file(series, ending, make, ending, *used)
@@ -442,15 +370,6 @@ def converted(work: Work, ending: str) -> Job:
     return work.file(series, f".{ending}", make, ending, tool, version_of(tool) if tool else "")
 
 
-@cache
-def version_of(tool: str) -> str:
-    """Return what a command says about its version."""
-    done = subprocess.run([*shlex.split(tool), "--version"], check=False, capture_output=True, stdin=subprocess.DEVNULL)
-    if done.returncode:
-        raise KissgsError(f"{tool} --version fails; give a command that starts splat-transform")
-    return done.stdout.decode(errors="replace").strip()
-
-
 # The other studies.
 
 
@@ -461,7 +380,7 @@ def ablation(work: Work) -> Iterator[Job]:
 
     def make(leave_out: LeaveOut | None) -> Made:
         parts = whole() if leave_out is None else leave_out(whole(), settings, 0)
-        return Made(parts.decoded, parts.size(settings, 0))
+        return Made(parts.decoded, {"bytes": parts.size(settings, 0)})
 
     for name, (leave_out, _, _) in PARTS.items():
         if name in OF_CODEBOOK and work.original.sh_degree == 0:
@@ -537,22 +456,3 @@ def sensitivity(work: Work) -> Iterator[Job]:
 
 
 STUDIES = {"rd": rate_distortion, "ablation": ablation, "compaction": strategies, "sensitivity": sensitivity}
-
-
-def check_request(manifest: Manifest, given: argparse.Namespace) -> None:
-    """Check, before any work, that the manifest has the scenes and tiers, and that its settings allow the studies."""
-    scenes = {name for each in manifest.datasets.values() for name in each}
-    tiers = {REFERENCE, *(tier for each in manifest.datasets.values() for s in each.values() for tier in s.checkpoints)}
-    for option, words, known in (("--scenes", given.scenes, scenes), ("--tiers", given.tiers, tiers)):
-        for word in words or []:
-            if word not in known:
-                raise UnsupportedError(f"{option}: the manifest has no {word!r}; it has {', '.join(sorted(known))}")
-    usual = manifest.with_changes()
-    if "ablation" in given.studies and usual.encode.rate_distortion:
-        raise UnsupportedError(f"the ablation leaves out parts of preset paper, not of {manifest.preset}")
-    trained = [name for name in given.strategies if STRATEGIES[name][0] != "untrained"]
-    if "compaction" in given.studies and trained and not usual.compact.trains:
-        raise UnsupportedError(f"{trained[0]!r} needs training steps, which preset {manifest.preset} does not have")
-    if "sensitivity" in given.studies:
-        for changes in variants(manifest).values():
-            manifest.with_changes(encode=changes.get("encode", {}), finetune=changes.get("finetune", {}))

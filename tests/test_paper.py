@@ -296,7 +296,7 @@ def test_the_other_studies(manifest, tmp_path, monkeypatch, capsys):
         ("datasets: {d: {s: {capture: a, reference: a.compressed.ply}}}", "a.compressed.ply is no plain .ply"),
         ("datasets: {d: {s: {capture: a, checkpoints: {L: {scene: a, count: 0}}}}}", "count"),
         ("datasets: {d: {s: {capture: a, checkpoints: {L: {scene: a, count: 9, ratio: 0.5}}}}}", "give one"),
-        ("{datasets: {}, settings: {compact: {ratio: 0.5}}}", "give count or ratio to a checkpoint"),
+        ("{datasets: {}, settings: {compact: {ratio: 0.5}}}", "give count or ratio to checkpoints"),
         ("{datasets: {}, settings: {finetune: {steps: 0}}}", "setting steps"),
     ],
 )
