@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from kissgs import EncodeSettings, KissgsError, Settings, Views, load_views
 from kissgs.settings import GOALS
 
@@ -85,7 +87,11 @@ def at_quality_offset(settings: Settings, decibels: float) -> Settings:
 
 def with_changes(settings: Settings, changes: Mapping[str, object]) -> Settings:
     """Return settings with other values of the encoder's settings."""
-    encode = EncodeSettings(**{**settings.encode.model_dump(), **changes})
+    try:
+        encode = EncodeSettings(**{**settings.encode.model_dump(), **changes})
+    except ValidationError as error:
+        problem = error.errors()[0]
+        raise KissgsError(f"setting {problem['loc'][-1]}: {problem['msg'].lower()}, not {problem['input']}") from error
     return settings.model_copy(update={"encode": encode})
 
 

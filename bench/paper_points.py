@@ -136,7 +136,7 @@ PROBLEMS = {
     "string_type": "must be text; put quotes around it",
     "string_pattern_mismatch": "is no name: write up to 100 letters, digits, spaces and . _ - ( ), not first",
 }
-"""What is wrong with a value, by pydantic's type of error; of others, pydantic's message is plain."""
+"""Messages by pydantic's type of error; of other types, its own message is plain."""
 
 
 def read_manifest(path: Path) -> Manifest:
