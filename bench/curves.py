@@ -53,12 +53,6 @@ class Point(BaseModel):
         """Names of what the point is of; a later point of the same place replaces it."""
         return self.series, self.dataset, self.scene, self.tier
 
-    @property
-    def stage_seconds(self) -> dict[str, float]:
-        """Wall times of the stages by name."""
-        cells = (cell.partition("=") for cell in self.stages.split())
-        return {name: float(seconds) for name, _, seconds in cells}
-
     def value(self, metric: str) -> float | None:
         """Return one of :data:`METRICS`; None if it was not measured, or is not finite."""
         value: float | None = getattr(self, metric)
@@ -121,22 +115,10 @@ def append_point(path: Path, point: Point) -> None:
         writer.writerow(point.model_dump())
 
 
-def gaps(points: Sequence[Point]) -> list[str]:
-    """Return a sentence for each series and tier that has no mean, since scenes of its data set are missing."""
-    scenes, groups = defaultdict[str, dict[str, None]](dict), defaultdict[tuple[str, str, str], set[str]](set)
-    for point in points:
-        scenes[point.dataset][point.scene] = None
-        groups[point.dataset, point.tier, point.series].add(point.scene)
-    found = list[str]()
-    for (dataset, tier, series), group in groups.items():
-        missing = ", ".join(name for name in scenes[dataset] if name not in group)
-        found.extend([f"no mean of {series}, {dataset} {tier}: {missing} is missing"] if missing else [])
-    return found
-
-
-def means(points: Sequence[Point]) -> list[Point]:
+def means(points: Sequence[Point], missing: list[str] | None = None) -> list[Point]:
     """Return the means of each series and tier over the scenes of a data set, of bytes too. Means that are given stay,
-    and where a scene of the data set is missing there is none, since means over other scenes say nothing."""
+    and where a scene of the data set is missing there is none, since means over other scenes say nothing; a sentence
+    about that is added to ``missing``."""
     scenes, groups = defaultdict[str, set[str]](set), defaultdict[tuple[str, str, str], list[Point]](list)
     given = [point for point in points if point.scene == MEAN]
     for point in points:
@@ -145,11 +127,13 @@ def means(points: Sequence[Point]) -> list[Point]:
             groups[point.series, point.dataset, point.tier].append(point)
     known = {(point.series, point.dataset, point.tier) for point in given}
     for place, group in groups.items():
-        if place not in known and len(group) == len(scenes[place[1]]):
+        absent = sorted(scenes[place[1]] - {point.scene for point in group})
+        if absent and missing is not None:
+            missing.append(f"no mean of {place[0]}, {place[1]} {place[2]}: there is no point of {', '.join(absent)}")
+        if place not in known and not absent:
             values: dict[str, float | None] = {name: _mean([getattr(each, name) for each in group]) for name in NUMBERS}
-            given.append(
-                Point.model_validate({**group[0].model_dump(), "scene": MEAN, "stages": "", "key": "", **values})
-            )
+            own = {"scene": MEAN, "stages": "", "key": ""}
+            given.append(Point.model_validate({**group[0].model_dump(), **own, **values}))
     return given
 
 

@@ -32,7 +32,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from bench.common import markdown, parser_of, percent, run, signed, write
-from bench.curves import MEAN, METRICS, Point, append_point, gaps, means, ranks, read_points, reduction, resumed_points
+from bench.curves import MEAN, METRICS, Point, append_point, means, ranks, read_points, reduction, resumed_points
 from bench.external import version_of
 from bench.paper_parts import PARTS, PUBLISHED_BYTES
 from bench.paper_points import (
@@ -190,7 +190,8 @@ def stage_table(points: Sequence[Point]) -> str:
     groups = defaultdict[tuple[str, str, str], list[dict[str, float]]](list)
     for point in points:
         if point.stages and ": " not in point.series:
-            groups[point.dataset, point.tier, point.series].append(point.stage_seconds)
+            cells = (cell.partition("=") for cell in point.stages.split())
+            groups[point.dataset, point.tier, point.series].append({name: float(each) for name, _, each in cells})
     names = list(dict.fromkeys(name for group in groups.values() for each in group for name in each))
     rows = list[list[object]]()
     for place, group in groups.items():
@@ -239,9 +240,9 @@ def plot(path: Path, found: Sequence[Point], published: Sequence[Point]) -> None
 
 def write_results(points: Sequence[Point], published: Sequence[Point], folder: Path) -> None:
     """Print tables and write them and plots to the folder. They have the points of this run, not all of the folder."""
-    scenes = {(point.dataset, point.scene) for point in points}
-    found, theirs = means(points), means([p for p in published if (p.dataset, p.scene) in scenes])
-    sys.stderr.write("".join(f"{gap}\n" for gap in gaps(points)))
+    scenes, missing = {(point.dataset, point.scene) for point in points}, list[str]()
+    found, theirs = means(points, missing), means([p for p in published if (p.dataset, p.scene) in scenes])
+    sys.stderr.writelines(f"{each}\n" for each in missing)
     if published and not theirs:
         sys.stderr.write("no published point is of these scenes\n")
     text = tables(points, found, theirs)

@@ -140,11 +140,7 @@ PROBLEMS = {
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Read a manifest.
-
-    Raises:
-        KissgsError: the file is no YAML, or something in it is missing, unknown or wrong.
-    """
+    """Read a manifest; a KissgsError says what in it is missing, unknown or wrong."""
     try:
         document = yaml.load(path.read_text(encoding="utf-8-sig"), _UniqueKeys)
         manifest = Manifest.model_validate(document, context=path.parent)
@@ -277,8 +273,7 @@ def failing_once(make: Callable[[], Made]) -> Callable[[], Made]:
 
 
 def stored(path: Path, make: Make, source: Callable[[], Path]) -> Made:
-    """Return what is in a file; ``make`` writes it unless an earlier run has, whose record, with its times, is beside
-    it."""
+    """Return what is in a file, which ``make`` writes unless it is there with its record, of bytes and times."""
     record = path.with_name(f"{path.name}.json")
     found = _record_of(path, record)
     if found is None:
@@ -314,10 +309,7 @@ def rate_distortion(work: Work) -> Iterator[Job]:
         return
     yield encoding(work, "popspa-sogxt")
     yield encoding(work, "popspa-sogxt-ft", finetune={"enabled": True})
-    if work.given.splat_transform:
-        yield converted(work, "sog")
-    else:
-        yield encoding(work, "popspa-sog-kissgs", ".sog")
+    yield converted(work, "sog") if work.given.splat_transform else encoding(work, "popspa-sog-kissgs", ".sog")
     yield converted(work, "spz")
 
 
@@ -383,9 +375,8 @@ def ablation(work: Work) -> Iterator[Job]:
         return Made(parts.decoded, {"bytes": parts.size(settings, 0)})
 
     for name, (leave_out, _, _) in PARTS.items():
-        if name in OF_CODEBOOK and work.original.sh_degree == 0:
-            continue
-        yield Job(f"without: {name}", work.key(before, settings, name), partial(make, leave_out))
+        if work.original.sh_degree or name not in OF_CODEBOOK:
+            yield Job(f"without: {name}", work.key(before, settings, name), partial(make, leave_out))
 
 
 AT_ONCE, IN_ROUNDS = {"min_keep_per_scoring": 0.0}, {"min_keep_per_scoring": 0.8}
