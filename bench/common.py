@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -82,16 +82,10 @@ def run(study: Callable[[], None]) -> None:
 def at_quality_offset(settings: Settings, decibels: float) -> Settings:
     """Return settings with rate-distortion planning at another quality offset, without a lambda or a goal."""
     changes = {"quality_offset_db": decibels, "rd_lambda": None, **dict.fromkeys(GOALS)}
-    return with_changes(settings, changes)
-
-
-def with_changes(settings: Settings, changes: Mapping[str, object]) -> Settings:
-    """Return settings with other values of the encoder's settings."""
     try:
         encode = EncodeSettings(**{**settings.encode.model_dump(), **changes})
     except ValidationError as error:
-        problem = error.errors()[0]
-        raise KissgsError(f"setting {problem['loc'][-1]}: {problem['msg'].lower()}, not {problem['input']}") from error
+        raise KissgsError(f"a quality offset of {decibels:g}: {error.errors()[0]['msg'].lower()}") from error
     return settings.model_copy(update={"encode": encode})
 
 

@@ -43,7 +43,7 @@ class Point(BaseModel):
     lpips: Cell
     seconds: Cell = None  # wall time of this step
     cpu_seconds: Cell = None  # of all threads
-    stages: Annotated[str, Field(pattern=r"^((^| )[^ =]+=\d+(\.\d+)?)*$")] = (
+    stages: Annotated[str, Field(pattern=r"^([^=]+=\d+(\.\d+)?( |$))*$")] = (
         ""  # wall times of its parts: "order=1.5 codebook=20.1"
     )
     key: str = ""  # stands for input, views and settings

@@ -17,7 +17,8 @@ The manifest names scenes by data set; its paths are relative to it:
     preset: paper                                # the default
     settings: {finetune: {steps: 2000}}          # values of the preset to change
 
-Files and points.csv are in the output folder; a later run makes what is missing or has other inputs or settings.
+Files and points.csv are in the output folder; a later run makes what is missing or has other inputs or settings. What
+fails is said, and the exit status is 1 after all else is made.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import fcntl
+import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -190,8 +192,8 @@ def stage_table(points: Sequence[Point]) -> str:
     groups = defaultdict[tuple[str, str, str], list[dict[str, float]]](list)
     for point in points:
         if point.stages and ": " not in point.series:
-            cells = (cell.partition("=") for cell in point.stages.split())
-            groups[point.dataset, point.tier, point.series].append({name: float(each) for name, _, each in cells})
+            cells = re.findall(r"([^=]+)=(\S+) ?", point.stages)
+            groups[point.dataset, point.tier, point.series].append({name: float(each) for name, each in cells})
     names = list(dict.fromkeys(name for group in groups.values() for each in group for name in each))
     rows = list[list[object]]()
     for place, group in groups.items():

@@ -282,7 +282,7 @@ def stored(path: Path, make: Make, source: Callable[[], Path]) -> Made:
         wall, cpu = time.perf_counter(), sum(os.times()[:4])
         stages = make(scene, path) or {}
         wall, cpu = time.perf_counter() - wall, sum(os.times()[:4]) - cpu
-        text = " ".join(f"{name.replace(' ', '-')}={seconds:.2f}" for name, seconds in stages.items())
+        text = " ".join(f"{name}={seconds:.2f}" for name, seconds in stages.items())
         found = {"bytes": path.stat().st_size, "seconds": wall, "cpu_seconds": cpu, "stages": text}
         with atomic_file(record, overwrite=True) as file:
             file.write(json.dumps(found).encode())
