@@ -107,7 +107,8 @@ def points_of(manifest: Manifest, given: argparse.Namespace, failed: list[str]) 
                 if point is not None:
                     append_point(table, point)
                     sys.stderr.write(f"{work}, {job.series}: {point.bytes:,.0f} bytes, {point.psnr:.2f} dB\n")
-            found.extend([] if point is None else [point])
+            if point is not None:
+                found.append(point)
     return found
 
 

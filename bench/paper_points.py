@@ -13,7 +13,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
@@ -80,41 +80,41 @@ class Scene(Part):
         return reference | self.checkpoints
 
 
-class Changes(Part):
-    """Values of a preset to change, by group."""
-
-    compact: dict[str, Any] = {}
-    encode: dict[str, Any] = {}
-    finetune: dict[str, Any] = {}
-
-
 class Manifest(Part):
     """Scenes by data set, and how they are compressed."""
 
     datasets: dict[Name, dict[Name, Scene]]
     preset: Preset = Preset.PAPER
-    settings: Changes = Changes()
+    settings: dict[Literal["compact", "encode", "finetune"], dict[str, Any]] = {}
 
     def with_changes(self, **changes: Mapping[str, object]) -> Settings:
         """Return the settings with changes by group; UnsupportedError says what is wrong with them."""
-        compact = {**self.settings.compact, **changes.get("compact", {})}
-        encode = {**self.settings.encode, **changes.get("encode", {})}
-        finetune = {**self.settings.finetune, **changes.get("finetune", {})}
+        compact = {**self.settings.get("compact", {}), **changes.get("compact", {})}
+        encode = {**self.settings.get("encode", {}), **changes.get("encode", {})}
+        finetune = {**self.settings.get("finetune", {}), **changes.get("finetune", {})}
         return Settings.research(self.preset, compact=compact, finetune=finetune, **encode)
 
     def check(self) -> None:
         """Raise UnsupportedError if settings are wrong, or scenes whose bytes count are no ``.ply``."""
         self.with_changes(finetune={"enabled": True})
-        if any(name in self.settings.compact for name in BUDGETS):
+        if any(name in self.settings.get("compact", {}) for name in BUDGETS):
             raise UnsupportedError("settings.compact has a budget; give count or ratio to checkpoints instead")
-        for scene in (scene for scenes in self.datasets.values() for scene in scenes.values()):
-            if REFERENCE in scene.checkpoints:
-                raise UnsupportedError(f"{REFERENCE!r} is the tier of the reference; choose another name")
-            for checkpoint in scene.tiers.values():
-                self.with_changes(compact=checkpoint.budget)
-                path = checkpoint.scene
-                if not checkpoint.budget and (path.suffix != ".ply" or path.name.endswith(".compressed.ply")):
-                    raise UnsupportedError(f"{path} is no plain .ply, whose bytes are to be compared; save it as one")
+        for dataset, scenes in self.datasets.items():
+            for name, scene in scenes.items():
+                if REFERENCE in scene.checkpoints:
+                    raise UnsupportedError(f"{dataset}/{name}: {REFERENCE!r} is the tier of the reference; rename it")
+                for tier, checkpoint in scene.tiers.items():
+                    try:
+                        self.check_checkpoint(checkpoint)
+                    except UnsupportedError as error:
+                        raise UnsupportedError(f"{dataset}/{name} {tier}: {error}") from error
+
+    def check_checkpoint(self, checkpoint: Checkpoint) -> None:
+        """Raise UnsupportedError if a checkpoint is wrong."""
+        path = checkpoint.scene
+        if not checkpoint.budget and (path.suffix != ".ply" or path.name.endswith(".compressed.ply")):
+            raise UnsupportedError(f"{path} is no plain .ply, whose bytes are to be compared; save it as one")
+        self.with_changes(compact=checkpoint.budget)
 
 
 class _UniqueKeys(yaml.SafeLoader):
