@@ -13,15 +13,17 @@ import argparse
 import shlex
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bench.common import at_quality_offset, capture, head, parser_of, row, run, signed, write
 from bench.curves import bytes_at
 from bench.external import FORMATS, External, measure_external
-from kissgs import Evaluation, KissgsError, Preset, sample_scene, save
+from kissgs import Evaluation, KissgsError, Preset, Settings, sample_scene, save
 from kissgs.cli.bench import Measurement, measured
 from kissgs.cli.options import chosen
+from kissgs.formats import ContainerName
 
 HEAD = "codec", "bytes", "per Gaussian", "wall s", "CPU s", "decode CPU s", "peak MB"
 IMAGES = "PSNR to photographs", "change, dB", "SSIM", "PSNR to the original", "SSIM", "worst view"
@@ -44,6 +46,8 @@ def main() -> None:
     parser.add_argument("--splat-transform", default="splat-transform", help="command that starts it")
     parser.add_argument("--sog-iterations", type=int, help="k-means iterations over the SH of .sog")
     given = parser.parse_args()
+    codecs = codecs_of(given)  # settings are checked before the first measurement
+    failed = False
     for scene in given.scenes:
         write(f"{scene}:", "")
         with tempfile.TemporaryDirectory() as folder:
@@ -51,39 +55,62 @@ def main() -> None:
             if scene.isdecimal():
                 path = Path(folder, "scene.ply")
                 save(sample_scene(int(scene), sh_degree=given.degree), path)
-            measure(path, given)
+            failed |= measure(path, codecs, given)
+    if failed:
+        raise SystemExit(2)
 
 
-def measure(scene: Path, given: argparse.Namespace) -> None:
-    """Print the table of a scene; what fails is said, and the others are measured."""
-    points: dict[str, list[tuple[float, float]]] = {}
-    others: dict[str, tuple[float, float]] = {}
-    head(*HEAD, *IMAGES)
-    for preset in given.presets:
-        for change in [None, *given.each]:
+class Codec(NamedTuple):
+    """A preset with a container and perhaps another quality, whose points are on one curve; or with a change."""
+
+    curve: str
+    name: str
+    container: ContainerName
+    settings: Settings
+    changed: bool
+
+
+def codecs_of(given: argparse.Namespace) -> list[Codec]:
+    """Return all codecs that are wanted."""
+    found = list[Codec]()
+    for preset in dict.fromkeys(given.presets):
+        for change in dict.fromkeys([None, *given.each]):
             settings = chosen(preset, [*given.set, *filter(None, [change])])
             offsets = given.offsets if settings.encode.rate_distortion and not change else []
             for container in given.containers:
                 curve = " ".join([preset, *([] if container == "sogxt" else [".sog"]), *filter(None, [change])])
-                for offset in [None, *offsets]:
-                    tuned = settings if offset is None else at_quality_offset(settings, offset)
-                    name = curve if offset is None else f"{curve} at {offset:g}"
-                    try:
-                        found = measured(scene, tuned, container=container, views=given.views)
-                    except KissgsError as error:
-                        sys.stderr.write(f"{name}: {error}\n")
-                        continue
-                    point = print_measurement(name, found), float(found.report.container_bytes)
-                    if change:
-                        others[name] = point
-                    else:
-                        points.setdefault(curve, []).append(point)
+                found.append(Codec(curve, curve, container, settings, bool(change)))
+                for offset in offsets:
+                    tuned = at_quality_offset(settings, offset)
+                    found.append(Codec(curve, f"{curve} at {offset:g}", container, tuned, False))
+    return found
+
+
+def measure(scene: Path, codecs: Sequence[Codec], given: argparse.Namespace) -> bool:
+    """Print the table of a scene; what fails is said, and the others are measured. Returns whether something failed."""
+    points: dict[str, list[tuple[float, float]]] = {}
+    others: dict[str, tuple[float, float]] = {}
+    failed = False
+    head(*HEAD, *IMAGES)
+    for codec in codecs:
+        try:
+            found = measured(scene, codec.settings, container=codec.container, views=given.views)
+        except KissgsError as error:
+            sys.stderr.write(f"{codec.name}: {error}\n")
+            failed = True
+            continue
+        point = print_measurement(codec.name, found), float(found.report.container_bytes)
+        if codec.changed:
+            others[codec.name] = point
+        else:
+            points.setdefault(codec.curve, []).append(point)
     for ending in given.external:
         command, iterations = shlex.split(given.splat_transform), given.sog_iterations
         try:
             external = measure_external(scene, ending, command, sh_iterations=iterations, views=given.views)
         except KissgsError as error:
             sys.stderr.write(f"{error}\n")
+            failed = True
             continue
         others[f".{ending}"] = print_external(f".{ending}", external), float(external.bytes)
     write("")
@@ -93,6 +120,7 @@ def measure(scene: Path, given: argparse.Namespace) -> None:
             if equal is not None:
                 at = f"at the PSNR of {name} to the original, {psnr:.2f} dB"
                 write(f"{at}: {curve} {equal:,.0f} bytes, {equal / size:.3f} of its")
+    return failed
 
 
 def print_measurement(name: str, found: Measurement) -> float:

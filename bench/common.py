@@ -1,11 +1,15 @@
-"""Arguments of studies, and tables in Markdown."""
+"""Arguments and inputs of studies, and tables in Markdown."""
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
+
+from pydantic import ValidationError
 
 from kissgs import EncodeSettings, KissgsError, Settings, Views, load_views
 from kissgs.settings import GOALS
@@ -32,6 +36,29 @@ def capture(path: str) -> Views:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
+views_of = cache(load_views)
+
+
+@cache
+def digest_of(path: Path) -> str:
+    """Return the hash of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@cache
+def digest_of_capture(path: Path) -> str:
+    """Return the hash of all cameras and photographs of a capture, and of what else renderings depend on."""
+    views = views_of(path)
+    digest = hashlib.sha256(f"{views.background} {[each.matrix.tolist() for each in views.similarities]}".encode())
+    for role, each in (("train", views.train), ("test", views.test)):
+        for view in each:
+            photo = "" if view.photo is None else digest_of(view.photo)
+            geometry = view.camera.viewmat.tolist(), view.camera.K.tolist(), view.undistortion, view.background
+            digest.update(f"{role} {view.name} {photo} {geometry}".encode())
+    return digest.hexdigest()
+
+
 def positive(text: str) -> int:
     """Return a whole number of at least 1."""
     number = int(text)
@@ -41,22 +68,24 @@ def positive(text: str) -> int:
 
 
 def run(study: Callable[[], None]) -> None:
-    """Run a study; an error of the library or the system becomes one sentence."""
+    """Run a study; an error of the library or the system becomes one sentence, and exit status 2."""
     try:
         study()
+    except KeyboardInterrupt:
+        sys.stderr.write("stopped; run it again to go on\n")
+        raise SystemExit(130) from None
     except (KissgsError, OSError) as error:
-        raise SystemExit(f"{Path(sys.argv[0]).name}: {error}") from error
+        sys.stderr.write(f"{Path(sys.argv[0]).name}: {error}\n")
+        raise SystemExit(2) from error
 
 
 def at_quality_offset(settings: Settings, decibels: float) -> Settings:
     """Return settings with rate-distortion planning at another quality offset, without a lambda or a goal."""
     changes = {"quality_offset_db": decibels, "rd_lambda": None, **dict.fromkeys(GOALS)}
-    return with_changes(settings, changes)
-
-
-def with_changes(settings: Settings, changes: Mapping[str, object]) -> Settings:
-    """Return settings with other values of the encoder's settings."""
-    encode = EncodeSettings(**{**settings.encode.model_dump(), **changes})
+    try:
+        encode = EncodeSettings(**{**settings.encode.model_dump(), **changes})
+    except ValidationError as error:
+        raise KissgsError(f"a quality offset of {decibels:g}: {error.errors()[0]['msg'].lower()}") from error
     return settings.model_copy(update={"encode": encode})
 
 
@@ -86,7 +115,11 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def _line(cells: Sequence[object]) -> str:
-    return "| " + " | ".join(f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in cells) + " |"
+    return (
+        "| "
+        + " | ".join(f"{cell:,}" if isinstance(cell, int) else str(cell).replace("|", "\\|") for cell in cells)
+        + " |"
+    )
 
 
 def signed(value: float | None, digits: int = 2) -> str:

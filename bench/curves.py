@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import math
+import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -35,13 +37,15 @@ class Point(BaseModel):
     dataset: str
     scene: str
     tier: str  # name of the number of Gaussians, such as L
-    bytes: Annotated[float, Field(gt=0)]
+    bytes: Annotated[float, Field(gt=0, allow_inf_nan=False)]
     psnr: Cell
     ssim: Cell
     lpips: Cell
     seconds: Cell = None  # wall time of this step
     cpu_seconds: Cell = None  # of all threads
-    stages: str = ""  # wall times of its parts: "order=1.5 codebook=20.1"
+    stages: Annotated[str, Field(pattern=r"^([^=]+=\d+(\.\d+)?( |$))*$")] = (
+        ""  # wall times of its parts: "order=1.5 codebook=20.1"
+    )
     key: str = ""  # stands for input, views and settings
 
     @property
@@ -49,9 +53,14 @@ class Point(BaseModel):
         """Names of what the point is of; a later point of the same place replaces it."""
         return self.series, self.dataset, self.scene, self.tier
 
+    def value(self, metric: str) -> float | None:
+        """Return one of :data:`METRICS`; None if it was not measured, or is not finite."""
+        value: float | None = getattr(self, metric)
+        return value if value is not None and math.isfinite(value) else None
+
     def quality(self, metric: str) -> float | None:
         """Return one of :data:`METRICS` so that more is better."""
-        value: float | None = getattr(self, metric)
+        value = self.value(metric)
         return -value if value is not None and metric == "lpips" else value
 
 
@@ -62,31 +71,54 @@ def read_points(path: Path) -> list[Point]:
         KissgsError: the file is not such a table; OSError if it cannot be read.
     """
     found = dict[tuple[str, ...], Point]()
-    with path.open(newline="", encoding="utf-8") as file:
-        for number, row in enumerate(csv.DictReader(file), 2):
-            try:
-                point = Point.model_validate(row)
-            except ValidationError as error:
-                problem = error.errors()[0]
-                reason = f"{problem['loc'][0]}: {problem['msg'].lower()}"
-                raise KissgsError(f"line {number} of {path} is no point of a curve ({reason}); correct it") from error
-            found[point.place] = point
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            for number, row in enumerate(csv.DictReader(file, strict=True), 2):
+                point = _point(row, f"line {number} of {path}")
+                found[point.place] = point
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise KissgsError(f"{path} is no table of points ({error}); give a CSV file in UTF-8") from error
     return list(found.values())
+
+
+def _point(row: Mapping[str | None, object], where: str) -> Point:
+    try:
+        if None in row or None in row.values():
+            raise KissgsError(f"{where} has another number of cells than the head; correct it")
+        return Point.model_validate(row)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        reason = f"{problem['loc'][0]}: {problem['msg'].lower()}"
+        raise KissgsError(f"{where} is no point of a curve ({reason}); correct it") from error
+
+
+def resumed_points(path: Path) -> list[Point]:
+    """Read the points of a run, if there are any, without the last line if its writing was interrupted."""
+    data = path.read_bytes() if path.exists() else b""
+    whole = data[: data.rfind(b"\n") + 1]
+    if len(whole) < len(data):
+        sys.stderr.write(f"the last line of {path} is incomplete and dropped\n")
+        with path.open("r+b") as file:
+            file.truncate(len(whole))
+    head = whole.removeprefix(codecs.BOM_UTF8).partition(b"\n")[0].strip()
+    if head and head != ",".join(Point.model_fields).encode():
+        raise KissgsError(f"{path} has other columns than this version writes; rename it")
+    return read_points(path) if whole else []
 
 
 def append_point(path: Path, point: Point) -> None:
     """Add a point to a CSV file, which is made if there is none."""
-    is_new = not path.exists()
     with path.open("a", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(Point.model_fields))
-        if is_new:
+        if file.tell() == 0:
             writer.writeheader()
         writer.writerow(point.model_dump())
 
 
-def means(points: Sequence[Point]) -> list[Point]:
+def means(points: Sequence[Point], missing: list[str] | None = None) -> list[Point]:
     """Return the means of each series and tier over the scenes of a data set, of bytes too. Means that are given stay,
-    and where a scene of the data set is missing there is none, since means over other scenes say nothing."""
+    and where a scene of the data set is missing there is none, since means over other scenes say nothing; a sentence
+    about that is added to ``missing``."""
     scenes, groups = defaultdict[str, set[str]](set), defaultdict[tuple[str, str, str], list[Point]](list)
     given = [point for point in points if point.scene == MEAN]
     for point in points:
@@ -95,11 +127,13 @@ def means(points: Sequence[Point]) -> list[Point]:
             groups[point.series, point.dataset, point.tier].append(point)
     known = {(point.series, point.dataset, point.tier) for point in given}
     for place, group in groups.items():
-        if place not in known and len(group) == len(scenes[place[1]]):
+        absent = sorted(scenes[place[1]] - {point.scene for point in group})
+        if absent and missing is not None:
+            missing.append(f"no mean of {place[0]}, {place[1]} {place[2]}: there is no point of {', '.join(absent)}")
+        if place not in known and not absent:
             values: dict[str, float | None] = {name: _mean([getattr(each, name) for each in group]) for name in NUMBERS}
-            given.append(
-                Point.model_validate({**group[0].model_dump(), "scene": MEAN, "stages": "", "key": "", **values})
-            )
+            own = {"scene": MEAN, "stages": "", "key": ""}
+            given.append(Point.model_validate({**group[0].model_dump(), **own, **values}))
     return given
 
 

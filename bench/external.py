@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shlex
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from kissgs import Evaluation, KissgsError, UnsupportedError, Views, evaluate, load
@@ -74,3 +76,12 @@ def convert(command: Sequence[str], source: Path, target: Path, options: list[st
         raise KissgsError(f"{' '.join(command)} could not convert {source.name} to {target.suffix}: {last}")
     wall, cpu, memory = json.loads(done.stdout)
     return wall, cpu, memory
+
+
+@cache
+def version_of(tool: str) -> str:
+    """Return what a command says about its version."""
+    done = subprocess.run([*shlex.split(tool), "--version"], check=False, capture_output=True, stdin=subprocess.DEVNULL)
+    if done.returncode:
+        raise KissgsError(f"{tool} --version fails; give a command that starts splat-transform")
+    return done.stdout.decode(errors="replace").strip()

@@ -117,7 +117,7 @@ def test_documented_measurements_are_accepted(monkeypatch):
         monkeypatch.setattr(sys, "argv", [target, *words])
         with pytest.raises(Parsed):
             study.main()
-    shared = {"__init__", "common", "curves", "external", "paper_parts"}
+    shared = {"__init__", "common", "curves", "external", "paper_parts", "paper_points"}
     assert studies == {path.stem for path in ROOT.glob("bench/*.py")} - shared
 
 

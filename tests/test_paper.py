@@ -1,8 +1,10 @@
 """``bench/paper.py`` on made data sets; reference: the published table, curves as formulas, captures of known views."""
 
 import contextlib
+import fcntl
 import io
 import math
+import re
 import sys
 from itertools import product
 from pathlib import Path
@@ -91,7 +93,8 @@ def test_a_bound_and_a_quality_that_is_never_reached():
 def test_means_need_all_scenes_of_the_data_set():
     points = [point(100, 30, scene="a", tier="S"), point(300, 34, scene="b", tier="S")]
     points.append(point(900, 35, scene="a", tier="L"))
-    (mean,) = means(points)
+    (mean,) = means(points, missing := [])
+    assert missing == ["no mean of ours, d L: there is no point of b"]
     assert (mean.bytes, mean.psnr, mean.ssim, mean.lpips, mean.scene) == (200, 32, 0.32, None, "_mean")
 
 
@@ -200,7 +203,7 @@ def test_the_experiments_of_all_data_sets(manifest, results):
     """Bytes are those of files, and quality that of held-out photographs, every eighth, or those of the test split."""
     folder, said = results
     points = {point.place: point for point in read_points(folder / "points.csv")}
-    series = ["ply", "sogxt", "sogxt-ft", "sog", "spz"]
+    series = ["ply", "sogxt", "sogxt-ft", "sog-kissgs", "spz-kissgs"]
     tiers = [("reference", f"inria-{each}") for each in series[:2]]
     tiers += [(tier, f"popspa-{each}") for tier in "SL" for each in series]
     datasets = yaml.safe_load(manifest.read_text())["datasets"]
@@ -212,7 +215,7 @@ def test_the_experiments_of_all_data_sets(manifest, results):
         scene, views = kissgs.load(root / "scene.ply"), kissgs.load_views(root)
         assert [len(views.test), len(views.train)] == [2, 8]
         assert views.background.tolist() == [dataset == "SyntheticNeRF"] * 3
-        small, whole = points["popspa-spz", dataset, name, "S"], points["popspa-sogxt", dataset, name, "L"]
+        small, whole = points["popspa-spz-kissgs", dataset, name, "S"], points["popspa-sogxt", dataset, name, "L"]
         (file,) = (folder / dataset / name / "S").glob("*.spz")
         assert (small.bytes, len(kissgs.load(file, raw_axes=True))) == (file.stat().st_size, 60)
         (made,) = (path for path in (folder / dataset / name / "L").glob("*.zip") if path.stem == whole.key)
@@ -261,8 +264,10 @@ def test_the_other_studies(manifest, tmp_path, monkeypatch, capsys):
     (path := manifest.parent / "one.yaml").write_text(yaml.safe_dump(document))
     strategies = "merge", "merge + refine", "POP + refine", *paper.OF_PAPER, "prunings along the way"
     studies = "--studies", "rd", "ablation", "compaction", "sensitivity", "--strategies", *strategies
-    said = run_paper(monkeypatch, capsys, path, "-o", tmp_path, *studies, "--tiers", "S")
-    assert f"MipNeRF360/gone S is skipped: there is no {manifest.parent / 'no.ply'}\n" in said.err
+    with pytest.raises(SystemExit, match="1"):
+        run_paper(monkeypatch, capsys, path, "-o", tmp_path, *studies, "--tiers", "S")
+    said = capsys.readouterr()
+    assert f"MipNeRF360/gone S: there is no {manifest.parent / 'no.ply'}\n" in said.err
     points = {point.series: point for point in read_points(tmp_path / "points.csv")}
     for one, other in (("without: nothing", "popspa-sogxt"), ("fine-tuning: as it is", "popspa-sogxt-ft")):
         assert (points[one].bytes, points[one].psnr) == (points[other].bytes, points[other].psnr)
@@ -279,10 +284,18 @@ def test_the_other_studies(manifest, tmp_path, monkeypatch, capsys):
     ("text", "reason"),
     [
         ("datasets: [", "is no YAML"),
-        ("[]", "the file: input should be"),
-        ("datasets: {d: {s: {checkpoints: {}}}}", "datasets.d.s.capture: field required"),
-        ("datasets: {d: {s: {capture: a, checkpoints: {L: {scene: a, size: 3}}}}}", "size: extra inputs"),
+        ("[]", "the file: must be a mapping"),
+        ("datasets: {d: {s: {checkpoints: {}}}}", "datasets.d.s.capture: is missing"),
+        ("datasets: {d: {s: {capture: a, checkpoints: {L: {scene: a, size: 3}}}}}", "size: is unknown"),
         ("{datasets: {}, settings: {encoder: {}}}", "settings.encoder"),
+        ("datasets: {../d: {}}", "datasets.../d: is no name"),
+        ("datasets: {d: {_mean: {capture: a}}}", "datasets.d._mean: is no name"),
+        ("datasets: {d: {}, d: {}}", "'d' is there twice"),
+        ("datasets: {d: {s: {capture: a, checkpoints: {reference: {scene: a.ply}}}}}", "'reference' is the tier"),
+        ("datasets: {d: {s: {capture: a, checkpoints: {L: {scene: a.spz}}}}}", "a.spz is no plain .ply"),
+        ("datasets: {d: {s: {capture: a, checkpoints: {L: {scene: a, count: 0}}}}}", "count"),
+        ("datasets: {d: {s: {capture: a, checkpoints: {L: {scene: a, count: 9, ratio: 0.5}}}}}", "give one"),
+        ("{datasets: {}, settings: {compact: {ratio: 0.5}}}", "give count or ratio to checkpoints"),
     ],
 )
 def test_a_wrong_manifest_is_one_sentence(tmp_path, text, reason):
@@ -294,10 +307,108 @@ def test_a_wrong_manifest_is_one_sentence(tmp_path, text, reason):
     assert "\n" not in str(refused.value)
 
 
-def test_the_ablation_needs_preset_paper(manifest, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("preset", "words", "reason"),
+    [
+        ("balanced", ("--studies", "ablation"), "the ablation leaves out parts of preset paper, not of balanced"),
+        ("balanced", ("--studies", "sensitivity"), "gaussians_per_codebook_entry has no effect"),
+        ("fast", ("--studies", "compaction"), "needs training steps, which preset fast does not have"),
+        ("paper", ("--scenes", "three"), "--scenes: the manifest has no 'three'; it has one, two"),
+        ("paper", ("--tiers", "M"), "--tiers: the manifest has no 'M'; it has L, S, reference"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_before_any_work(manifest, tmp_path, monkeypatch, capsys, preset, words, reason):
+    document = yaml.safe_load(manifest.read_text())
+    (path := manifest.parent / "refused.yaml").write_text(yaml.safe_dump(document | {"preset": preset, "settings": {}}))
+    with pytest.raises(kissgs.KissgsError, match=re.escape(reason)):
+        run_paper(monkeypatch, capsys, path, "-o", tmp_path / "out", *words)
+    assert not (tmp_path / "out").exists()
+
+
+def small(manifest, **changes):
+    """Return a manifest of one tier of one scene without a reference, with changes."""
     scene = yaml.safe_load(manifest.read_text())["datasets"]["DeepBlending"]["one"]
-    scene.pop("reference")
-    document = {"datasets": {"DeepBlending": {"one": scene}}, "preset": "balanced"}
-    (path := manifest.parent / "balanced.yaml").write_text(yaml.safe_dump(document))
-    said = run_paper(monkeypatch, capsys, path, "-o", tmp_path, "--studies", "ablation", "--tiers", "L")
-    assert said.err == "DeepBlending/one L, ablation: the ablation leaves out parts of preset paper, not of balanced\n"
+    scene |= {"checkpoints": {"S": scene["checkpoints"]["S"]}, "reference": None}
+    (path := manifest.parent / "small.yaml").write_text(
+        yaml.safe_dump({"datasets": {"d": {"one": scene | changes}}, "settings": FEW})
+    )
+    return path
+
+
+def test_files_are_made_again_unless_whole(manifest, tmp_path, monkeypatch, capsys):
+    """A file counts with its record and of the size there; a line of points.csv if it was written to its end."""
+    path, table = small(manifest), tmp_path / "points.csv"
+    run_paper(monkeypatch, capsys, path, "-o", tmp_path)
+    before = [(each.place, each.bytes, each.psnr) for each in read_points(table)]
+    files = {each.suffix: each for each in (tmp_path / "d/one/S").iterdir() if each.suffix in (".ply", ".sog", ".spz")}
+    wanted = {ending: each.read_bytes() for ending, each in files.items()}
+    files[".sog"].write_bytes(b"half")
+    files[".spz"].with_name(files[".spz"].name + ".json").write_bytes(b"")
+    files[".ply"].unlink()
+    table.write_bytes(table.read_bytes().splitlines(keepends=True)[0] + b"popspa-ply,d,on")
+    said = run_paper(monkeypatch, capsys, path, "-o", tmp_path).err
+    assert said.startswith(f"the last line of {table} is incomplete and dropped\n")
+    assert {ending: each.read_bytes() for ending, each in files.items()} == wanted
+    assert [(each.place, each.bytes, each.psnr) for each in read_points(table)] == before
+    table.write_text("series,dataset\n")
+    with pytest.raises(kissgs.KissgsError, match=r"points.csv has other columns than this version writes; rename it"):
+        run_paper(monkeypatch, capsys, path, "-o", tmp_path)
+    with (tmp_path / ".lock").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(kissgs.KissgsError, match="another run writes to"):
+            run_paper(monkeypatch, capsys, path, "-o", tmp_path)
+
+
+def test_a_failed_compaction_is_tried_once(manifest, tmp_path, monkeypatch, capsys):
+    calls = []
+
+    def compact(*given, **more):
+        calls.append(given)
+        raise kissgs.KissgsError("no memory")
+
+    monkeypatch.setattr(kissgs, "compact", compact)
+    with pytest.raises(SystemExit) as ended:
+        run_paper(monkeypatch, capsys, small(manifest), "-o", tmp_path)
+    assert (ended.value.code, len(calls)) == (1, 1)
+    assert capsys.readouterr().err.count(": no memory\n") == 5
+
+
+def test_a_capture_without_held_out_photographs_is_refused(manifest, tmp_path, monkeypatch, capsys):
+    """Otherwise quality would be that towards renderings of the scene, in the same column."""
+    write_colmap(cloud(9, seed=1), manifest.parent / "bare", [])
+    with pytest.raises(SystemExit):
+        run_paper(monkeypatch, capsys, small(manifest, capture="bare"), "-o", tmp_path)
+    assert capsys.readouterr().err.count("bare has no held-out photographs to compare with") == 1
+    assert not (tmp_path / "points.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("row", "reason"),
+    [
+        (b"a,b,c,d,1,1,1,1,1\n", "another number of cells"),
+        (b"a,b,c,d,inf,1,1,1\n", "bytes: input should be a finite number"),
+        (b"\xff,b,c,d,1,1,1,1\n", "is no table of points"),
+        (b'"a,b,c,d,1,1,1,1\n', "is no table of points"),
+    ],
+)
+def test_a_wrong_table_is_one_sentence(tmp_path, row, reason):
+    (path := tmp_path / "points.csv").write_bytes(b"series,dataset,scene,tier,bytes,psnr,ssim,lpips\n" + row)
+    with pytest.raises(kissgs.KissgsError, match=reason) as refused:
+        read_points(path)
+    assert "\n" not in str(refused.value)
+
+
+def test_what_is_not_finite_is_not_measured():
+    curve = [point(1000, math.inf), point(2000, 30.0), point(500, math.nan)]
+    assert reduction(point(60_000, 30.0), curve, "psnr") == "30"
+    assert ranks({"a": point(100, math.nan), "b": point(200, 31)}) == {"a": 0.5, "b": 1.0}
+
+
+def test_tables_have_ranks_of_whole_groups_and_changes_from_the_named_base():
+    names = "POP", "merge"
+    whole = [point(100 + n, 30.0, f"compaction: {name}", tier="S") for n, name in enumerate(names)]
+    text = paper.study_table([*whole, point(90, 29.0, "compaction: POP", tier="L")], "compaction", ("merge",))
+    rows = {tuple(cells[:3]): cells[3:] for cells in (line.strip("| ").split(" | ") for line in text.splitlines())}
+    assert rows["d", "S", "POP"][:3] == ["100", "-1.0 %", "30.0000 (+0.0000)"]
+    assert rows["d", "L", "POP"][:3] == ["90", "", "29.0000"], "there is no merge to compare with"
+    assert [rows["all", "", name][-1] for name in names] == ["1.25", "1.75"], "of tier S alone"

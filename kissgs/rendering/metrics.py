@@ -175,9 +175,7 @@ class Flip:
         try:
             self._package = importlib.import_module("flip_evaluator")
         except ModuleNotFoundError as error:
-            raise UnsupportedError(
-                f"FLIP needs a package that is missing ({error}): pip install flip-evaluator"
-            ) from error
+            raise UnsupportedError("FLIP needs flip-evaluator, which is missing: pip install flip-evaluator") from error
 
     def __call__(self, image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
         """Return the mean over all pixels of two sRGB images, clamped to [0, 1]; NaN if either has a NaN."""
@@ -201,13 +199,13 @@ class Lpips:
             self._network = package.LearnedPerceptualImagePatchSimilarity(net_type="vgg").to(device)
         except ModuleNotFoundError as error:
             raise UnsupportedError(
-                f"LPIPS needs packages that are missing ({error}): pip install torchmetrics torchvision"
+                f"LPIPS needs torchmetrics and torchvision ({error}): pip install torchmetrics torchvision"
             ) from error
         except (OSError, RuntimeError, http.client.HTTPException) as error:
             raise UnsupportedError(
-                f"LPIPS could not load the weights of its network, vgg16, which torchvision downloads on first use "
-                f"({error}): construct kissgs.rendering.metrics.Lpips once while online, or copy the file into the "
-                f"folder checkpoints of torch.hub.get_dir()"
+                f"LPIPS could not load its network, vgg16 ({error}): torchvision must be of torch's build; it "
+                "downloads the weights on first use: construct kissgs.rendering.metrics.Lpips once while online, or "
+                "copy the file into the folder checkpoints of torch.hub.get_dir()"
             ) from error
         self._device = device
 
@@ -221,6 +219,7 @@ class Lpips:
             raise UnsupportedError(f"LPIPS needs images of at least 16x16 pixels, not {width}x{height}")
         if any(np.isnan(array).any() for array in pair):  # the package refuses NaN
             return float("nan")
-        first, second = (torch.from_numpy(array).to(self._device).permute(2, 0, 1)[None] for array in pair)
+        clamped = (torch.from_numpy(np.clip(array, 0, 1)) for array in pair)
+        first, second = (array.to(self._device).permute(2, 0, 1)[None] for array in clamped)
         with torch.no_grad():
             return float(self._network(first, second).item())

@@ -24,6 +24,14 @@ from kissgs.core.numba_kernels import compiled
 _FAST = {"contract", "nsz", "reassoc"}  # without "nnan", so that NaN stays NaN
 
 
+@njit
+def _zeros(count: int) -> np.ndarray:
+    """Return zeros that begin at a cache line: half of the vectors would cross one otherwise, which costs a third."""
+    zeros = np.zeros(count + 16, np.float32)
+    first = -(zeros.ctypes.data // 4) % 16
+    return zeros[first : first + count]
+
+
 @compiled("float32(float32[::1], int64, int64)", inline="always")
 def _blur(x: np.ndarray, i: int, step: int) -> np.float32:
     """Return the 11-tap Gaussian of standard deviation 1.5 over ``x[i], x[i + step], ...``."""
@@ -196,11 +204,11 @@ def ssim_tile(
     count = right - left
     first, last = max(left - 30, 0), min(right + 30, width)  # columns of s and d inside the image
     near, far = max(15 - left, 0), min(count + 30, width - left + 15)  # of the maps; the others stay zero
-    ring = np.zeros(22 * 1152, dtype=np.float32)
-    moments = np.zeros(4 * 576, dtype=np.float32)
-    values = np.zeros(512, dtype=np.float32)
-    map_ring = np.zeros(22 * 1536, dtype=np.float32)
-    blurred = np.zeros(3 * 512, dtype=np.float32)
+    ring = _zeros(22 * 1152)
+    moments = _zeros(4 * 576)
+    values = _zeros(512)
+    map_ring = _zeros(22 * 1536)
+    blurred = _zeros(3 * 512)
     reach = 10 if gradient.size > 0 else 5
     for step in range(bottom - top + 2 * reach):
         slot, oldest = step % 11, (step + 1) % 11
@@ -234,8 +242,8 @@ def similarity_tile(image: np.ndarray, target: np.ndarray, tile: np.ndarray, sum
     height, width = image.shape
     top, bottom, left, right = tile
     first, last = max(left - 15, 0), min(right + 15, width)  # columns inside the image; the others stay zero
-    ring = np.zeros(22 * 1152, dtype=np.float32)
-    moments = np.zeros(4 * 576, dtype=np.float32)
+    ring = _zeros(22 * 1152)
+    moments = _zeros(4 * 576)
     maps = np.zeros((2, right - left), dtype=np.float32)
     for step in range(bottom - top + 10):
         slot, y = step % 11, top - 5 + step

@@ -72,7 +72,7 @@ export function choiceField(limits, presets) {
     isEarlier: () => before.radio.checked,
     /** Show what to expect of a scene. @param {import("./expected.js").Scene} scene */
     refresh(scene) {
-      const usual = expect({}, scene, named);
+      const usual = expect({}, { ...scene, reduced: false }, named);
       if (!small.radio.checked && !size.checkValidity()) sized = false; // else it would prevent the submission
       const share = scene.trains ? TRAINED_SHARE : ENCODED_SHARE;
       if (!sized && usual) {

@@ -110,9 +110,10 @@ function optionFields(limits, presets) {
     keep.disabled = given || limit || (!limits.training && preset !== "fast");
     if (keep.disabled) keep.value = "";
     choice.refresh(scene());
-    byId("choice-note").textContent =
-      `Expected for ${facts?.gaussians ? "this scene" : "a million Gaussians"} on two cores; other scenes differ. ` +
-      `Quality is the change of PSNR to photographs, all measured on ${presets.measured_on}.`;
+    byId("choice-note").textContent = keep.value
+      ? "What to expect of fewer Gaussians is not known before."
+      : `Expected for ${facts?.gaussians ? "this scene" : "a million Gaussians"} on two cores; other scenes differ. ` +
+        `Quality is the change of PSNR to photographs, all measured on ${presets.measured_on}.`;
   }
 
   if (!limits.training) {

@@ -125,7 +125,6 @@ REFUSED = {
     "compress scene.ply -o k.ssog --container sog": ".zip or .sog",
     "compress scene.ply -o k.ssog --unpacked": "a slash",
     "remote compress scene.ply -o out.xyz": ".zip or .sog",
-    "remote get 1 -o out.xyz": ".zip or .sog",
     "decompress scene.ply -o x.usdz": ".ply",
     "compact scene.ply --ratio 0.5 -o x.plyy": ".ply",
     "convert scene.ply x.usdz": ".spz, .splat",
