@@ -220,7 +220,7 @@ def test_gsplats_frame_is_not_guessed_without_photographs_that_show_the_scene(tm
     scene = gsplat_scene(POINTS, (1, 1, 1))
     assert "gsplat's" not in fitting_views(scene, kissgs.load_views(tmp_path))[1]
     write_photos(tmp_path / "images", OTHERS["noise"])
-    with pytest.raises(InvalidViewsError, match="or the points of its COLMAP model if gsplat did"):
+    with pytest.raises(InvalidViewsError, match=r"or its COLMAP model with points3D\.bin if gsplat did"):
         fitting_views(scene, kissgs.load_views(tmp_path))
 
 
