@@ -252,7 +252,9 @@ def capture_of(path: Path, scene: Path | None) -> Path:
     found = next((path / name for name in names if is_capture(path / name)), None)
     if found is None:
         wanted = listed([quoted(name) for name in names])
-        raise InvalidViewsError(f"{path} has no capture of {scene}: no folder in it is named {wanted}, and has cameras")
+        raise InvalidViewsError(
+            f"{path} has no cameras, nor has a folder in it named {wanted}; name the scene's capture"
+        )
     return found
 
 

@@ -324,5 +324,5 @@ def test_the_capture_of_each_scene(tmp_path):
     assert found == tmp_path / "data/garden"
     assert capture_of(found, tmp_path / "sparse.ply") == found, "it has cameras itself"
     assert capture_of(tmp_path / "data/notes", scene) == tmp_path / "data/notes"
-    with pytest.raises(InvalidViewsError, match=r"no folder in it is named 'runs', '7', 'notes', 'x', and has"):
+    with pytest.raises(InvalidViewsError, match=r"no cameras, nor .* named 'runs', '7', 'notes', 'x'; name"):
         capture_of(tmp_path / "data", tmp_path / "bonsai/x/notes/7/runs.ply")
