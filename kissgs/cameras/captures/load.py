@@ -40,7 +40,7 @@ from kissgs.core.array_types import Float32
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidViewsError
 from kissgs.formats import MAX_PACKED_NAME, PHOTOGRAPHS, is_packable
-from kissgs.io.files import atomic_file, listed
+from kissgs.io.files import atomic_file
 from kissgs.rendering.camera import Camera
 
 DEFAULT_RESOLUTION = 1600
@@ -251,10 +251,9 @@ def capture_of(path: Path, scene: Path | None) -> Path:
     names = [name for name in (scene.stem, *(folder.name for folder in scene.absolute().parents[:3])) if name]
     found = next((path / name for name in names if is_capture(path / name)), None)
     if found is None:
-        wanted = listed([quoted(name) for name in names])
-        raise InvalidViewsError(
-            f"{path} has no cameras, nor has a folder in it named {wanted}; name the scene's capture"
-        )
+        wanted = ", ".join(map(quoted, names))
+        remedy = "name the capture of the scene"
+        raise InvalidViewsError(f"{path} has no cameras, nor has a folder in it named {wanted}; {remedy}")
     return found
 
 
