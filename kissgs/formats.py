@@ -88,6 +88,7 @@ CAMERA_FILES = frozenset(
         "images.bin",
         "cameras.txt",
         "images.txt",
+        "points3D.bin",
         "dataparser_transforms.json",
         "transforms.json",
         "transforms_train.json",
@@ -95,7 +96,7 @@ CAMERA_FILES = frozenset(
         "transforms_val.json",
     }
 )
-"""Names of the files of a capture that have its cameras."""
+"""Names of the files of a capture that have its cameras, and the frame of its scene."""
 
 MAX_PACKED_NAME = 255  # bytes of the name of a file in the archive of a capture, with its folders
 

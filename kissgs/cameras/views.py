@@ -186,9 +186,9 @@ class Views:
         note: clause about an unexpected property of the capture, for messages; empty if there is none.
         similarities: from the cameras' coordinates to others that the scene may have, according to the capture's files;
             which of them are the scene's, its renderings tell (:func:`kissgs.evaluation.evaluate.in_scene_frame`).
+        origin: point of the world at which the cameras' coordinates are zero, as for :class:`kissgs.Splats`.
         points: points of the COLMAP model, in the cameras' coordinates, from which gsplat's normalisation of the world
             follows; None if there are none.
-        origin: point of the world at which the cameras' coordinates are zero, as for :class:`kissgs.Splats`.
     """
 
     train: tuple[View, ...]
@@ -197,8 +197,8 @@ class Views:
     source: str
     note: str = ""
     similarities: tuple[Similarity, ...] = ()
-    points: Path | None = None
     origin: Origin = WORLD
+    points: Path | None = None
 
     @property
     def all(self) -> tuple[View, ...]:

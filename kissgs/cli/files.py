@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import itertools
 import json
 import os
 import signal
@@ -149,7 +150,9 @@ def for_each_input(
     processed; the exit code is then 2. A folder that is made for the outputs stays if all fail: another command may be
     about to write into it. The context of ``during``, which gets all inputs with their outputs, encloses the work. A
     slash at the end of ``output`` names a folder."""
-    inputs = expand(names)
+    from kissgs.io.checkpoint import one_per_step
+
+    inputs = one_per_step(expand(names))
     if writes and output is None:
         _refuse_output_as_input(inputs, suffix)
     if writes and as_json and str(output) == "-":
@@ -233,12 +236,22 @@ def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folde
 
 
 def _names(inputs: list[str]) -> list[str]:
-    """Return the names of outputs in one folder: those of the inputs; if two are equal, those of the nearest folders
-    above the inputs that all differ."""
-    paths = [Path(os.path.abspath(name)) for name in inputs]  # noqa: PTH100  links keep their names
-    levels = zip(*([folder.name for folder in path.parents] for path in paths), strict=False)
-    names = [tuple(_stem(name) for name in inputs), *levels]
-    return list(next((each for each in names if len(set(each)) == len(inputs)), names[0]))
+    """Return the names of outputs in one folder: those of the inputs; of equal ones, the names of the nearest folders
+    above them that all differ, or of two such folders. Names that differ in case only are equal on some machines."""
+    names, equal = list(map(_stem, inputs)), dict[str, list[int]]()
+    for n, name in enumerate(names):
+        equal.setdefault(name.casefold(), []).append(n)
+    for group in filter(lambda group: len(group) > 1, equal.values()):
+        paths = [Path(os.path.abspath(inputs[n])) for n in group]  # noqa: PTH100  links keep their names
+        levels = list(zip(*([folder.name for folder in path.parents] for path in paths), strict=False))
+        pairs = [
+            tuple(f"{above}_{name.removeprefix('iteration_')}" for above, name in zip(outer, inner, strict=True))
+            for inner, outer in itertools.combinations(levels, 2)
+        ]
+        chosen = next((each for each in [*levels, *pairs] if len({name.casefold() for name in each}) == len(group)), ())
+        for n, name in zip(group, chosen, strict=False):
+            names[n] = name
+    return names
 
 
 def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:

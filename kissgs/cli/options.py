@@ -8,7 +8,7 @@ import inspect
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
@@ -415,14 +415,17 @@ def open_views(
     path: Path | None, scene: str | Path, *, scale: int | None = None, images: Path | None = None
 ) -> Views | None:
     """Load the capture at ``path``, if there is one; of a folder of captures, the one named as the scene, or as the
-    nearest folder above it."""
+    nearest of three folders above it."""
     if path is None:
         return None
     from kissgs.cameras.captures.load import capture_of, load_views
 
-    file = Path(scene).absolute()
-    names = [file.stem, *(each.name for each in file.parents)]
-    return load_views(capture_of(path, names), scene=file, scale=scale, images=images)
+    file = None if str(scene) == "-" else Path(scene).absolute()
+    capture = capture_of(path, file)
+    views = load_views(capture, scene=file, scale=scale, images=images)
+    if capture == path:
+        return views
+    return replace(views, note="; ".join(filter(None, [f"the capture is {capture}", views.note])))
 
 
 def open_common_views(path: Path | None) -> Views | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from kissgs.cli.files import Result, for_each_input, print_json, progress_bar, show
+from kissgs.cli.files import Result, for_each_input, is_folder, print_json, progress_bar, show
 from kissgs.cli.options import (
     EncodingOptions,
     FilesArgument,
@@ -56,8 +56,10 @@ def compress(
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job."""
+    from kissgs.cameras.captures.load import capture_of
     from kissgs.cli.tables import status_table
     from kissgs.io.files import open_scene_file, refuse_existing
+    from kissgs.pipeline.scene_files import scene_root
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
@@ -65,19 +67,18 @@ def compress(
     with _service(server) as remote, tempfile.TemporaryDirectory() as folder:
 
         @functools.cache
-        def packed() -> Path | None:
-            if views is None:
-                return None
+        def packed(capture: Path, within: Path) -> Path:
             _check_reachable(remote)
-            return _pack(views, Path(folder), quiet or as_json)
+            return _pack(capture, within / "scene", Path(tempfile.mkdtemp(dir=folder)), quiet or as_json)
 
         def work(scene: str, target: Path) -> Result:
             refuse_existing(target, overwrite=force)  # here, as packing may take minutes
-            with open_scene_file(Path(scene)):
-                capture = packed()
+            file = scene_root(Path(scene)) if is_folder(Path(scene)) else Path(scene)
+            with open_scene_file(file):
+                capture = None if views is None else packed(capture_of(views, Path(scene)), file.absolute().parent)
             with progress_bar(quiet or as_json) as progress:
                 status = remote.compress(
-                    scene,
+                    file,
                     target,
                     settings=settings,
                     container=kind,
@@ -157,13 +158,13 @@ def _check_reachable(remote: Remote) -> None:
             raise
 
 
-def _pack(views: Path, folder: Path, quiet: bool) -> Path:
-    """Pack a capture into an archive in the folder."""
+def _pack(views: Path, scene: Path, folder: Path, quiet: bool) -> Path:
+    """Pack a capture for a scene into an archive in the folder."""
     from kissgs.cameras.captures.load import pack_capture
 
     archive = folder / "capture.zip"
     with progress_bar(quiet) as progress:
-        pack_capture(views, archive, progress)
+        pack_capture(views, archive, progress, scene=scene)
     return archive
 
 

@@ -34,6 +34,7 @@ LEAST_PSNR, USUAL_PSNR = 12.0, 18.0
 """Median PSNR, decibels, below which a capture is refused, and below which a note says so. Images of different scenes
 have about 8 to 12 dB; renderings of a trained scene have 20 to 35."""
 
+FRAME_MARGIN = 3.0  # decibels by which a frame that no file states must be better than all others
 COMPARED, SIDE = 5, 160  # photographs that are compared, and pixels on the longer side of each
 CAMERAS = 16  # number of cameras that tell, where there are no photographs, how much of the scene they show
 GAINS = 0.25, 4.0  # by which a photograph may be darker or brighter than renderings of the same scene
@@ -55,6 +56,7 @@ class _Fit:
     # white have another background than the photographs, or than is known here.
     psnr_inside: float = math.nan
     shown: float = math.nan  # share of the scene that the cameras show, 0 to 1; NaN if there are photographs
+    unread: str = ""  # why gsplat's normalisation could not be tried
 
     @property
     def quality(self) -> float:
@@ -73,7 +75,7 @@ def in_scene_frame(splats: Splats, views: Views, context: Context = DEFAULT_CONT
     """Return views with cameras in the coordinates of the scene; their note says if there was a choice. Each of
     :attr:`Views.similarities` is tried, and the best is kept if it is better than none: the one with the highest median
     PSNR to some photographs; without photographs, the one whose cameras show most of the scene. Where the photographs
-    still do not show the scene, gsplat's normalisation of the world is tried, and kept if they then do."""
+    still do not show the scene, gsplat's normalisation of the world is tried, and kept if whole images then do."""
     samples = _samples(views) if views.similarities or views.points else []
     if not views.all or not (views.similarities or samples):
         return _moved(views, None, splats.origin)
@@ -93,13 +95,14 @@ def fitting_views(
     load_kernels(context.progress)
     context.progress("cameras", 0.0)
     samples, source = _samples(views), views.source
-    views, fit, note = _best(splats, views, samples, context.threads)
+    views, fit, note = _best(splats, views, samples, context.threads, guess=not force)
     problem = _problem(fit, source, samples)
     refused = not fit.seen or (fit.psnr < LEAST_PSNR and fit.psnr_inside < USUAL_PSNR)
     if samples and not force and refused:
+        problem = "; ".join(filter(None, [fit.unread, problem]))
         raise InvalidViewsError(
             f"{problem}: give the capture of this scene, with dataparser_transforms.json beside it if nerfstudio "
-            "trained the scene, or the points of its COLMAP model if gsplat did, or --force-views (in Python "
+            "trained the scene, or its COLMAP model with points3D.bin if gsplat did, or --force-views (in Python "
             "force_views) to use it all the same"
         )
     return views, "; ".join(filter(None, [note, problem]))
@@ -121,8 +124,12 @@ def _problem(fit: _Fit, source: str, samples: Sequence[_Sample]) -> str:
     )
 
 
-def _best(splats: Splats, views: Views, samples: Sequence[_Sample], threads: int) -> tuple[Views, _Fit, str]:
-    """Return the views in the coordinates that fit best, how well they fit, and a note if there was a choice."""
+def _best(
+    splats: Splats, views: Views, samples: Sequence[_Sample], threads: int, *, guess: bool = True
+) -> tuple[Views, _Fit, str]:
+    """Return the views in the coordinates that fit best, how well they fit, and a note if there was a choice. With
+    ``guess``, gsplat's normalisation counts too, which no file states: it must show the scene in whole images, much
+    better than any other; its four choices are many for parts of images, where some wrong scene may look right."""
     tried = tuple(view for view, _ in samples) or tuple(_spread(views.train or views.test, CAMERAS))
 
     def fit(similarity: Similarity | None) -> _Fit:
@@ -138,16 +145,21 @@ def _best(splats: Splats, views: Views, samples: Sequence[_Sample], threads: int
         found = fit(similarity)
         if found.quality > best.quality:
             best, chosen = found, similarity
-    if samples and best.quality < USUAL_PSNR and views.points is not None:
-        for similarity in gsplat_similarities(views.points, [view.camera.viewmat for view in views.all]):
-            found = fit(similarity)
-            if found.quality >= max(best.quality, USUAL_PSNR):
-                best, chosen = found, similarity
+    if guess and samples and best.quality < USUAL_PSNR and views.points is not None:
+        try:
+            guesses = gsplat_similarities(views.points, [view.camera.viewmat for view in views.all])
+        except InvalidViewsError as error:  # in points that other trainers' scenes do not need
+            guesses, best = (), replace(best, unread=str(error))
+        ordered = sorted(((fit(each), each) for each in guesses), key=lambda pair: pair[0].psnr, reverse=True)
+        if ordered and ordered[0][0].seen:
+            second = max(best.psnr, ordered[1][0].psnr)
+            if ordered[0][0].psnr >= max(USUAL_PSNR, second + FRAME_MARGIN):
+                best, chosen = ordered[0]
     files = ", ".join(dict.fromkeys(similarity.source for similarity in views.similarities))
     views = _moved(views, chosen, splats.origin)
     if chosen is None:
         unused = f"the cameras fit the scene as they are ({given}), so {files} is not applied"
-        return views, best, unused if ".json" in files else ""
+        return views, best, best.unread or (unused if ".json" in files else "")
     return views, best, f"the cameras are moved by {chosen.source} to fit the scene: {best} instead of {given}"
 
 

@@ -17,6 +17,7 @@ from kissgs.core.errors import InvalidContainerError, OutputError, UnsupportedEr
 from kissgs.core.positions import WORLD, centred, in_world, origin_for, relative_to, world_positions
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, clean
 from kissgs.formats import ENDINGS, FORMATS, LEVELS_NAME, LOD_NAME, SCENE_ENDINGS, output_format
+from kissgs.io.checkpoint import ranks
 from kissgs.io.containers import (
     MAX_METADATA_BYTES,
     META_NAME,
@@ -95,10 +96,17 @@ def scene_root(path: Path) -> Path:
     scene in a folder that INRIA's trainer has written; else the path itself."""
     if path.name in (META_NAME, *_STREAMED) and path.is_file():
         return path.parent
-    if not _is_folder(path):
+    if not _is_folder(path) or _has_metadata(path):
         return path
     scenes = path.glob("point_cloud/iteration_[0-9]*/point_cloud.ply")
-    return max(scenes, key=lambda scene: (len(scene.parent.name), scene), default=path)  # in the order of numbers
+    in_order = sorted(scenes, key=lambda scene: (len(scene.parent.name), scene))  # of the numbers
+    return next((scene for scene in reversed(in_order) if scene.is_file()), path)
+
+
+def _has_metadata(folder: Path) -> bool:
+    with suppress(OSError, ValueError):
+        return any((folder / name).is_file() for name in (YAML_NAME, META_NAME, *_STREAMED))
+    return False
 
 
 def is_container(source: Path | bytes) -> bool:
@@ -121,12 +129,12 @@ def _is_folder(path: Path) -> bool:
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse a folder that is no container, and name the scenes in it."""
+    """Refuse a folder that is no container, and name the scenes in it, or below it where INRIA's trainer puts them."""
+    if _has_metadata(folder):
+        return
     try:
-        if any((folder / name).is_file() for name in (YAML_NAME, META_NAME, *_STREAMED)):
-            return
-        endings = (*ENDINGS, *SCENE_ENDINGS)
-        scenes = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in endings and path.is_file()]
+        found = [path for pattern in ("*", "point_cloud/iteration_*/*") for path in sorted(folder.glob(pattern))]
+        scenes = [path for path in found if path.suffix.lower() in (*ENDINGS, *SCENE_ENDINGS) and path.is_file()]
     except (OSError, ValueError):
         return  # the reader says why
     if scenes:
@@ -317,6 +325,8 @@ def read_scene(
     root = scene_root(source) if isinstance(source, Path) else source
     if only_containers and found == "ply":
         found = "sogxt"  # whose reader says what is wrong
+    if found == "sogxt" and isinstance(root, Path | bytes) and b"/data.pkl" in _beginning(root)[0]:
+        raise UnsupportedError("a checkpoint of a trainer is read from a file whose name ends in .pt or .ckpt only")
     refuse_level(found, root, reading.level)
     splats = reading.marked(FORMATS[found].codec.read(root, reading, threads, progress))
     if isinstance(source, Path) and isinstance(root, Path) and source in root.parents:
@@ -344,11 +354,11 @@ def reading_notes(splats: Splats) -> list[str]:
 
 
 def stored_bytes(path: Path) -> int:
-    """Return the size of a file, or of all files in a folder and below it, in bytes."""
+    """Return the size of a file, with other ranks' of a checkpoint, or of all files in a folder and below, in bytes."""
     try:
         root = scene_root(path)
         if not root.is_dir():
-            return root.stat().st_size
+            return sum(file.stat().st_size for file in ranks(root))
         return sum(entry.stat().st_size for entry in root.rglob("*") if entry.is_file())
     except OSError as error:
         raise InvalidContainerError(f"cannot read {path}: {reason_of(error)}") from error

@@ -230,6 +230,13 @@ def test_outputs_of_equal_names_are_named_after_the_folders_that_differ(scene, t
         shutil.copy(scene, tmp_path / name)
     assert run("convert", *inputs, "out/", "--to", "spz", "-q", cwd=tmp_path).returncode == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"garden.spz", "bonsai.spz"}
+    other = inputs[0].replace("_9", "_7")
+    (tmp_path / other).parent.mkdir()
+    shutil.copy(scene, tmp_path / other)
+    shutil.copy(scene, tmp_path / "Own.ply")
+    command = ["convert", *inputs, other, "Own.ply", "all/", "--to", "spz", "-q"]
+    assert run(*command, cwd=tmp_path).returncode == 0
+    assert {path.stem for path in (tmp_path / "all").iterdir()} == {"garden_9", "garden_7", "bonsai_9", "Own"}
     inputs = [inputs[0], f"garden/../{inputs[0]}"]
     assert "would become one file" in failure("convert", *inputs, "out/", "--to", "spz", cwd=tmp_path)
 

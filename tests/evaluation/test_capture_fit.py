@@ -111,9 +111,15 @@ def test_the_run_of_a_scene_has_nerfstudios_frame(tmp_path):
     run_folder = tmp_path / "outputs/data/splatfacto/2026-01-01"
     (run_folder / "nerfstudio_models").mkdir(parents=True)
     write_dataparser(run_folder)
+    (run_folder / "config.yml").touch()
     for scene in (run_folder / "nerfstudio_models/step-000029999.ckpt", run_folder / "splat.ply"):
         views = kissgs.load_views(tmp_path / "data", scene=scene)
         assert "moved by dataparser_transforms.json" in fitting_views(moved_scene(), views)[1]
+    for text in ("no JSON", '{"transform": [[1,0,0,9],[0,1,0,9],[0,0,1,9]], "scale": 3}'):
+        write_dataparser(tmp_path / "data")
+        (run_folder / "dataparser_transforms.json").write_text(text)
+        views = kissgs.load_views(tmp_path / "data", scene=scene)
+        assert "moved by dataparser_transforms.json" in fitting_views(moved_scene(), views)[1], "the capture's own"
     kissgs.save(moved_scene(), scene)
     settings = kissgs.Settings.from_preset("fast")
     report = kissgs.compress(scene, settings=settings, evaluate=True, views=tmp_path / "data").report
@@ -180,9 +186,9 @@ def gsplat_scene(points, signs):
 POINTS = np.random.default_rng(5).normal((1, -0.5, 2), (4, 0.3, 1.5), (201, 3)) + [(0, 0, n / 99) for n in range(201)]
 
 
-def write_points(folder):
+def write_points(folder, points=POINTS):
     write_colmap(folder)
-    (folder / "sparse/0/points3D.bin").write_bytes(point_bytes(POINTS))
+    (folder / "sparse/0/points3D.bin").write_bytes(point_bytes(points))
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
@@ -214,8 +220,28 @@ def test_gsplats_frame_is_not_guessed_without_photographs_that_show_the_scene(tm
     scene = gsplat_scene(POINTS, (1, 1, 1))
     assert "gsplat's" not in fitting_views(scene, kissgs.load_views(tmp_path))[1]
     write_photos(tmp_path / "images", OTHERS["noise"])
-    with pytest.raises(InvalidViewsError, match="or the points of its COLMAP model if gsplat did"):
+    with pytest.raises(InvalidViewsError, match=r"or its COLMAP model with points3D\.bin if gsplat did"):
         fitting_views(scene, kissgs.load_views(tmp_path))
+
+
+def test_a_wrong_scene_does_not_pass_in_gsplats_frame_for_parts_of_its_images(tmp_path):
+    """A small object in front of walls once passed, since only the pixels that it covers were compared."""
+    write_photos(tmp_path / "images", lambda image: 0 * image + 0.7)
+    write_points(tmp_path, POINTS + 50)  # in whose frame the model's own cameras see nothing of the scene
+    scene, views = gsplat_scene(POINTS + 50, (1, 1, 1)), kissgs.load_views(tmp_path)
+    with pytest.raises(InvalidViewsError, match="shows any of the scene"):
+        fitting_views(replace(scene, sh0=np.full_like(scene.sh0, 0.7)).select(slice(1400, None)), views)
+
+
+def test_damaged_points_stop_only_a_scene_that_nothing_else_shows(tmp_path):
+    write_photos(tmp_path / "images")
+    write_points(tmp_path)
+    (tmp_path / "sparse/0/points3D.bin").write_bytes(b"nothing that could be read")
+    views, scene = kissgs.load_views(tmp_path), moved_scene()
+    with pytest.raises(InvalidViewsError, match=r"points3D\.bin.*--force-views"):
+        fitting_views(scene, views)
+    assert fitting_views(scene, views, force=True)[0].train == views.train
+    assert "points3D.bin" in in_scene_frame(scene, views).note
 
 
 @pytest.mark.parametrize("data", [point_bytes(POINTS)[:-9], point_bytes(POINTS) + b"1", b"\xff" * 80])

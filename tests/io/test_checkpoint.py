@@ -1,8 +1,11 @@
 """Oracle: checkpoints that torch writes as the trainers do, of random values."""
 
+import argparse
+import concurrent.futures
 import contextlib
 import os
 import sys
+import zipfile
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from kissgs.core.errors import InvalidSceneError, KissgsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES, SH_C0
 from kissgs.io.checkpoint import read_checkpoint
 from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline.scene_files import describe
 
 
 def gsplat_document(scene, **more):
@@ -82,6 +86,18 @@ def test_all_ranks_of_a_step_are_read(tmp_path):
         assert_equal(found, scene)
         assert found.notes[0].startswith("read from ckpt_29999_rank0.pt, ckpt_29999_rank1.pt, ")
     assert len(read_checkpoint(tmp_path / "ckpt_6999_rank0.pt")) == 4
+    files = sorted(tmp_path.glob("ckpt_29999_*.pt"))
+    assert describe(files[3]).bytes == sum(file.stat().st_size for file in files)
+    inputs = [*files, tmp_path / "ckpt_6999_rank0.pt"]
+    run("convert", *inputs, f"{tmp_path}/out/", "--to", "splat")
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [
+        "ckpt_29999_rank0.splat",
+        "ckpt_6999_rank0.splat",
+    ]
+    (tmp_path / "ckpt_29999_rank05.pt").touch()
+    with pytest.raises(InvalidSceneError, match=r"the same rank's .*ckpt_29999_rank05\.pt, .*; remove one"):
+        read_checkpoint(files[0])
+    (tmp_path / "ckpt_29999_rank05.pt").unlink()
     (tmp_path / "ckpt_29999_rank5.pt").unlink()
     with pytest.raises(InvalidSceneError, match="that of rank 5 is not beside it"):
         read_checkpoint(tmp_path / "ckpt_29999_rank0.pt")
@@ -131,6 +147,8 @@ def changed(document, **values):
     [
         (lambda scene: {"state_dict": {}}, "neither 'splats'.* nor 'pipeline'"),
         (lambda scene: torch.zeros(3), "neither 'splats'"),
+        (lambda scene: {"config": argparse.Namespace()}, r"tensors and numbers \(it has argparse\.Namespace\)"),
+        (lambda scene: {"pipeline": {"_model.means": 1}}, r"; nerfstudio before 1\.1 wrote it: export"),
         (lambda scene: {"splats": [1, 2]}, "neither 'splats'"),
         (lambda scene: {"splats": {"features": torch.zeros(3, 32)}}, "has no means, .*, shN; .* without app_opt"),
         (lambda scene: {"pipeline": {}}, r"has no _model\.gauss_params\.means"),
@@ -158,6 +176,48 @@ def test_files_that_are_none(tmp_path, data):
         read_checkpoint(path)
     with pytest.raises(InvalidSceneError, match=r"cannot read .*b\.ckpt: there is no such file"):
         read_checkpoint(tmp_path / "b.ckpt")
+
+
+def repacked(path, compression, pickle=None):
+    """Write the entries of a checkpoint as other zip programs do."""
+    with zipfile.ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, data in entries.items():
+            archive.writestr(name, pickle if pickle and name.endswith("data.pkl") else data)
+    return path
+
+
+def test_a_checkpoint_that_was_compressed_again_is_refused(tmp_path):
+    """torch maps tensors into memory without looking at the compression: their bytes were taken for numbers."""
+    scene = made_scene(30, 1)
+    path = saved(tmp_path / "a.pt", gsplat_document(scene))
+    assert_equal(read_checkpoint(repacked(path, zipfile.ZIP_STORED)), scene)
+    with pytest.raises(InvalidSceneError, match=r"^a\.pt was compressed .*; save it again with torch\.save$"):
+        read_checkpoint(repacked(path, zipfile.ZIP_DEFLATED))
+    with pytest.raises(InvalidSceneError, match=r"holds much more than tensors"):
+        read_checkpoint(repacked(path, zipfile.ZIP_STORED, bytes(1 << 25)))
+    torch.save(gsplat_document(scene), path, _use_new_zipfile_serialization=False)
+    with pytest.raises(InvalidSceneError, match=r"no zip.*; save it again, by torch 1\.6 or newer$"):
+        read_checkpoint(path)
+
+
+def test_checkpoints_are_read_from_files_of_their_endings(tmp_path):
+    data = saved(tmp_path / "a.pt", gsplat_document(made_scene(3, 1))).read_bytes()
+    assert "from a file whose name ends in .pt or .ckpt" in failure("convert", "-", tmp_path / "a.ply", stdin=data)
+
+
+def test_tensors_of_unusual_kinds(tmp_path):
+    scene, document = made_scene(3, 1), gsplat_document(made_scene(3, 1))
+    values = document["splats"]
+    values["means"] = torch._neg_view(-values["means"])
+    values["quats"] = torch.nn.Parameter(values["quats"])
+    values["quats"].detach = values["quats"].layout2 = 1
+    assert_equal(read_checkpoint(saved(tmp_path / "a.pt", document)), scene)
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:  # what may be unpickled is a list of the whole process
+        splatfacto = saved(tmp_path / "a.ckpt", splatfacto_document(scene))
+        for found in pool.map(read_checkpoint, [splatfacto] * 80):
+            assert_equal(found, scene)
 
 
 def test_damaged_copies_are_a_scene_or_refused(tmp_path):

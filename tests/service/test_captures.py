@@ -30,7 +30,7 @@ def folder(tmp_path_factory):
     """A capture with photographs, and with files that nothing needs."""
     found = write_capture(tmp_path_factory.mktemp("capture") / "statue", names=[f"{n}.png" for n in range(9)])
     (found / "notes.txt").write_text("notes")
-    (found / "images" / "points3D.bin").write_bytes(bytes(1000))
+    (found / "images" / "points3D.ply").write_bytes(bytes(1000))
     return found
 
 

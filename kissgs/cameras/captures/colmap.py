@@ -307,11 +307,9 @@ def read_colmap(folder: Path) -> Capture:
         raise InvalidViewsError(f"{images_path} has no images; reconstruct the capture again")
     root = _root(folder)
     within = folder.resolve().relative_to(root)  # the files themselves may be links to others
-    files = {str(within / path.name): path for path in (cameras_path, images_path)}
-    points = folder / "points3D.bin"
-    return Capture(
-        tuple(posed_images), root, f"COLMAP model {folder}", files, points=points if points.is_file() else None
-    )
+    points = folder / "points3D.bin" if (folder / "points3D.bin").is_file() else None
+    files = {str(within / path.name): path for path in (cameras_path, images_path, points) if path is not None}
+    return Capture(tuple(posed_images), root, f"COLMAP model {folder}", files, points=points)
 
 
 def _is_model(folder: Path, suffix: str) -> bool:

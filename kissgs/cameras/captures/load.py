@@ -5,10 +5,11 @@ from __future__ import annotations
 import ast
 import io
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from os import PathLike
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -28,7 +29,7 @@ from kissgs.cameras.captures.photos import (
 )
 from kissgs.cameras.captures.transforms_json import (
     DATAPARSER_TRANSFORMS,
-    dataparser_file,
+    dataparser_files,
     read_split_transforms,
     read_transforms,
     similarities,
@@ -49,6 +50,7 @@ published results depend; INRIA's code limits only the width, so that portrait p
 HOLD_OUT = 8  # every eighth view, starting with the first, is held out: the protocol of 3DGS and Mip-NeRF 360
 JSONS = ("transforms.json", "transforms_train.json")
 MAX_ARGUMENTS_BYTES = 1 << 16  # of cfg_args that are read; INRIA's trainer writes 300
+EVERY_EIGHTH = "cfg_args says eval=False, so the scene was trained on every eighth photograph, which is held out here"
 MAX_ASPECT_ERROR = 0.01  # relative difference of aspect ratios of photograph and camera; scaled copies round sides
 
 
@@ -74,7 +76,7 @@ def load_views(
     are loaded.
 
     Cameras are in the coordinates of the camera file. nerfstudio trains scenes in others: its
-    ``dataparser_transforms.json``, in the folder of the run that ``scene`` is from, in the capture's folder or beside
+    ``dataparser_transforms.json``, in the folder of its run that ``scene`` is from, in the capture's folder or beside
     the camera file, is read for those who compare the views with a scene (:attr:`Views.similarities`). A folder of
     INRIA's trainer stands for the capture, the folder of photographs and the background that its ``cfg_args`` names.
 
@@ -107,21 +109,16 @@ def load_views(
         raise InvalidViewsError("hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more")
     path = archive = Path(path)
     try:
-        training = None if unpacked else _trained_on(path)
-        if training is not None:
-            path, images = training[0], training[1] if scale is None and images is None else images
-        if scale is None and images is None and not unpacked:
-            path, scale = _of_scale(path)
-        path = _uppermost_with_cameras(path) if unpacked else path
-        capture, folder = _read_capture(path), path if path.is_dir() else path.parent
-        run = [] if scene is None else list(scene.absolute().parents)[:2]
-        moves = similarities(dataparser_file((*run, folder, capture.root)), capture.applied)
+        place = _Place(_uppermost_with_cameras(path)) if unpacked else _place(path, scale, images)
+        path, scale, images = place[:3]
+        capture = _read_capture(path)
+        near = sorted(file.parent for file in archive.rglob(DATAPARSER_TRANSFORMS)) if unpacked else _run(scene)
+        moves = similarities(dataparser_files(_own(path, capture), near), capture.applied)
     except OSError as error:  # even testing for a path fails without permission or if a name is too long
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
     names = [posed.photo for posed in capture.images]
     photos = find_photos(names, capture.root, scale=scale, images=images, inside=unpacked)
-    white = capture.white and (photos is None or read_photo_header(photos[0].path).transparent)
-    white = white if training is None else training[2]
+    white = _is_white(capture, photos or ()) if place.white is None else place.white
     background = np.full(3, float(white), dtype=np.float32)
     limit = DEFAULT_RESOLUTION if resolution is None else resolution
     views = []
@@ -136,7 +133,9 @@ def load_views(
         source = source.replace(f"{archive}/", "").replace(f"{archive}", "the archive")
     if photos is not None:
         source = f"{source}, photographs of {_folders(photos)}"
-        return Views(train, test, background, source, similarities=moves, points=capture.points)
+        return Views(
+            train, test, background, source, place.note if test else "", similarities=moves, points=capture.points
+        )
     searched = searched_folders(names, capture.root)
     note = f"no photographs were found (searched {searched}); name their folder with --images"
     note = "the archive has no photographs" if unpacked else note
@@ -181,29 +180,81 @@ def _of_scale(path: Path) -> tuple[Path, int | None]:
     return path, None
 
 
-def _trained_on(folder: Path) -> tuple[Path, Path | None, bool] | None:
-    """Return what ``cfg_args`` of INRIA's trainer names: the capture, the folder of photographs if it is not the usual
-    one, and whether the background is white; None of a folder without it, or with cameras of its own. It is Python's
-    text of a ``Namespace``, which is parsed and never evaluated."""
+class _Place(NamedTuple):
+    """Place of a capture, and INRIA's choices for it."""
+
+    path: Path
+    scale: int | None = None
+    images: Path | None = None
+    white: bool | None = None  # whether the background is; None: as the capture says
+    note: str = ""
+
+
+def _place(path: Path, scale: int | None = None, images: Path | None = None) -> _Place:
+    """Return the capture for which a path stands, with the scale or the folder of its photographs."""
+    trained = _trained_on(path)
+    if trained is not None:
+        path, images = trained.path, trained.images if scale is None and images is None else images
+    if scale is None and images is None:
+        path, scale = _of_scale(path)
+    return (trained or _Place(path))._replace(path=path, scale=scale, images=images)
+
+
+def _is_white(capture: Capture, photos: Sequence[FoundPhoto]) -> bool:
+    return capture.white and (not photos or read_photo_header(photos[0].path).transparent)
+
+
+def _own(path: Path, capture: Capture) -> list[Path]:
+    return [path if path.is_dir() else path.parent, capture.root]
+
+
+def _run(scene: Path | None) -> list[Path]:
+    """Return the folder of nerfstudio's run that a scene is from, in it or in its folder of checkpoints."""
+    folders = [] if scene is None else list(scene.absolute().parents)[:2]
+    return [folder for folder in folders if (folder / "config.yml").is_file()]
+
+
+def _trained_on(folder: Path) -> _Place | None:
+    """Return what ``cfg_args`` of INRIA's trainer names; None of a folder without it, or with cameras of its own. It is
+    Python's text of a ``Namespace``, which is parsed and never evaluated."""
     file, given = folder / "cfg_args", dict[str | None, object]()
     if not file.is_file() or _has_cameras(folder):
         return None
     with suppress(SyntaxError, ValueError, RecursionError, MemoryError), open_file(file) as (opened, _):
-        call = ast.parse(opened.read(MAX_ARGUMENTS_BYTES).decode(), mode="eval").body
+        call = ast.parse(opened.read(MAX_ARGUMENTS_BYTES).decode("utf-8-sig"), mode="eval").body
         keywords = call.keywords if isinstance(call, ast.Call) else []
         given = {each.arg: each.value.value for each in keywords if isinstance(each.value, ast.Constant)}
-    capture, photographs = Path(str(given.get("source_path"))), str(given.get("images"))
-    if not ("source_path" in given and capture.is_dir()):
-        raise InvalidViewsError(f"{file} names no capture that is here: {capture!s:.200}; name the capture's folder")
+    named, photographs = str(given.get("source_path") or ""), str(given.get("images"))
+    capture = next((each for each in (Path(named), folder / named) if named and each.is_dir()), None)
+    if capture is None:
+        cameras = ", and its cameras.json, which names no photographs, is not read"
+        cameras = cameras if (folder / "cameras.json").is_file() else ""
+        remedy = "name the capture's folder with --views"
+        raise InvalidViewsError(f"{file} names no capture that is here: {quoted(named)}{cameras}; {remedy}")
     usual = photographs == IMAGES or not (capture / photographs).is_dir()
-    return capture, None if usual else capture / photographs, given.get("white_background") is True
+    white, note = given.get("white_background") is True, EVERY_EIGHTH if given.get("eval") is False else ""
+    return _Place(capture, images=None if usual else capture / photographs, white=white, note=note)
 
 
-def capture_of(path: Path, names: Iterable[str]) -> Path:
-    """Return the capture of a scene: the first folder in ``path`` with cameras and one of these names, if ``path`` has
-    no cameras itself; else ``path``."""
-    own = [] if is_capture(path) else [path / name for name in names if name]
-    return next((each for each in own if is_capture(each)), path)
+def capture_of(path: Path, scene: Path | None) -> Path:
+    """Return the capture of a scene: ``path`` if it has cameras, else the first folder in it that has and is named as
+    the scene, or as one of the three folders above.
+
+    Raises:
+        InvalidViewsError: ``path`` is a folder of other folders, none of which is the scene's capture.
+    """
+    folders = list[Path]()  # none where the path is no folder that can be read, of which loading it tells
+    with suppress(OSError):
+        folders = [] if scene is None or is_capture(path) else list(path.iterdir())
+    if scene is None or not any(map(is_capture, folders)):
+        return path
+    names = [name for name in (scene.stem, *(folder.name for folder in scene.absolute().parents[:3])) if name]
+    found = next((path / name for name in names if is_capture(path / name)), None)
+    if found is None:
+        wanted = ", ".join(map(quoted, names))
+        remedy = "name the capture of the scene"
+        raise InvalidViewsError(f"{path} has no cameras, nor has a folder in it named {wanted}; {remedy}")
+    return found
 
 
 def is_capture(path: Path) -> bool:
@@ -308,15 +359,23 @@ def _split(views: Sequence[tuple[View, str | None]], hold_out: int) -> tuple[tup
 # Packing for a service.
 
 
-def pack_capture(path: Path, destination: Path, progress: Progress = silent) -> None:
-    """Pack what :func:`load_views` uses of a capture into a zip, from which a service reads the same views: its camera
-    files, and the photographs of its views, those that are used reduced without further loss. Equal captures make equal
-    files."""
-    load_views(path)  # refuses what a service would refuse
-    path, scale = _of_scale(path)
+def pack_capture(path: Path, destination: Path, progress: Progress = silent, *, scene: Path | None = None) -> None:
+    """Pack what :func:`load_views` uses of a capture for a scene into a zip, from which a service reads the same views:
+    its camera files, and the photographs of its views, those that are used reduced without further loss. Equal captures
+    make equal files."""
+    load_views(path, scene=scene)  # refuses what a service would refuse
+    path, scale, images, white, _ = _place(path)
     capture = _read_capture(path)
-    photos = find_photos([posed.photo for posed in capture.images], capture.root, scale=scale) or ()
-    packed = {_packed_name(posed, photo): (posed, photo) for posed, photo in zip(capture.images, photos, strict=False)}
+    names = [posed.photo for posed in capture.images]
+    photos = find_photos(names, capture.root, scale=scale, images=images) or ()
+    if white not in (None, _is_white(capture, photos)):
+        raise InvalidViewsError(
+            f"the background that cfg_args names for {path} cannot be sent to a service; compress the scene here"
+        )
+    packed = {
+        _packed_name(posed, photo, renamed=images is not None): (posed, photo)
+        for posed, photo in zip(capture.images, photos, strict=False)
+    }
     if len(packed) < len({photo.path for photo in photos}):
         raise InvalidViewsError(f"two photographs of {path} have the same name in different folders; rename one")
     if (refused := next((name for name in packed if not is_packable(name)), None)) is not None:
@@ -324,9 +383,9 @@ def pack_capture(path: Path, destination: Path, progress: Progress = silent) -> 
         raise InvalidViewsError(
             f"the name {quoted(refused)} of a photograph is not printable or has {longest}; rename it"
         )
-    cameras, folder = dict(capture.files), path if path.is_dir() else path.parent
-    if (dataparser := dataparser_file((folder, capture.root))) is not None:
-        cameras[DATAPARSER_TRANSFORMS] = dataparser
+    cameras = dict(capture.files)
+    for n, dataparser in enumerate(dataparser_files(_own(path, capture), _run(scene))):
+        cameras[f"{n}/{DATAPARSER_TRANSFORMS}" if n else DATAPARSER_TRANSFORMS] = dataparser
     with atomic_file(destination) as file, zipfile.ZipFile(file, "w") as archive:
         for name, camera_file in sorted(cameras.items()):
             archive.writestr(_entry(name), _content(camera_file), zipfile.ZIP_DEFLATED)
@@ -336,14 +395,15 @@ def pack_capture(path: Path, destination: Path, progress: Progress = silent) -> 
     progress("pack", 1.0)
 
 
-def _packed_name(posed: PosedImage, photo: FoundPhoto) -> str:
-    """Return the name under which :func:`find_photos` finds a photograph inside the root of an unpacked capture. If the
-    camera file has none of the endings that a service unpacks, it gets that of the file, or any: content decides."""
+def _packed_name(posed: PosedImage, photo: FoundPhoto, *, renamed: bool) -> str:
+    """Return the name under which :func:`find_photos` finds a photograph inside the root of an unpacked capture, in a
+    folder of the usual name if ``renamed``. If the camera file has none of the endings that a service unpacks, it gets
+    that of the file, or any: content decides."""
     parts = without_parents(posed.photo).parts
     if is_absolute(posed.photo):
         parts = (IMAGES if photo.factor == 1 else f"{IMAGES}_{photo.factor}", *parts[1:])
     elif len(parts) > 1:
-        parts = (photo.folder.name, *parts[1:])  # perhaps that of a scaled copy
+        parts = (IMAGES if renamed else photo.folder.name, *parts[1:])  # perhaps that of a scaled copy
     name, suffix = "/".join(parts), photo.path.suffix
     if PurePosixPath(name).suffix.lower() in PHOTOGRAPHS:
         return name

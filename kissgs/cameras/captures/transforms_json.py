@@ -6,6 +6,7 @@ import codecs
 import json
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, TypeVar
@@ -268,16 +269,23 @@ def read_split_transforms(folder: Path) -> Capture:
     return Capture(tuple(images), folder, f"cameras of {train_path} and {test_path.name}", files, white)
 
 
-def dataparser_file(folders: Iterable[Path]) -> Path | None:
-    """Return the ``dataparser_transforms.json`` of the first of ``folders`` that has one."""
-    return next((path for folder in folders if (path := folder / DATAPARSER_TRANSFORMS).is_file()), None)
+def dataparser_files(own: Iterable[Path], near: Iterable[Path]) -> list[Path]:
+    """Return each ``dataparser_transforms.json`` in the capture's own folders and in those near it or its scene, which
+    may be of another program: there, unreadable ones are left out."""
+    found = dict[Path, Path]()
+    for n, folder in enumerate([*(own := list(own)), *near]):
+        path = folder / DATAPARSER_TRANSFORMS
+        with suppress(InvalidViewsError):
+            if path.is_file() and (n < len(own) or similarities([path], None)):
+                found.setdefault(path.resolve(), path)
+    return list(found.values())
 
 
-def similarities(path: Path | None, applied: Float64[np.ndarray, "4 4"] | None) -> tuple[Similarity, ...]:
-    """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have; ``path`` is
-    that of its ``dataparser_transforms.json``."""
+def similarities(paths: Iterable[Path], applied: Float64[np.ndarray, "4 4"] | None) -> tuple[Similarity, ...]:
+    """Return the transforms from a capture's coordinates to others that a scene of nerfstudio may have; ``paths`` are
+    those of its ``dataparser_transforms.json``."""
     found = []
-    if path is not None:
+    for path in paths:
         document = _read(path, _DataparserTransforms)
         matrix = _similarity(document.transform, f"{path}, transform")
         matrix[:3] *= document.scale

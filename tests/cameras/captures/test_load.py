@@ -1,5 +1,6 @@
 """Oracle: small captures written by hand, the README of fox, and independent code for the rules of INRIA and COLMAP."""
 
+import zipfile
 from argparse import Namespace
 from pathlib import Path
 
@@ -259,7 +260,7 @@ def test_a_synthetic_scene_has_the_background_that_it_was_trained_on(tmp_path):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("Namespace(source_path='/no/such/data')", "names no capture that is here: /no/such/data; name the"),
+        ("Namespace(source_path='/no/such/data')", "names no capture that is here: '/no/such/data'; name the"),
         ("Namespace(source_path=open('ran', 'w'))", "names no capture"),
         ("__import__('os').mkdir('ran')", "names no capture"),
         ("Namespace(", "names no capture"),
@@ -274,19 +275,54 @@ def test_arguments_of_inrias_trainer_are_not_evaluated(tmp_path, monkeypatch, te
     assert [path.name for path in tmp_path.iterdir()] == ["cfg_args"]
 
 
+def test_a_folder_of_inrias_trainer_is_packed_as_it_is_loaded(tmp_path):
+    capture(tmp_path / "data", size=(120, 80))
+    capture(tmp_path / "data", photos="sharp", size=(60, 40))
+    (tmp_path / "data/sparse/0/points3D.bin").write_bytes(bytes(8))
+    write_json(tmp_path / "data/dataparser_transforms.json", {"transform": np.eye(4)[:3].tolist(), "scale": 2})
+    run = tmp_path / "run"
+    run.mkdir()
+    write_json(run / "dataparser_transforms.json", {"transform": np.eye(4)[:3].tolist(), "scale": 3})
+    (run / "config.yml").touch()
+    trained(tmp_path / "model", source_path="../data", images="sharp", eval=False)
+    pack_capture(tmp_path / "model", tmp_path / "packed.zip", scene=run / "splat.ply")
+    with zipfile.ZipFile(tmp_path / "packed.zip") as archive:
+        archive.extractall(tmp_path / "unpacked")
+    there, here = load_views(tmp_path / "unpacked", unpacked=True), load_views(tmp_path / "model", scene=run / "s.ply")
+    assert "eval=False" in here.note
+    for found, wanted in zip(there.all, here.all, strict=True):
+        np.testing.assert_array_equal(found.camera.viewmat, wanted.camera.viewmat)
+        np.testing.assert_array_equal(found.load_photo(), wanted.load_photo())
+    assert [each.matrix[0, 0] for each in there.similarities] == [each.matrix[0, 0] for each in here.similarities]
+    assert there.points.read_bytes() == bytes(8)
+    trained(tmp_path / "model", source_path=str(tmp_path / "data"), white_background=True)
+    with pytest.raises(InvalidViewsError, match=r"background .* cannot be sent to a service; compress the scene here"):
+        pack_capture(tmp_path / "model", tmp_path / "packed.zip")
+
+
+def test_a_downloaded_model_names_what_it_lacks(tmp_path):
+    trained(tmp_path, source_path="/no\n/data")
+    (tmp_path / "cameras.json").write_text("[]")
+    assert message(tmp_path) == (
+        f"{tmp_path}/cfg_args names no capture that is here: '/no\\n/data', and its cameras.json, which names no "
+        "photographs, is not read; name the capture's folder with --views"
+    )
+
+
 def test_archives_from_elsewhere_name_no_capture_of_this_machine(tmp_path):
     capture(tmp_path / "data", size=(120, 80))
     trained(tmp_path / "model", source_path=str(tmp_path / "data"))
     assert "has no cameras" in message(tmp_path / "model", unpacked=True)
-    with pytest.raises(InvalidViewsError, match="has no cameras"):
-        pack_capture(tmp_path / "model", tmp_path / "packed.zip")
 
 
 def test_the_capture_of_each_scene(tmp_path):
     for name in ("garden", "bonsai"):
         capture(tmp_path / "data" / name)
     (tmp_path / "data" / "notes").mkdir()
-    found = capture_of(tmp_path / "data", ["", "notes", "garden", "runs", "bonsai"])
+    scene = tmp_path / "bonsai/garden/notes/7/runs.ply"
+    found = capture_of(tmp_path / "data", scene)
     assert found == tmp_path / "data/garden"
-    assert capture_of(found, ["sparse"]) == found, "it has cameras itself"
-    assert capture_of(tmp_path / "data", ["stump"]) == tmp_path / "data"
+    assert capture_of(found, tmp_path / "sparse.ply") == found, "it has cameras itself"
+    assert capture_of(tmp_path / "data/notes", scene) == tmp_path / "data/notes"
+    with pytest.raises(InvalidViewsError, match=r"no cameras, nor .* named 'runs', '7', 'notes', 'x'; name"):
+        capture_of(tmp_path / "data", tmp_path / "bonsai/x/notes/7/runs.ply")
