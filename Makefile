@@ -2,7 +2,7 @@
 # make demo SCENE=x.ply   the same with your own
 # make serve              the service, with its page, on http://127.0.0.1:8000 (KISSGS_PORT=… and others: docs/guide/service.md)
 # make bench              bytes, seconds, memory and quality of all presets and of limited times (SCENE=x.ply for your own)
-# make test               tests of everything, a quarter of an hour (SIXTH=COMMIT: a sixth of the others too)
+# make test               tests of everything, ten minutes (SIXTH=COMMIT: a sixth of the others too)
 # make test-all           the same with all examples, parameters, trainings and faults; three quarters of an hour
 # make lint               format, lint, types, import contract; of the JavaScript, format and types
 # make docs               what is generated in docs/
