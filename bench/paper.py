@@ -252,7 +252,7 @@ def write_results(points: Sequence[Point], published: Sequence[Point], folder: P
     write(text)
     (folder / "tables.md").write_text(text, encoding="utf-8")
     if find_spec("matplotlib") is None:
-        sys.stderr.write("no plots without matplotlib, which is missing: pip install 'kissgs[bench]'\n")
+        sys.stderr.write("no plots without matplotlib, which is missing: pip install matplotlib\n")
         return
     for dataset in dict.fromkeys(point.dataset for point in found):
         ours = [point for point in found if point.dataset == dataset and ": " not in point.series]

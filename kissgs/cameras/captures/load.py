@@ -121,13 +121,7 @@ def load_views(
     white = _is_white(capture, photos or ()) if place.white is None else place.white
     background = np.full(3, float(white), dtype=np.float32)
     limit = DEFAULT_RESOLUTION if resolution is None else resolution
-    views = []
-    for n, posed in enumerate(capture.images):
-        photo = None if photos is None else photos[n]
-        nominal, size = _sizes(posed, photo, scale or 1)
-        file = None if photo is None else photo.path
-        views.append((_view(posed, file, nominal, _reduced(size, limit), background), posed.split))
-    train, test = _split(views, hold_out)
+    train, test = _split(_posed_views(capture, photos, scale or 1, limit, background), hold_out)
     source = capture.source
     if unpacked:  # where it is unpacked is nobody's concern
         source = source.replace(f"{archive}/", "").replace(f"{archive}", "the archive")
@@ -140,6 +134,19 @@ def load_views(
     note = f"no photographs were found (searched {searched}); name their folder with --images"
     note = "the archive has no photographs" if unpacked else note
     return Views(train, test, background, f"{source}, no photographs", note, moves)
+
+
+def _posed_views(
+    capture: Capture, photos: Sequence[FoundPhoto] | None, scale: int, limit: int, background: Float32[np.ndarray, "3"]
+) -> list[tuple[View, str | None]]:
+    """Return the view of each image of a capture, and its split."""
+    views = list[tuple[View, str | None]]()
+    for n, posed in enumerate(capture.images):
+        photo = None if photos is None else photos[n]
+        nominal, size = _sizes(posed, photo, scale)
+        file = None if photo is None else photo.path
+        views.append((_view(posed, file, nominal, _reduced(size, limit), background), posed.split))
+    return views
 
 
 def as_views(views: Views | str | PathLike[str] | None, scene: Path | None = None) -> Views | None:
