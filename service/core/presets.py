@@ -30,10 +30,10 @@ class _Facts:
 
 _FACTS: dict[kissgs.Preset, _Facts] = {
     kissgs.Preset.FAST: _Facts(
-        "Fast", "Takes seconds; for previews and quick checks.", 13.02, -0.37, 13, (1, 15), (50, 300)
+        "Fast", "Takes seconds; for previews and quick checks.", 13.01, -0.37, 13, (1, 15), (50, 300)
     ),
     kissgs.Preset.BALANCED: _Facts(
-        "Balanced", "The best quality for its size. The default.", 11.90, -0.28, 205, (300, 600), (50, 1300)
+        "Balanced", "The best quality for its size. The default.", 11.88, -0.28, 205, (300, 600), (50, 1300)
     ),
     kissgs.Preset.PAPER: _Facts(
         "Paper", "The method of the KISS-GS paper, for comparison.", 16.72, -0.39, 260, (700, 2000), (1000, 40_000)
