@@ -83,7 +83,7 @@ def test_a_running_job_and_its_cancellation(start):
     begun = time.monotonic()
     for _ in range(20):
         service.status(job)
-    assert time.monotonic() - begun < 20 * 0.1
+    assert time.monotonic() - begun < 20 * 0.5
     for name in ("result", "report", "decoded", "source", "files/meta.json"):
         answer = service.http.get(f"/v1/jobs/{job['id']}/{name}")
         assert problem(answer, 409, "not-finished")["retryable"]
