@@ -17,8 +17,7 @@ from kissgs.core.context import Context
 from kissgs.core.resources import blas_workers
 from kissgs.core.splats import Splats
 from kissgs.io.images import compress_images
-from kissgs.planning.encoding_plan import EncodingPlan
-from kissgs.planning.planner import plan_encoding
+from kissgs.planning.planner import EncodingPlan, plan_encoding
 from kissgs.planning.quantize import MEANS_TOP, Quantized, quantize
 from kissgs.planning.rotation_forms import apply_forms, pras_forms
 from kissgs.planning.sh_codebook import PAPER_TOP

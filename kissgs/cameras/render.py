@@ -9,21 +9,19 @@ import numpy as np
 
 from kissgs.cameras.captures.transforms_json import is_camera_file, pick_view, view_of_file
 from kissgs.cameras.views import Vec3, View, Views, check_images
-from kissgs.cameras.virtual.candidates import (
+from kissgs.cameras.virtual.select import (
     FIELD_OF_VIEW,
+    SCORE_MARGIN,
     SceneBounds,
+    ScoredCandidates,
+    best_view,
     direction_at,
     horizontal_axes,
     opacity,
-    weighted_quantiles,
-)
-from kissgs.cameras.virtual.select import (
-    SCORE_MARGIN,
-    ScoredCandidates,
-    best_view,
     overview_bonus,
     score_candidates,
     virtual_views,
+    weighted_quantiles,
 )
 from kissgs.core.array_types import Bool, Float64, Int, UInt8
 from kissgs.core.context import DEFAULT_CONTEXT, Context, load_kernels

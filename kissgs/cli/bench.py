@@ -47,7 +47,7 @@ def warmup() -> None:
     """Compile and cache all kernels, and measure the speed of this machine, by which --time chooses what to do."""
     from kissgs.compaction import merging  # noqa: F401
     from kissgs.core import numba_kernels
-    from kissgs.planning import kernels, kmeans_kernels, rdo_kernels  # noqa: F401
+    from kissgs.planning import kernels, kmeans_kernels  # noqa: F401
     from kissgs.rendering import ssim_kernels  # noqa: F401
     from kissgs.rendering.cpu import frame, neighbours  # noqa: F401
 

@@ -180,7 +180,7 @@ def compress(
     """Compress each scene into a SOG-XT container, into SOG, or into a folder with levels of detail."""
     from kissgs.cli import compress_scenes
     from kissgs.formats import ending_of, named_container, named_manifest
-    from kissgs.pipeline.choice import resolved
+    from kissgs.pipeline.limited_time import resolved
 
     manifest = None if output is None else named_manifest(Path(output))
     kind = named_container(encoding.container, None if manifest or output == "-" else output)

@@ -30,7 +30,7 @@ from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 from kissgs.formats import ContainerName
 from kissgs.io.files import move_into_place, open_scene_file, reason_of
 from kissgs.io.scene_format import ReadOptions
-from kissgs.pipeline.choice import resolved
+from kissgs.pipeline.limited_time import resolved
 from kissgs.pipeline.pipeline import Compressed, compress
 from kissgs.pipeline.scene_files import scene_root
 from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of

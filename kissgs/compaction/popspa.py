@@ -14,7 +14,7 @@ import numpy as np
 
 from kissgs._version import __version__
 from kissgs.cameras.captures.photos import open_file
-from kissgs.cameras.virtual.candidates import scene_bounds
+from kissgs.cameras.virtual.select import scene_bounds
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
 from kissgs.compaction.scoring import prune_by_score
 from kissgs.core.array_types import Float32, Int

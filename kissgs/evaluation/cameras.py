@@ -25,8 +25,7 @@ from kissgs.evaluation.scene_parts import (
 )
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.constants import NEAR
-from kissgs.rendering.cpu.frame import draw
-from kissgs.rendering.rasterizer import drawn_opacities
+from kissgs.rendering.cpu.frame import draw, drawn_opacities
 
 BACKGROUNDS = (0.0, 0.5, 1.0)  # grey levels, in turn: on black, missing parts of a dark scene would not show
 FIELDS_OF_VIEW = np.radians((50.0, 90.0))  # smallest and largest, along the longer side, radians

@@ -24,8 +24,9 @@ from kissgs.evaluation.cameras import evaluation_views, farther
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, PatchChanges, Split, ViewComparison
 from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import Camera
+from kissgs.rendering.cpu.frame import drawn_opacities
 from kissgs.rendering.metrics import Flip, Lpips, ms_ssim, psnr, ssim_with_patches
-from kissgs.rendering.rasterizer import drawn_opacities, render
+from kissgs.rendering.rasterizer import render
 
 # Whether a capture belongs to a scene: renderings are compared with some photographs, since a capture of another scene,
 # or one whose cameras have other coordinates, would let an encoder remove what matters.

@@ -12,7 +12,6 @@ import numpy as np
 from kissgs.cameras.views import View
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.positions import WORLD, Origin
-from kissgs.rendering.metrics import PATCH
 
 
 def format_metric(value: float, digits: int, *, signed: bool = False) -> str:
@@ -53,6 +52,8 @@ class Detail:
 
 def detail_text(detail: Detail, against: str) -> str:
     """Return the changes of SSIM in patches, to "photos" or to "renderings" of the reference, as text."""
+    from kissgs.rendering.metrics import PATCH  # only for its size
+
     return (
         f"SSIM to {'photographs' if against == 'photos' else 'the reference'} in patches of {PATCH}x{PATCH} pixels: "
         f"{format_metric(detail.worst_percent, 4, signed=True)} in the worst 1 %, "

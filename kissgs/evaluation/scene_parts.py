@@ -12,9 +12,8 @@ from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.io.conventions import spread_bits
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.cpu.frame import color_gradients, draw, sums_of_slots
+from kissgs.rendering.cpu.frame import color_gradients, draw, drawn_opacities, sums_of_slots
 from kissgs.rendering.cpu.records import Frame
-from kissgs.rendering.rasterizer import drawn_opacities
 
 MORTON_BITS = 21  # bits per axis of a Morton code: as many as 64 bits hold
 NEIGHBOURS = 64  # number of Gaussians, consecutive in Morton order, that form a neighbourhood

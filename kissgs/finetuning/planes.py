@@ -17,7 +17,7 @@ from kissgs.core.context import Device
 from kissgs.core.numba_kernels import compiled
 from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.planner import EncodingPlan
 from kissgs.planning.quantize import MEANS_TOP, SIZE, ByteTables, Quantized, short_values, table_field
 from kissgs.planning.rd_fields import CAPTURED
 from kissgs.planning.sh_codebook import COEFFICIENTS

@@ -18,11 +18,10 @@ from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.finetuning.planes import Ctx, Plane, each_part, level_bits, planes_of, sum_by_label
 from kissgs.planning import rotation_forms
-from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import Grid
+from kissgs.planning.planner import EncodingPlan
 from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel, Quantized, half_steps, quantize
-from kissgs.planning.rd_criterion import Costs
-from kissgs.planning.rd_fields import UNUSED_COUNT, decoded_quats
+from kissgs.planning.rd_fields import UNUSED_COUNT, Costs, decoded_quats
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.rendering.differentiable import Parameters
 from kissgs.training.loop import Regularizer
@@ -117,7 +116,7 @@ class _LookUp(torch.autograd.Function):
 # across the boundary and may end at the worse level. So a quadratic term attracts each latent to its current level,
 # with the curvature that the loss has there. The latent converges to the result of one Newton step from the level,
 # ``level - gradient / curvature``, which is the same point from both levels, and is rounded to the nearer one. The
-# curvature follows from the costs of errors (:class:`kissgs.planning.rd_criterion.Costs`).
+# curvature follows from the costs of errors (:class:`kissgs.planning.rd_fields.Costs`).
 
 ATTRIBUTE_FIELDS = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}  # without transformation
 REFORMED = ("quaternions", "scales")  # fields that another form of a Gaussian changes

@@ -23,10 +23,9 @@ from kissgs.finetuning.planes import FIELDS, TABLES
 from kissgs.finetuning.quantized_scene import QuantizedScene, RateLoss, TotalVariationLoss, table_name
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.io.scene_format import ReadOptions
-from kissgs.planning.encoding_plan import Encoded, EncodingPlan
+from kissgs.planning.planner import Encoded, EncodingPlan, implied_lambda
 from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
-from kissgs.planning.rate_distortion import implied_lambda
-from kissgs.planning.rd_criterion import Costs
+from kissgs.planning.rd_fields import Costs
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import FinetuneSettings
 from kissgs.sogxt.container import zip_bytes

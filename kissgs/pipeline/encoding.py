@@ -22,18 +22,14 @@ from kissgs.core.splats import ATTRIBUTES, NOTHING_CLEANED, Cleaned, Splats
 from kissgs.formats import ContainerName
 from kissgs.io.files import atomic_file, reason_of, refuse_existing
 from kissgs.pipeline.goal import Container
-from kissgs.planning.encoding_plan import Encoded, EncodingPlan
-from kissgs.planning.planner import plan_encoding, refine_order
+from kissgs.planning.planner import ColorRefit, Encoded, EncodingPlan, plan_encoding, refine_order
 from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
-from kissgs.planning.rate_distortion import ColorRefit
 from kissgs.rendering.rasterizer import need_cuda
 from kissgs.settings import EncodeSettings, FinetuneSettings, Settings
 from kissgs.sog import encode as sog
-from kissgs.sog.decode import decode as decode_sog
 from kissgs.sog.encode import SOG
 from kissgs.sogxt import encode as sogxt
 from kissgs.sogxt.container import FILES as SOGXT_FILES
-from kissgs.sogxt.decode import decode as decode_sogxt
 
 if TYPE_CHECKING:
     from kissgs.compaction.popspa import Popspa
@@ -45,7 +41,6 @@ if TYPE_CHECKING:
 # The containers that ``compress`` writes: what each can hold, and how its files are made.
 
 MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}  # for the planner
-DECODERS = {"sogxt": decode_sogxt, "sog": decode_sog}  # decoder of each container
 FILES = frozenset({*SOGXT_FILES, *sog.FILES})  # a folder with no others may be replaced by a container
 
 
@@ -223,6 +218,8 @@ def _pruned_for_finetune(settings: EncodeSettings, finetune: FinetuneSettings) -
 def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: Popspa | None = None) -> Tuner:
     """Return what fine-tunes the levels, with the images of a compaction if the settings would choose the same."""
     from kissgs.finetuning.tune import Tuner
+    from kissgs.sog.decode import decode as decode_sog
+    from kissgs.sogxt.decode import decode as decode_sogxt
     from kissgs.training.supervision import supervision_views, training_targets
 
     settings = settings or work.settings.finetune
@@ -233,7 +230,7 @@ def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: 
     else:
         supervision = supervision_views(work.original, work.views, settings, work.context, scoring_stride=0)
         targets = training_targets(work.original, supervision, work.context)
-    model, decode = MODELS[work.container], DECODERS[work.container]
+    model, decode = MODELS[work.container], decode_sog if work.container == "sog" else decode_sogxt
     return Tuner(work.original, settings, supervision, targets, work.context, model, decode)
 
 

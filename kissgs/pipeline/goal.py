@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from kissgs.compaction.result import Compacted
     from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
-    from kissgs.planning.encoding_plan import Encoded
+    from kissgs.planning.planner import Encoded
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

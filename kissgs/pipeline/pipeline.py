@@ -17,13 +17,11 @@ from kissgs.core.resources import peak_memory, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Cleaned, Splats, empty_splats
 from kissgs.evaluation.results import Evaluation
-from kissgs.finetuning.result import FinetuneReport
 from kissgs.formats import ContainerName, named_container
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.choice import choose, resolved
 from kissgs.pipeline.encoding import FILES, Work, check_finetuning, encode, make_tuner, measure, plan, write
 from kissgs.pipeline.goal import Attempt
-from kissgs.pipeline.limited_time import Expected
+from kissgs.pipeline.limited_time import Expected, choose, resolved
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
 from kissgs.settings import GOALS, EncodeSettings, Settings
 from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
@@ -31,6 +29,7 @@ from kissgs.training.checkpoint import delete_checkpoints, finetune_checkpoint_p
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
+    from kissgs.finetuning.result import FinetuneReport
     from kissgs.pipeline.goal import Container
 
 

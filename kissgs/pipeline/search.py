@@ -19,7 +19,6 @@ from kissgs.core.context import Context, SearchNote, ignore_stop_search
 from kissgs.core.errors import InvalidViewsError, StopSearch, UnsupportedError
 from kissgs.core.splats import Splats
 from kissgs.evaluation.results import ESTIMATED_DROP, Evaluation, drop_of
-from kissgs.finetuning.result import FinetuneReport
 from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline import curves
 from kissgs.pipeline.curves import LambdaCurve, NoFurtherError, at_lambda, count_at, last_number
@@ -31,6 +30,7 @@ from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
+    from kissgs.finetuning.result import FinetuneReport
     from kissgs.finetuning.tune import Tuner
 
 MAX_OFFSET_DB = 30.0  # largest value of the setting quality_offset_db

@@ -4,18 +4,161 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, Int32, UInt16
 from kissgs.core.resources import Workers
-from kissgs.planning.clustering import BLOCK, Clustering, Vectors, sorted_by_label
 from kissgs.planning.quantize import clip_outliers, for_each_block
 from kissgs.settings import EncodeSettings
 
-if TYPE_CHECKING:
-    from kissgs.planning.clustering import ShMetric
+# Comparing every vector with every centroid takes too long for a million vectors and 65,536 centroids. Three methods
+# from the literature replace it:
+#
+# - The start is hierarchical: vectors are split among cells, cells among smaller cells, and each of these gets
+#   centroids in proportion to sqrt(its error × its count).
+# - A vector then moves only to one of the centroids nearest to its present one (k²-means: Agustsson, Timofte and Van
+#   Gool, CVPR 2017). The lists of near centroids are made from the cells, and searched again as the centroids move.
+# - Between two such iterations, pairs of similar clusters are merged and spread-out clusters are split, as long as that
+#   lowers the error (iterative splitting and merging: Kaukoranta, Fränti and Nevalainen, Optical Engineering 37, 1998).
+#   Plain k-means cannot move a centroid from where it is useless to where it is needed; with this step the error ends
+#   below that of an exhaustive search.
+#
+# Vectors are read where they are, by their index; beside them the clustering needs some 20 bytes for each and some 600
+# for each centroid. Sums run in a fixed order in float64, each cluster belongs to one task, and all random numbers come
+# from one seed: the result does not depend on the number of threads.
+
+BLOCK = 1024  # vectors per matrix product: its result, against some hundred centroids, stays in the processor's cache
+SEARCHED = 4  # number of near centroids of a centroid whose own near ones are searched for nearer ones
+PARTNERS = 24  # number of near centroids, the nearest, with whose clusters a cluster may merge
+TASKS = 64  # number of tasks of an iteration: more than threads, since others may use the processor too
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vectors:
+    """The vectors to cluster, as rows of a table, and their weights."""
+
+    table: Float32[np.ndarray, "R D"]
+    rows: Int[np.ndarray, " N"]
+    weights: Float32[np.ndarray, " N"]
+
+    def take(self, members: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M D"]:
+        """Return a copy of some of the vectors."""
+        return self.table[self.rows[members]]
+
+    def mean_and_rms(self, pool: Workers) -> tuple[Float32[np.ndarray, " D"], float]:
+        """Return the weighted mean, and the weighted root mean square distance to it per dimension."""
+        start = self.table[self.rows[0]]
+
+        def moments(first: int) -> Float64[np.ndarray, "2 D"]:
+            block = slice(first, first + BLOCK)
+            steps, weights = self.table[self.rows[block]].astype(np.float64) - start, self.weights[block]
+            return np.stack([weights @ steps, weights @ np.square(steps)])
+
+        first, second = sum(pool.map(moments, range(0, len(self.rows), BLOCK))) / self.weights.sum(dtype=np.float64)
+        return (start + first).astype(np.float32), float(np.maximum(second - np.square(first), 0).mean()) ** 0.5
+
+
+@dataclass(slots=True, eq=False)
+class Clustering:
+    """A clustering that is being improved."""
+
+    data: Vectors
+    centroids: Float32[np.ndarray, "K D"]
+    labels: Int32[np.ndarray, " N"]  # centroid of each vector
+    distances: Float32[np.ndarray, " N"]  # squared distance of each vector to its centroid when it was last assigned
+    near: UInt16[np.ndarray, "K k"]  # near centroids of each centroid, itself first
+    members: Int32[np.ndarray, " N"]  # vectors sorted by label
+    edges: Int[np.ndarray, " edges"]  # where each cluster's members begin
+    totals: Float64[np.ndarray, " K"]  # sum of the weights of each cluster
+    errors: Float64[np.ndarray, " K"]  # weighted error of each cluster when its vectors were last assigned
+
+    def update(self, pool: Workers) -> None:
+        """Move every centroid to the weighted mean of its vectors; one without vectors stays."""
+        from kissgs.planning import kmeans_kernels as kernels
+
+        self.sort_members()
+        arrays = self._arrays()
+        pool.map(lambda part: kernels.means(*arrays, *part, self.centroids, self.totals, self.errors), self.parts())
+
+    def sort_members(self) -> None:
+        """Sort the vectors by label again, after labels have changed."""
+        self.members, self.edges = sorted_by_label(self.labels, len(self.centroids))
+
+    def reassign(self, pool: Workers) -> None:
+        """Assign every vector to the nearest of the centroids near its present one."""
+        from kissgs.planning import kmeans_kernels as kernels
+
+        arrays = self.data.table, self.data.rows, self.members, self.edges, self.centroids, self.near
+        pool.map(lambda part: kernels.assign_near(*arrays, *part, self.labels, self.distances), self.parts())
+
+    def refresh_near(self, pool: Workers) -> None:
+        """Find the near centroids again, which have moved, among the near ones of the nearest so far."""
+        from kissgs.planning import kmeans_kernels as kernels
+
+        found = np.empty_like(self.near)
+        pool.map(lambda part: kernels.find_near(self.centroids, self.near, SEARCHED, *part, found), self.parts())
+        self.near = found
+
+    def relocate(self, pool: Workers) -> None:
+        """Merge pairs of clusters and split others as long as the error shrinks, each cluster once at most. Only labels
+        and lists of near centroids change; :meth:`update` then finds the centroids."""
+        from kissgs.planning import kmeans_kernels as kernels
+
+        arrays, count = self._arrays(), len(self.centroids)
+        nearest = np.ascontiguousarray(self.near[:, :PARTNERS])
+        partners, costs, gains = np.empty(count, np.int32), np.empty(count), np.zeros(count)
+        second = np.zeros(len(self.labels), dtype=np.bool_)
+
+        most = max(count // 2, 1)
+        least = np.partition(self.errors, count - most)[count - most]
+
+        def work(part: tuple[int, int]) -> None:
+            kernels.merge_costs(self.centroids, self.totals, nearest, *part, partners, costs)
+            kernels.split_gains(*arrays, self.centroids, self.totals, self.errors, least, *part, second, gains)
+
+        pool.map(work, self.parts())
+        merged = np.argsort(costs, kind="stable")[:most].astype(np.int32)
+        split = np.argsort(-gains, kind="stable")[:most].astype(np.int32)
+        kernels.relocate(
+            merged, split, partners, costs, gains, second, self.members, self.edges, self.labels, self.near
+        )
+
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the vectors, their distances, and the members of each cluster, as kernels take them."""
+        data = self.data
+        return data.table, data.rows, data.weights, self.distances, self.members, self.edges
+
+    def parts(self) -> list[tuple[int, int]]:
+        """Return ranges of clusters with about equal numbers of vectors."""
+        wanted = np.linspace(0, self.edges[-1], TASKS + 1)
+        cuts = np.unique(np.concatenate([[0], np.searchsorted(self.edges, wanted[1:-1]), [len(self.edges) - 1]]))
+        return [(int(a), int(b)) for a, b in pairwise(cuts)]
+
+
+@runtime_checkable
+class Metric(Protocol):
+    """Errors by which vectors are compared, instead of squared distances."""
+
+    def reassign(self, state: Clustering, pool: Workers) -> None:
+        """Assign every vector to the one of the centroids near its present one at which its error is smallest."""
+
+    def move_centroids(self, state: Clustering, pool: Workers) -> None:
+        """Move every centroid to where its vectors' error is smallest; one without vectors stays."""
+
+
+def sorted_by_label(
+    labels: Int32[np.ndarray, " N"], count: int
+) -> tuple[Int32[np.ndarray, " N"], Int[np.ndarray, " edges"]]:
+    """Return the numbers of the vectors sorted by label, and where those of each label begin."""
+    from kissgs.planning import kmeans_kernels as kernels
+
+    edges = np.concatenate([[0], np.cumsum(np.bincount(labels, minlength=count))])
+    members = np.empty(len(labels), dtype=np.int32)
+    kernels.sort_by_label(labels, edges[:-1].copy(), members)
+    return members, edges
 
 
 # The hierarchical start of the k-means: cells, smaller cells, centroids, and the near ones of each centroid.
@@ -157,22 +300,6 @@ def near_centroids(
     return near
 
 
-# Comparing every vector with every centroid takes too long for a million vectors and 65,536 centroids. Three methods
-# from the literature replace it:
-#
-# - The start is hierarchical: vectors are split among cells, cells among smaller cells, and each of these gets
-#   centroids in proportion to sqrt(its error × its count).
-# - A vector then moves only to one of the centroids nearest to its present one (k²-means: Agustsson, Timofte and Van
-#   Gool, CVPR 2017). The lists of near centroids are made from the cells, and searched again as the centroids move.
-# - Between two such iterations, pairs of similar clusters are merged and spread-out clusters are split, as long as that
-#   lowers the error (iterative splitting and merging: Kaukoranta, Fränti and Nevalainen, Optical Engineering 37, 1998).
-#   Plain k-means cannot move a centroid from where it is useless to where it is needed; with this step the error ends
-#   below that of an exhaustive search.
-#
-# Vectors are read where they are, by their index; beside them the clustering needs some 20 bytes for each and some 600
-# for each centroid. Sums run in a fixed order in float64, each cluster belongs to one task, and all random numbers come
-# from one seed: the result does not depend on the number of threads.
-
 METRIC_ITERATIONS = 3  # iterations under a metric, after those of the Euclidean distance
 OUTLIERS = 1e-3  # share of entries at either end of a dimension that may be clipped, for a smaller step
 
@@ -196,7 +323,7 @@ def fit(
     *,
     lattice: float,
     from_zero: bool = False,
-    metric: ShMetric | None = None,
+    metric: Metric | None = None,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Clusters:
     """Find at most ``size`` centroids of small weighted squared error. They are rounded to steps of ``lattice`` times
@@ -246,7 +373,7 @@ def fit(
     return Clusters(state.centroids[used], compact[state.labels], step)
 
 
-def _mean_square_error(state: Clustering, metric: ShMetric | None, pool: Workers) -> float:
+def _mean_square_error(state: Clustering, metric: Metric | None, pool: Workers) -> float:
     """Return the weighted mean square distance of the vectors to their centroids, per dimension."""
     data = state.data
     if metric is None:  # as they were last assigned

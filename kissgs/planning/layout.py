@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from math import isqrt
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float32, Int, Int32, Integer, UInt16
+from kissgs.core.array_types import Bool, Float32, Int, Int32, Integer, UInt8, UInt16
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.resources import Workers
 from kissgs.core.splats import MAX_GRID_SIDE
@@ -253,3 +254,94 @@ def hilbert_order(
 
     for_each_block(count, work, pool)
     return sorted_order(keys, CURVE_BITS if classes is None else 64)
+
+
+# Order along the Hilbert curve, refined by the local search of the travelling-salesman problem (2-opt and Or-opt).
+#
+# WebP codes the differences of a pixel from the one on its left, which then take fewer bits for what resembles that of
+# neighbours: high bytes of positions and base colours.
+
+REORDERED, SMALLEST = 1 << 13, 64  # Gaussians reordered together; fewer have too few differences to count
+ROUNDS, PASSES = 2, 2  # rounds of counting bits, in blocks that begin elsewhere, and most passes in each
+NEAR, REACH = 8, 16  # Gaussians that each may be joined to, and places on the curves where they are found
+CURVES = ((0, 1, 2, 0), (1, 2, 0, 21845), (2, 0, 1, 43690))  # axes and shift: where one has a gap, another has none
+SMOOTHING = ((-2, 1 / 9), (-1, 2 / 9), (0, 3 / 9), (1, 2 / 9), (2, 1 / 9))  # average of counts: shifts, weights
+UNIT = 256  # fractions of a bit that the local search counts in, so that no rounding of a machine changes the order
+
+
+def refined_order(
+    means: UInt16[np.ndarray, "M 3"],
+    colors: UInt8[np.ndarray, "M 3"],
+    runs: Integer[np.ndarray, " M"],
+    pool: Workers,
+    report: Callable[[float], None] = lambda fraction: None,
+) -> Int32[np.ndarray, " M"]:
+    """Return the index of the Gaussian for every place. Gaussians at the same position keep their order, because
+    renderers blend them in it. The first and the last Gaussian of a run stay."""
+    pixels, order = _pixels(means, colors), np.arange(len(means), dtype=np.int32)
+    ends = np.concatenate([np.flatnonzero(np.diff(runs)) + 1, [len(runs)]]).tolist()
+
+    def refine(places: slice) -> None:
+        chosen = order[places]
+        order[places] = chosen[_block_order(means[chosen], pixels[chosen])]
+
+    for done in range(ROUNDS):
+
+        def report_done(fraction: float, done: int = done) -> None:
+            report((done + fraction) / ROUNDS)
+
+        pool.map(refine, _blocks(ends, REORDERED if done % 2 == 0 else REORDERED // 2), report_done)
+    return _with_equal_positions_in_order(order, means)
+
+
+def _pixels(means: UInt16[np.ndarray, "M 3"], colors: UInt8[np.ndarray, "M 3"]) -> UInt8[np.ndarray, "M 6"]:
+    """Return what WebP predicts from the left: high bytes of positions; green, and red and blue without it."""
+    red, green, blue = colors.T
+    return np.ascontiguousarray(np.column_stack([(means >> 8).astype(np.uint8), green, red - green, blue - green]))
+
+
+def _blocks(ends: list[int], first_size: int) -> list[slice]:
+    """Return blocks of runs with these ends: in each run, one of at most ``first_size`` places, then larger ones. What
+    is left of a run may be too small to count differences in, and is no block."""
+    blocks = []
+    for start, end in pairwise([0, *ends]):
+        edges = [start, *range(start + first_size, end, REORDERED), end]
+        blocks += [slice(a, b) for a, b in pairwise(edges) if b - a >= SMALLEST]
+    return blocks
+
+
+def _block_order(means: UInt16[np.ndarray, "B 3"], pixels: UInt8[np.ndarray, "B 6"]) -> Int32[np.ndarray, " B"]:
+    """Return the refined order of some Gaussians, of which the first and the last stay."""
+    from kissgs.planning import kernels
+
+    order = np.arange(len(means), dtype=np.int32)
+    bits = _difference_bits(pixels)
+    curves = np.stack([hilbert_order(means[:, axes] + np.uint16(shift)) for *axes, shift in CURVES])
+    near = np.empty((len(means), NEAR), np.int32)
+    kernels.near_pixels(pixels, bits, curves, REACH, near)
+    kernels.improve(pixels, bits, near, PASSES, order)
+    return order
+
+
+def _difference_bits(pixels: UInt8[np.ndarray, "B C"]) -> Int32[np.ndarray, "C 256"]:
+    """Return the bits of each difference of a channel from the pixel before, modulo 256, by how often it occurs. The
+    counts of differences that are alike are averaged. A difference and its negative take the same bits."""
+    counts = np.stack([np.bincount(channel, minlength=256) for channel in np.diff(pixels, axis=0).T]).astype(np.float64)
+    counts += counts[:, -np.arange(256)]
+    counts = (counts + sum(weight * np.roll(counts, shift, axis=1) for shift, weight in SMOOTHING)) / 2 + 1
+    return np.rint(UNIT * np.log2(counts.sum(axis=1, keepdims=True) / counts)).astype(np.int32)
+
+
+def _with_equal_positions_in_order(
+    order: Int32[np.ndarray, " M"], means: UInt16[np.ndarray, "M 3"]
+) -> Int32[np.ndarray, " M"]:
+    """Return an order in which Gaussians of equal position have ascending indices."""
+    x, y, z = means[order].T
+    keys = x | y.astype(np.uint64) << np.uint64(16) | z.astype(np.uint64) << np.uint64(32)
+    places = sorted_order(keys, 48)
+    group = np.cumsum(np.diff(keys, prepend=keys[:1]) > 0)
+    shared = np.bincount(group, minlength=1)[group] > 1
+    places, group = places[shared], group[shared]
+    order = order.copy()
+    order[places] = order[places][np.lexsort((order[places], group))]
+    return order

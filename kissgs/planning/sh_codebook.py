@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Int
+from kissgs.core.array_types import Float32, Float64, Int, Int32
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, SH_REST_COUNTS, Splats
 from kissgs.planning import kmeans
-from kissgs.planning.clustering import ShMetric
+from kissgs.planning.kmeans import BLOCK, Clustering
 from kissgs.planning.layout import axes_order, plas, principal_axes
 from kissgs.planning.quantize import Planning, Quantized, fit_table, half_steps, nearest_levels, quantize, table_field
 from kissgs.settings import EncodeSettings
@@ -199,3 +199,127 @@ def codebook_error_model(
     share = sensitivity.color_weight[some].astype(np.float64)
     weighted = float(seen @ share / max(share.sum(), 1e-300) * colors)
     return CodebookErrorModel(entries, weighted, float(squared.mean() * colors))
+
+
+# ``ShMetric``: errors of view-dependent colour, measured in the directions from which cameras see each Gaussian.
+
+# Weight of all directions alike, beside those from which cameras see a Gaussian; both add up to 1. It grows with the
+# view uncertainty, since that shrinks the measured means, and is 1 for Gaussians that no capture has seen.
+UNIFORM_WEIGHT = 0.3
+NEIGHBORS = 32  # number of codebook entries, the nearest to a Gaussian's present one, that are compared
+SPHERE = 4 * np.pi  # area of the unit sphere: a form is the identity where all directions count alike
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShMetric:
+    """Quadratic forms of the errors of shN, one per Gaussian, after base colours have compensated the mean error. The
+    colour error in direction d is that of shN times the harmonics at d. Its mean square over the directions from which
+    a Gaussian is seen, less the square of its mean, which the base colour takes up, is a form of the covariance of the
+    harmonics. Products of harmonics are sums of harmonics of up to twice the degree, so the means of these give all
+    covariances. What the base colour's change costs in all other directions is left out: counting it made images worse,
+    those of the capture and those from elsewhere."""
+
+    sensitivity: Sensitivity  # with the means of harmonics to twice the scene's degree
+    degree: int
+
+    @classmethod
+    def of(cls, sensitivity: Sensitivity, degree: int) -> ShMetric | None:
+        """Return the metric of a sensitivity that knows directions of view; None for others."""
+        return cls(sensitivity, degree) if sensitivity.higher_harmonics.shape[1] > 0 else None
+
+    def quadratic_forms(self, rows: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n K K"]:
+        """Return the forms of some Gaussians: positive definite, the identity where all directions count alike."""
+        means, higher = (
+            values.take(rows, axis=0) for values in (self.sensitivity.mean_harmonics, self.sensitivity.higher_harmonics)
+        )
+        number = means.shape[1]
+        known = np.float32(SPHERE * (1 - UNIFORM_WEIGHT)) * self.sensitivity.captured.take(rows)[:, None, None]
+        form = (np.concatenate([means, higher], axis=1) @ _products(self.degree)).reshape(-1, number, number)
+        form -= means[:, :, None] * means[:, None, :]
+        form *= known
+        diagonal = np.arange(number)
+        form[:, diagonal, diagonal] += 1
+        return form
+
+    def errors(self, vectors: Float32[np.ndarray, "n D"], rows: Int[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+        """Return the squared errors of shN under the forms of these Gaussians; ``vectors`` are the differences."""
+        found = np.empty(len(vectors))
+        for first in range(0, len(vectors), BLOCK):
+            block = slice(first, first + BLOCK)
+            some = vectors[block].reshape(-1, self.coefficients, 3)
+            found[block] = np.einsum("nkc,nkc->n", some, self.quadratic_forms(rows[block]) @ some, dtype=np.float64)
+        return found
+
+    @property
+    def coefficients(self) -> int:
+        """Number of coefficients of shN per colour channel."""
+        return (self.degree + 1) ** 2 - 1
+
+    def move_centroids(self, state: Clustering, pool: Workers) -> None:
+        """Move every centroid to where its vectors' error is smallest; one without vectors stays."""
+        data, number = state.data, self.coefficients
+
+        def work(part: tuple[int, int]) -> None:
+            first, last = part
+            counts = np.diff(state.edges[first : last + 1])
+            left, right = np.zeros((last - first, number, number)), np.zeros((last - first, number, 3))
+            for members, _ in _blocks(state, part):
+                vectors = data.take(members).reshape(-1, number, 3)
+                forms = self.quadratic_forms(data.rows[members]) * data.weights[members, None, None]
+                clusters, starts = np.unique(state.labels[members] - first, return_index=True)
+                left[clusters] += np.add.reduceat(forms, starts, axis=0, dtype=np.float64)
+                right[clusters] += np.add.reduceat(forms @ vectors, starts, axis=0, dtype=np.float64)
+            several, single = np.flatnonzero(counts > 1), np.flatnonzero(counts == 1)
+            moved = np.linalg.solve(left[several], right[several])
+            state.centroids[first + several] = moved.reshape(-1, 3 * number)
+            state.centroids[first + single] = data.take(state.members[state.edges[first + single]])
+
+        pool.map(work, state.parts())
+
+    def reassign(self, state: Clustering, pool: Workers) -> None:
+        """Assign every vector to the one of the centroids near its present one at which its error is smallest."""
+        from kissgs.planning import kmeans_kernels as kernels
+
+        data, number = state.data, self.coefficients
+        near = np.ascontiguousarray(state.near[:, :NEIGHBORS])
+        upper = np.triu_indices(number)
+
+        def work(part: tuple[int, int]) -> None:
+            for members, edges in _blocks(state, part):
+                forms = self.quadratic_forms(data.rows[members])
+                products = forms @ data.take(members).reshape(-1, number, 3)
+                rows = np.concatenate([forms[:, *upper], products.reshape(len(members), -1)], axis=1)
+                kernels.assign_by_form(rows, members, edges, state.centroids, near, part[0], state.labels)
+
+        pool.map(work, state.parts())
+        state.sort_members()
+
+
+def _blocks(
+    state: Clustering, part: tuple[int, int]
+) -> Iterator[tuple[Int32[np.ndarray, " n"], Int[np.ndarray, " edges"]]]:
+    """Yield the vectors of a range of clusters in blocks, sorted by cluster, and where each cluster's begin in a block.
+    A form takes a kilobyte, and a single cluster may have most of the vectors."""
+    edges = state.edges[part[0] : part[1] + 1]
+    for first in range(int(edges[0]), int(edges[-1]), BLOCK):
+        last = min(first + BLOCK, int(edges[-1]))
+        yield state.members[first:last], np.clip(edges, first, last) - first
+
+
+@cache
+def _products(degree: int) -> Float32[np.ndarray, "J P"]:
+    """Return the products of all pairs of harmonics to ``degree`` as sums of the harmonics to twice the degree. Column
+    a · K + b has the coefficients of the product of harmonics a + 1 and b + 1, without the constant one: that is 1 /
+    SPHERE for a = b, and 0 else."""
+    from kissgs.core.harmonics_kernel import write_harmonics_of
+
+    number, count = (degree + 1) ** 2 - 1, (2 * degree + 1) ** 2 - 1
+    points = 4 * count
+    height = 1 - (2 * np.arange(points) + 1) / points
+    turn, radius = np.pi * (3 - 5**0.5) * np.arange(points), np.sqrt(1 - height**2)
+    values = np.empty((points, count))
+    directions = np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
+    write_harmonics_of(directions, 2 * degree, values)
+    pairs = (values[:, :number, None] * values[:, None, :number]).reshape(points, -1)
+    with_constant = np.concatenate([np.ones((points, 1)), values], axis=1)
+    return np.linalg.lstsq(with_constant, pairs, rcond=None)[0][1:].astype(np.float32)

@@ -156,12 +156,6 @@ def render(
     return frame.image, 1 - frame.transmittance
 
 
-def drawn_opacities(splats: Splats) -> Float64[np.ndarray, " N"]:
-    """Return opacities from 0 to 1; 0 for Gaussians that no renderer draws."""
-    opacities = 1 / (1 + np.exp(-splats.opacities.astype(np.float64)))
-    return np.where(opacities > constants.ALPHA_MIN, opacities, 0.0)
-
-
 def removal_scores(
     splats: Splats, cameras: Sequence[Camera], context: Context = DEFAULT_CONTEXT, *, background: Colour = BLACK
 ) -> Float64[np.ndarray, " N"]:

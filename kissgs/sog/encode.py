@@ -18,7 +18,7 @@ from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.containers import META_NAME
 from kissgs.io.conventions import OPACITY_OF_BYTE
 from kissgs.io.images import compress_images
-from kissgs.planning.encoding_plan import Encoded, EncodingPlan
+from kissgs.planning.planner import Encoded, EncodingPlan
 from kissgs.planning.quantize import ByteTables, ContainerModel, Quantized
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.settings import EncodeSettings

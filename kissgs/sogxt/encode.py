@@ -13,10 +13,8 @@ from kissgs.core.resources import blas_workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
 from kissgs.io.images import compress_images, pixels_crc32
-from kissgs.planning.encoding_plan import Encoded, EncodingPlan
-from kissgs.planning.planner import plan_encoding
+from kissgs.planning.planner import ColorRefit, Encoded, EncodingPlan, plan_encoding
 from kissgs.planning.quantize import Quantized, observed_range
-from kissgs.planning.rate_distortion import ColorRefit
 from kissgs.planning.sh_codebook import Codebook
 from kissgs.settings import GOALS, EncodeSettings
 from kissgs.sogxt import container, metadata

@@ -20,8 +20,7 @@ from kissgs.evaluation.scene_parts import (
     share_shown,
 )
 from kissgs.rendering.camera import look_at
-from kissgs.rendering.cpu.frame import draw
-from kissgs.rendering.rasterizer import drawn_opacities
+from kissgs.rendering.cpu.frame import draw, drawn_opacities
 
 SCENE = kissgs.sample_scene(150, sh_degree=1, seed=7)
 UP = np.array([0.0, -1, 0])

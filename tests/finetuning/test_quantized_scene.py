@@ -16,7 +16,7 @@ from kissgs.core.splats import ATTRIBUTES
 from kissgs.finetuning.planes import TABLES
 from kissgs.finetuning.quantized_scene import QuantizedScene, table_name
 from kissgs.pipeline.encoding import MODELS, write_files
-from kissgs.planning.rd_criterion import Costs
+from kissgs.planning.rd_fields import Costs
 
 IMAGES = {"opacities": 3, "scales": 3, "quaternions": 4, "f_dc": 3}
 

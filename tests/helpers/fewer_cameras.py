@@ -1,14 +1,13 @@
 """Fewer camera candidates and smaller images, for faster tests."""
 
-from kissgs.cameras.virtual import candidates, select
+from kissgs.cameras.virtual import select
 
 
 def try_fewer(patch, azimuths=8, radii=(1.1, 2.6)):
     """Reduce the camera candidates to some dozens, for tests that do not depend on their number."""
-    patch.setattr(candidates, "AZIMUTHS", azimuths)
-    for module in (candidates, select):
-        patch.setattr(module, "INSIDE_DIRECTIONS", 4)
-        patch.setattr(module, "ORBIT_RADII", radii)
+    patch.setattr(select, "AZIMUTHS", azimuths)
+    patch.setattr(select, "INSIDE_DIRECTIONS", 4)
+    patch.setattr(select, "ORBIT_RADII", radii)
 
 
 def evaluate_smaller(patch, *, searches):

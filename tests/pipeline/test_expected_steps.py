@@ -5,8 +5,7 @@ from helpers.photographed import FEW_VIEWS, photographs, with_photographs
 
 import kissgs
 from kissgs import Settings
-from kissgs.pipeline.choice import resolved
-from kissgs.pipeline.limited_time import Expected
+from kissgs.pipeline.limited_time import Expected, resolved
 from kissgs.streaming.compress import compress_streamed
 
 VIEWS = {"views": 24, "view_size": 48}

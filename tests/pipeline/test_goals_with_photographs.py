@@ -170,7 +170,7 @@ def test_towards_a_goal_of_ssim_training_gives_it_more_weight(goal, given, weigh
 
 
 def test_without_torch_the_report_says_what_is_missing(tmp_path, monkeypatch):
-    monkeypatch.setattr("kissgs.pipeline.choice.has_torch", lambda: False)
+    monkeypatch.setattr("kissgs.pipeline.limited_time.has_torch", lambda: False)
     scene = cloud(100)
     views = photographs(scene, tmp_path)
     found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=9, max_encodes=1), views=views)

@@ -70,7 +70,7 @@ def test_a_size_is_better_used_with_training():
 @pytest.mark.parametrize(("units", "trained"), [(1e6, True), (10, False)])
 @pytest.mark.quick(0)
 def test_a_limited_time_trains_if_it_is_long(monkeypatch, units, trained):
-    monkeypatch.setattr("kissgs.pipeline.choice.encode_seconds", lambda *found: 1e5 / units)
+    monkeypatch.setattr("kissgs.pipeline.limited_time.encode_seconds", lambda *found: 1e5 / units)
     chosen = settings(steps=20, max_psnr_drop=0.5).model_copy(update={"time_limit": 1e5})
     report = kissgs.compress(SMALL, settings=chosen).report
     assert any(trial.count < len(SMALL) for trial in report.trials) == trained

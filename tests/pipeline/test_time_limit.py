@@ -12,8 +12,7 @@ import kissgs
 from kissgs import Settings, UnsupportedError
 from kissgs.core.context import Deadline
 from kissgs.pipeline import limited_time as machine_speed
-from kissgs.pipeline.choice import in_time
-from kissgs.pipeline.limited_time import WITH_GOAL, SearchTime, encode_seconds, save_speed
+from kissgs.pipeline.limited_time import WITH_GOAL, SearchTime, encode_seconds, in_time, save_speed
 from kissgs.settings import Preset
 from kissgs.training.supervision import SupervisionViews
 
@@ -159,7 +158,7 @@ def test_a_scene_that_training_does_not_recover_is_encoded_whole(tmp_path, monke
     """Photographs that are the scene's own renderings lose without limit; with much time, fewer Gaussians follow."""
     scene = cloud(200)
     views = photographs(scene, tmp_path, brightness=1.0)
-    monkeypatch.setattr("kissgs.pipeline.choice.encode_seconds", lambda *found: LONG / units)
+    monkeypatch.setattr("kissgs.pipeline.limited_time.encode_seconds", lambda *found: LONG / units)
     requested = with_photographs().model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     counts = [trial.count for trial in found.report.trials]
@@ -202,7 +201,7 @@ def test_a_goal_that_training_does_not_recover_is_met_by_the_encoder(tmp_path, m
     scene = cloud(200)
     views = photographs(scene, tmp_path)
     monkeypatch.setattr("kissgs.pipeline.search.RECOVERABLE_DB", -math.inf)
-    monkeypatch.setattr("kissgs.pipeline.choice.encode_seconds", lambda *found: LONG / 12.0)
+    monkeypatch.setattr("kissgs.pipeline.limited_time.encode_seconds", lambda *found: LONG / 12.0)
     requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     assert found.report.trials[0].count == 200
@@ -224,7 +223,7 @@ def test_much_time_makes_twice_the_usual_steps_on_renderings():
 def test_little_time_makes_one_container_with_few_steps(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
-    monkeypatch.setattr("kissgs.pipeline.choice.encode_seconds", lambda *found: 1.5)
+    monkeypatch.setattr("kissgs.pipeline.limited_time.encode_seconds", lambda *found: 1.5)
     settings = with_photographs({"steps": 10_000}).model_copy(update={"time_limit": 9.0})
     found = kissgs.compress(scene, settings=settings, views=views)
     assert len(found.report.trials) == 1
@@ -235,7 +234,7 @@ def test_little_time_makes_one_container_with_few_steps(tmp_path, monkeypatch):
 def test_a_short_search_prunes_no_further_than_it_trains(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
-    monkeypatch.setattr("kissgs.pipeline.choice.encode_seconds", lambda *found: 1e-3)
+    monkeypatch.setattr("kissgs.pipeline.limited_time.encode_seconds", lambda *found: 1e-3)
     monkeypatch.setattr(SearchTime, "plan", lambda self, photographs, time_only: WITH_GOAL[0][1])
     requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
@@ -251,7 +250,7 @@ def test_a_checkpoint_and_a_time_limit_are_refused_together(tmp_path):
 def test_the_note_says_what_torch_would_have_bought(tmp_path, monkeypatch):
     scene = cloud(60)
     views = photographs(scene, tmp_path)
-    monkeypatch.setattr("kissgs.pipeline.choice.has_torch", lambda: False)
+    monkeypatch.setattr("kissgs.pipeline.limited_time.has_torch", lambda: False)
     for capture in (views, None):
         plenty, little = (Settings.research("balanced", time_limit=t, **FEW_VIEWS) for t in (LONG, 1e-3))
         assert "needs torch, which is missing" in kissgs.compress(scene, settings=plenty, views=capture).report.note

@@ -7,9 +7,8 @@ from helpers.random_sensitivity import random_sensitivity
 import kissgs
 from kissgs import Settings
 from kissgs.core.resources import Workers
-from kissgs.planning import kernels, planner
-from kissgs.planning.layout import hilbert_order
-from kissgs.planning.planner import refined_order
+from kissgs.planning import kernels, layout
+from kissgs.planning.layout import hilbert_order, refined_order
 from kissgs.sogxt.encode import encode
 
 
@@ -72,8 +71,8 @@ def test_gaussians_stay_in_their_run_and_differences_become_smaller(count):
     np.testing.assert_array_equal(np.sort(order), np.arange(count))
     np.testing.assert_array_equal(runs[order], runs)
     if count > 100:
-        pixels = planner._pixels(means, colors)
-        bits = planner._difference_bits(pixels)
+        pixels = layout._pixels(means, colors)
+        bits = layout._difference_bits(pixels)
         assert cost(pixels, bits, order) < 0.95 * cost(pixels, bits, np.arange(count))
 
 

@@ -7,8 +7,8 @@ import pytest
 from helpers.codec_scenes import random_scene
 from helpers.random_sensitivity import encode_rd, random_sensitivity
 
-from kissgs.planning.rate_distortion import MIN_ERROR_RATIO, ErrorModel, default_error
-from kissgs.planning.rd_criterion import Costs
+from kissgs.planning.planner import MIN_ERROR_RATIO, ErrorModel, default_error
+from kissgs.planning.rd_fields import Costs
 from kissgs.planning.sh_codebook import CodebookErrorModel
 
 

@@ -9,8 +9,17 @@ from helpers.random_sensitivity import encode_rd, packed_hessian, random_sensiti
 import kissgs
 from kissgs.core.resources import Workers
 from kissgs.planning.quantize import quantize
-from kissgs.planning.rd_criterion import Costs, RdCriterion, step
-from kissgs.planning.rd_fields import CAPTURED, UNSEEN, VIRTUAL, largest_changes, quantize_by_steps, rdo_quantize
+from kissgs.planning.rd_fields import (
+    CAPTURED,
+    UNSEEN,
+    VIRTUAL,
+    Costs,
+    RdCriterion,
+    largest_changes,
+    quantize_by_steps,
+    rdo_quantize,
+    step,
+)
 
 
 def anything(count):

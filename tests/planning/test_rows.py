@@ -17,8 +17,7 @@ from kissgs.planning.quantize import (
     selected,
     sorted_order,
 )
-from kissgs.planning.rd_criterion import Costs
-from kissgs.planning.rd_fields import level_bits
+from kissgs.planning.rd_fields import Costs, level_bits
 from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS, choose_forms
 from kissgs.settings import Settings
 from kissgs.sog.encode import SOG

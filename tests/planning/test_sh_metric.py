@@ -13,8 +13,8 @@ from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.planning import kmeans
-from kissgs.planning.clustering import UNIFORM_WEIGHT, Clustering, ShMetric, Vectors, sorted_by_label
-from kissgs.planning.sh_codebook import codebook_error_model
+from kissgs.planning.kmeans import Clustering, Vectors, sorted_by_label
+from kissgs.planning.sh_codebook import UNIFORM_WEIGHT, ShMetric, codebook_error_model
 
 SETTINGS = kissgs.Settings.research("balanced", sh_kmeans_iterations=3, sh_neighbors=32, sh_tolerance=0.0).encode
 

@@ -11,8 +11,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from kissgs.cameras.views import Vec3, black
-from kissgs.cameras.virtual.candidates import SceneBounds, framing_camera, opacity, proxy_scene, weighted_quantiles
-from kissgs.cameras.virtual.select import THUMBNAIL_SIZE, ScoredCandidates, overview_bonus, score_candidates
+from kissgs.cameras.virtual.select import (
+    THUMBNAIL_SIZE,
+    SceneBounds,
+    ScoredCandidates,
+    framing_camera,
+    opacity,
+    overview_bonus,
+    proxy_scene,
+    score_candidates,
+    weighted_quantiles,
+)
 from kissgs.core.array_types import Float64
 from kissgs.core.context import DEFAULT_CONTEXT, Context, load_kernels
 from kissgs.core.resources import Workers

@@ -8,26 +8,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kissgs.cameras.views import Vec3, Views, black, camera_facing, check_images, log_uniform, random_direction
-from kissgs.cameras.virtual.candidates import (
+from kissgs.cameras.virtual.first_view import Record, first_view
+from kissgs.cameras.virtual.select import (
     FIELD_OF_VIEW,
     PROXY_GAUSSIANS,
     SceneBounds,
+    ScoredCandidates,
     ViewScorer,
     direction_at,
     opacity,
     proxy_scene,
     scene_bounds,
+    score_candidates,
+    select_diverse,
+    split_views,
+    with_size,
 )
-from kissgs.cameras.virtual.first_view import Record, first_view
-from kissgs.cameras.virtual.select import ScoredCandidates, score_candidates, select_diverse, split_views, with_size
 from kissgs.core.array_types import Bool, Float32, Int
 from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress
 from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import BLOCK, Sensitivity
 from kissgs.core.splats import Splats, concatenate
 from kissgs.rendering.camera import Camera, look_at
-from kissgs.rendering.cpu.frame import add_sensitivities, draw
-from kissgs.rendering.rasterizer import drawn_opacities
+from kissgs.rendering.cpu.frame import add_sensitivities, draw, drawn_opacities
 from kissgs.rendering.sensitivity import Coverage, WeightedCameras, local_scale
 
 # Regions: parts of a scene that each need cameras at their own scale.

@@ -179,3 +179,9 @@ def add_color_gradients(
     """Add the gradients of a loss by ``sh0`` alone, given its gradient by the image, ``v_image``, to ``into``."""
     v_slots, slots = color_gradients(frame, v_image, pool)
     _each_footprint(add_colors, frame, slots, pool, v_slots, into)
+
+
+def drawn_opacities(splats: Splats) -> Float64[np.ndarray, " N"]:
+    """Return opacities from 0 to 1; 0 for Gaussians that no renderer draws."""
+    opacities = 1 / (1 + np.exp(-splats.opacities.astype(np.float64)))
+    return np.where(opacities > constants.ALPHA_MIN, opacities, 0.0)

@@ -7,8 +7,8 @@ import pytest
 from helpers.whole_scenes import moved, two
 
 from kissgs import render, sample_scene
-from kissgs.cameras.virtual.candidates import scene_bounds
 from kissgs.cameras.virtual.samples import close_ups, scattered_cameras
+from kissgs.cameras.virtual.select import scene_bounds
 from kissgs.rendering.sensitivity import local_scale
 
 

@@ -5,7 +5,7 @@ import pytest
 from helpers.hollow_scenes import box, surface
 
 from kissgs import sample_scene
-from kissgs.cameras.virtual.candidates import scene_bounds, weighted_median, weighted_quantiles
+from kissgs.cameras.virtual.select import scene_bounds, weighted_median, weighted_quantiles
 from kissgs.core.splats import ATTRIBUTES, Splats
 
 

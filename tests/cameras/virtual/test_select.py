@@ -7,8 +7,7 @@ from helpers.hollow_scenes import box
 
 from kissgs import sample_scene
 from kissgs.cameras.captures.load import load_views
-from kissgs.cameras.virtual.candidates import scene_bounds
-from kissgs.cameras.virtual.select import best_view, virtual_views
+from kissgs.cameras.virtual.select import best_view, scene_bounds, virtual_views
 from kissgs.core.splats import clean
 from kissgs.io.ply import read_ply
 from kissgs.rendering.rasterizer import render
