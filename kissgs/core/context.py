@@ -64,7 +64,7 @@ class SearchNote:
 # ``JobProgress``: one fraction of a job that never falls, and the seconds left, from the progress of its stages.
 
 Step = tuple[str, float]  # an expected stage, and the seconds that it takes on some machine
-LOADING = "kernels"  # the stage that takes time only when it comes first
+LOADING = "kernels"  # the stage that takes time only when it comes first, also after its last event
 PRIOR = 0.1  # share of all work after which what is measured counts as much as what is expected
 OVERDUE = 0.25  # expected rest of a stage that takes longer than expected, in units of the time it has taken
 PAST_DEADLINE = 0.05  # the same of a job
@@ -77,9 +77,10 @@ class JobProgress:
     seconds left, and keeps the times of all stages.
 
     The seconds left are those of the expected steps, corrected by the speed so far, and by the pace of the current one.
-    Steps that are left out are skipped, and a stage that comes again without being expected repeats the steps since it
-    came last. The fraction gains its share of what is left: where that turns out to be more, it becomes slower. It is
-    below 1 until :meth:`stop`, since a search may go on after all expected steps."""
+    Steps that are left out are skipped, and a stage that comes again without being expected, or before others that have
+    not come at all, repeats the steps since it came last. The fraction gains its share of what is left: where that is
+    more than was expected, it becomes slower. It is below 1 until :meth:`stop`, since a search may go on after all
+    expected steps."""
 
     def __init__(self, receiver: Progress, steps: Sequence[Step] = ()) -> None:
         """Begin a job; see :meth:`expect` for ``steps``."""
@@ -96,15 +97,20 @@ class JobProgress:
         self._stage: str | None = None
         self._last_stage: str | None = None
         self._factor: dict[str, float] = {}  # by stage, of its seconds to those expected, the last time
+        self._steps, self._at = list[Step](), -1
+        self._deadline: Deadline | None = None
+        self._expected = self._measured = 0.0  # seconds of the steps so far
         self.expect(steps)
 
     def expect(self, steps: Sequence[Step], deadline: Deadline | None = None) -> None:
-        """Set the steps from here on. Stages that are not among them count as parts of the current step. A job with a
-        ``deadline`` is expected to end then if it has steps enough."""
-        self._steps, self._at, self._deadline = list(steps), -1, deadline
-        self._expected = self._measured = 0.0  # seconds of the steps so far
-        self._prior = PRIOR * sum(seconds for _, seconds in steps)
-        self._step_began, self._step_first, self._step_fraction = time.perf_counter(), 0.0, 0.0
+        """Set the steps from here on, between two stages. Stages that are not among them count as parts of the current
+        step. A job with a ``deadline`` is expected to end then if it has steps enough."""
+        now = time.perf_counter()
+        self._end_stage(now)
+        self._end_step(now)
+        self._steps, self._at, self._deadline = list(steps), -1, deadline or self._deadline
+        self._prior = PRIOR * (self._expected + sum(seconds for _, seconds in steps))
+        self._step_began, self._step_first, self._step_fraction = now, 0.0, 0.0
 
     def __call__(self, stage: str, fraction: float, note: str = "") -> None:
         """Receive the ``fraction`` of a stage; a new stage ends the current one."""
@@ -113,7 +119,7 @@ class JobProgress:
             self._end_stage(now)
             self._stage, self._stage_began = stage, now
             self._enter(stage, fraction, now)
-        if self._at >= 0 and stage == self._steps[self._at][0]:
+        if self._at >= 0 and stage == self._steps[self._at][0] != LOADING:
             self._step_fraction = max(self._step_fraction, fraction)
         if self._steps:
             since = self._began if self.seconds_left is None else self._latest
@@ -141,25 +147,33 @@ class JobProgress:
     def _enter(self, stage: str, fraction: float, now: float) -> None:
         """Go to the next step of this stage, if it is one."""
         known = [at for at, (name, _) in enumerate(self._steps) if name == stage]
-        following = [at for at in known if at > self._at]
+        came, following = [at for at in known if at <= self._at], [at for at in known if at > self._at]
         if not known or (stage == LOADING and not following):
             return
+        self._end_step(now)
+        if came and (not following or self._new(self._steps[self._at + 1 : following[0]])):
+            self._steps[self._at + 1 :] = self._steps[came[-1] :]
+            following = [self._at + 1]
+        self._at = following[0]
+        self._step_began, self._step_first, self._step_fraction = now, fraction, fraction
+
+    def _end_step(self, now: float) -> None:
         if self._at >= 0:
             name, seconds = self._steps[self._at]
-            spent, seconds = now - self._step_began, max(seconds * (1 - self._step_first), 1e-3)
+            end = self._latest if self._step_fraction == 1 else now  # loading the next stage may take longer
+            spent, seconds = end - self._step_began, max(seconds * (1 - self._step_first), 1e-3)
             self._factor[name] = spent / seconds
             if name != LOADING:  # which says little about the speed of other stages
                 self._expected, self._measured = self._expected + seconds, self._measured + spent
-        if not following:
-            self._steps[self._at + 1 :] = self._steps[known[-1] :]
-        self._at = following[0] if following else self._at + 1
-        self._step_began, self._step_first, self._step_fraction = now, fraction, fraction
 
     def _room(self) -> float:
         """Return the least share of the job to keep for its end and for the stages that have not begun: the compilation
         of kernels before them may take most of the time, which nobody expects."""
-        begun = {name for name, _ in self._steps[: self._at + 1]} | {*self._factor, *self.seconds}
-        return ROOM * (1 + len({name for name, _ in self._steps[self._at + 1 :]} - begun))
+        return ROOM * (1 + len(self._new(self._steps[self._at + 1 :])))
+
+    def _new(self, steps: Sequence[Step]) -> set[str]:
+        """Return the stages of these steps that have not come yet."""
+        return {name for name, _ in steps} - {name for name, _ in self._steps[: self._at + 1]} - {*self.seconds}
 
     def _slower(self, measured: float, expected: float) -> float:
         """Return the factor on the seconds of steps to come, after ``measured`` ones instead of ``expected``."""
@@ -174,7 +188,7 @@ class JobProgress:
             name, seconds = self._steps[self._at]
             spent, done = now - self._step_began, self._step_fraction - self._step_first
             usual = seconds * self._factor.get(name, self._slower(measured, expected))
-            rest = max(usual * (1 - self._step_first) - spent, OVERDUE * spent)
+            rest = max(usual * (1 - self._step_first) - spent, OVERDUE * spent * (name != LOADING))
             if done > 0:
                 by_pace, trust = spent * (1 - self._step_fraction) / done, 1 - (1 - done) ** 2
                 rest = trust * by_pace + (1 - trust) * (1 - self._step_fraction) * max(usual, spent)

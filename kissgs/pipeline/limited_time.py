@@ -81,7 +81,7 @@ def _speed_file() -> Path:
 # ``Expected``: the stages of a compression and the seconds of each, for its progress.
 
 STAGE_SECONDS = {
-    "kernels": (0.5, 0.0, 0.0),
+    "kernels": (0.25, 0.0, 0.0),
     "cameras": (0.5, 1.2, 7e-6),
     "sensitivity": (0.4, 1.2, 4e-6),
     "rate_distortion": (0.05, 0.0, 4e-6),
@@ -99,10 +99,10 @@ STAGE_SECONDS = {
 """Seconds of each stage with the preset balanced, in parts as those of :data:`ENCODE_SECONDS`."""
 
 OTHER_PRESETS = {
-    Preset.FAST: {"codebook": 0.3, "sort codebook": 0.2, "images": 0.04},
-    Preset.PAPER: {"order": 350.0, "forms": 80.0, "sort codebook": 7.0, "images": 0.2},
+    Preset.FAST: {"order": (0.2, 0.0, 0.2e-6), "codebook": (0.01, 0.0, 4e-6), "images": (0.0, 0.0, 1.4e-6)},
+    Preset.PAPER: {"order": (0.2, 0.0, 70e-6), "forms": (0.0, 0.0, 16e-6), "images": (0.02, 0.0, 7e-6)},
 }
-"""Factors on these with other presets."""
+"""The same with other presets; their first stage also loads what was compiled."""
 
 SMALL_IMAGES = 0.75e-8  # seconds of images with high effort by the square of the number of Gaussians
 FIRST_EVALUATION = 1.2  # seconds in which a search chooses the views that it evaluates in
@@ -110,9 +110,9 @@ FIRST_EVALUATION = 1.2  # seconds in which a search chooses the views that it ev
 STEP, TUNING_STEP, SCORE, TARGET = (3e-3, 1.2e-7, 3e-7), (8e-3, 2e-7, 1.2e-6), (5e-3, 1.2e-7, 1e-6), (2e-3, 8e-8, 1e-7)
 """Seconds of an image in training, fine-tuning, scoring and as a target: fixed, for each pixel, for each Gaussian."""
 
-ENCODES_FOR_SIZE, ENCODES, COMPACTIONS, PRUNED, POINTS, TUNED = 3, 5, 7, 2, 3, 3
-"""Results that searches usually make: containers for a size and for other goals, compactions for a loss, scenes that
-are pruned without training, others on the way, and trained containers."""
+FOR_SIZE, COMPACTIONS, PRUNED_FOR_SIZE, PRUNED, POINTS = 3, 7, 5, 2, 3
+"""Results that searches usually make: containers of a scene for a size, compactions for a loss, scenes that are pruned
+without training, for a size and other goals, and others on the way."""
 
 FEWER = 0.4  # share of the Gaussians in these
 
@@ -134,10 +134,8 @@ class Expected:
 
     def stages(self, *names: str) -> list[Step]:
         """Return stages with their seconds."""
-        factors = OTHER_PRESETS.get(self.settings.preset, {})
-        count, speed = self.count, self.speed
-        found = {name: factors.get(name, 1.0) * _reference_seconds(STAGE_SECONDS[name], count) for name in names}
-        return [(name, found[name] / speed) for name in names]
+        parts = STAGE_SECONDS | OTHER_PRESETS.get(self.settings.preset, {})
+        return [(name, _reference_seconds(parts[name], self.count) / self.speed) for name in names]
 
     def steps(self, *, evaluate: bool = False) -> list[Step]:
         """Return the steps of :func:`kissgs.compress`, from the scene on."""
@@ -185,11 +183,11 @@ class Expected:
         return "targets", self._images(TARGET, self.captured or views.views, views)
 
     def _scored(self, kept: float) -> Step:
-        """Return the pruning of all but a share of the Gaussians, by a quarter of the views."""
+        """Return the pruning of all but a share of the Gaussians, by a quarter of the views or those of the capture."""
         compact = self.settings.compact
         most = compact.min_keep_per_scoring or kept
         rounds = max(1, math.ceil(math.log(kept) / math.log(most) - 1e-9)) if most < 1 else 1
-        return "score", self._images(SCORE, rounds * 0.25 * (self.captured or compact.views), compact)
+        return "score", self._images(SCORE, rounds * (0.5 * self.captured or 0.25 * compact.views), compact)
 
     def _measured(self) -> list[Step]:
         """Return the steps before a scene is encoded for the first time."""
@@ -214,28 +212,40 @@ class Expected:
 
     def _search(self) -> list[Step]:
         """Return the steps of a search for a goal."""
-        compact, by_size = self.settings.compact, self.settings.encode.target_size is not None
-        evaluated, fewer = [] if by_size else self._evaluated(), self._fewer(FEWER)
-        whole = [*self._container(tuned=False), *evaluated] * (ENCODES_FOR_SIZE if by_size else ENCODES)
-        steps = [*self._measured(), *whole]
-        tuned, pruned = fewer._container(tuned=True), [self._scored(0.8), *self._evaluated()] * PRUNED
-        photographs = compact.auto_count and self.captured > 0
-        along = fewer._measured() if photographs and not by_size else []
-        trained = [*along, *tuned, *evaluated] * (TUNED * bool(self.settings.finetune.enabled))
-        if photographs:
-            unit = fewer._images(STEP, compact.sparsify_steps / compact.prune_rounds, compact)
-            path = [*[("sparsify", unit), fewer._scored(0.8)] * POINTS, ("sparsify", 3 * unit)]
-            steps = [*self.stages("cameras"), *pruned, self._targets(compact), *path]
-            steps += fewer._measured() if by_size else []
-        elif compact.auto_count:
-            steps = [*self.stages("cameras"), *steps, *pruned, self._targets(compact), *fewer._measured()]
-        steps = [*steps, *trained, *self._evaluated() * by_size]
-        return steps if self.captured else self._with_views(steps)
+        compact, fewer = self.settings.compact, self._fewer(FEWER)
+        begin = self.stages("cameras") * bool(compact.auto_count)
+        if not (compact.auto_count and self.captured):
+            return [*begin, *self._measured(), *self.further(self.settings.encode.max_encodes)]
+        unit = fewer._images(STEP, compact.sparsify_steps / compact.prune_rounds, compact)
+        path = [*[("sparsify", unit), fewer._scored(0.8)] * POINTS, ("sparsify", unit), *self._evaluated()]
+        begin += [*self._pruned(), self._targets(compact), *path, ("sparsify", 2 * unit), *self._evaluated()]
+        return begin + self.further(compact.max_compactions, fewer.count)
+
+    def _pruned(self) -> list[Step]:
+        by_size = self.settings.encode.target_size is not None and not self.captured
+        return [self._scored(0.8), *self._evaluated()] * (PRUNED_FOR_SIZE if by_size else PRUNED)
+
+    def further(self, left: int, count: int = 0) -> list[Step]:
+        """Return the steps of a search when up to ``left`` further containers of the scene may follow, half of which
+        are expected; with a ``count``, those of trained scenes with so many Gaussians."""
+        compact, encode, trained = self.settings.compact, self.settings.encode, replace(self, count=count or self.count)
+        by_size, tunes, steps = encode.target_size is not None, bool(self.settings.finetune.enabled), list[Step]()
+        evaluated = [] if by_size else self._evaluated()
+        if not count:
+            steps = [*self._container(tuned=False), *evaluated] * (min(left, FOR_SIZE) if by_size else -(-left // 2))
+            if compact.auto_count and not self.captured:
+                trained = self._fewer(FEWER)
+                steps += [*self._pruned(), self._targets(compact), *trained._measured()]
+        again = trained._measured() if self.captured and trained.count < self.count else []
+        number = -(-(left if count else compact.max_compactions * tunes) // 2)
+        steps += [*again, *trained._container(tuned=tunes), *evaluated] * number + self._evaluated() * by_size
+        compared = count or (left < encode.max_encodes and not by_size)
+        return steps if compared else self._with_views(steps)
 
     def _with_views(self, steps: list[Step]) -> list[Step]:
         """Return the steps of a search, the first evaluation of which includes the choice of its views."""
         first = next(at for at, (name, _) in enumerate(steps) if name == "evaluate")
-        steps[first] = "evaluate", steps[first][1] + FIRST_EVALUATION / self.speed
+        steps[first] = "evaluate", steps[first][1] + (not self.captured) * FIRST_EVALUATION / self.speed
         return steps
 
 

@@ -314,7 +314,7 @@ def compress(
     compacted = _compact_first(work, checkpoint)
     after_search = replace(context, progress=ignore_stop_search(clock)) if settings.searches else context
     if settings.encode.has_goal:
-        made, trials, note = _search(work, time_only=requested.time_only)
+        made, trials, note = _search(work, clock, evaluate=evaluate, time_only=requested.time_only)
     else:
         work.context = after_search
         trials, note = (), ""
@@ -413,11 +413,15 @@ def _compact_first(work: Work, checkpoint: Path | None) -> Compacted | None:
     return compacted
 
 
-def _search(work: Work, *, time_only: bool) -> tuple[Container, tuple[Attempt, ...], str]:
+def _search(
+    work: Work, job: JobProgress, *, evaluate: bool, time_only: bool
+) -> tuple[Container, tuple[Attempt, ...], str]:
     """Make containers until one meets the goal; return the best one, all attempts and a note."""
     from kissgs.pipeline.search import Search
 
-    search = Search(work, time_only)
+    expected = Expected.of(work.splats, work.settings, work.views, work.context.threads)
+    last = expected.stages("evaluate") * evaluate
+    search = Search(work, lambda left, count: job.expect([*expected.further(left, count), *last]), time_only)
     best = search.run()
     made = replace(best.made, compacted=search.compacted(best), finetuning=search.finetuning(best))
     return made, tuple(search.attempts), search.note(best)

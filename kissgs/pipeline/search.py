@@ -74,6 +74,7 @@ class Search:
     """A search for the container that serves the goal of the settings best."""
 
     work: Work
+    expect: Callable[[int, int], None]  # receives the further containers that are expected, see Expected.further
     time_only: bool = False  # only the time is limited: if no container meets the usual loss, the closest one is kept
     compactor: Popspa | None = field(init=False, default=None)  # if fewer Gaussians may serve the goal
     goal: Goal = field(init=False)
@@ -424,8 +425,15 @@ class Search:
         another = self.best is not None and self._best_scene is not scene and not self.goal.by_size
         limit = self.best.bytes if another and self.best is not None else math.inf
 
+        end, count = len(self.attempts) + most, 0 if tuner is None else len(scene.measured.splats)
+        if self.attempts:
+            self.expect(most, count)
+
         def encode_at(settings: EncodeSettings) -> Attempt:
             attempt = self._attempt(scene, settings, tuner)
+            near = self.goal.decisive(attempt).near_enough(trained=tuner is not None)
+            left = 0 if 0 <= self.goal.margin(attempt) <= near else end - len(self.attempts)
+            self.expect(left, count)
             if self.goal.margin(attempt) < 0 and self._expected_bytes(attempt) >= limit:
                 raise NoFurtherError
             return attempt
@@ -442,8 +450,12 @@ class Search:
             )
             scene = self._scene_at(path, number)
             settings = scene.settings if log2_lambda is None else at_lambda(scene.settings, log2_lambda)
-            return self._attempt(scene, settings, self._tuner)
+            attempt = self._attempt(scene, settings, self._tuner)
+            left = 0 if 0 <= self.goal.log2_margin(attempt) <= near else end - len(self.attempts)
+            self.expect(left, len(scene.measured.splats))
+            return attempt
 
+        end = len(self.attempts) + self.plan.containers
         near = NEAR_LOG2 if self.work.time is None and self.goal.most_bytes is None else NEAR_IN_TIME
         if self.plan.containers == 0:  # there is no time for training
             self._prune_to(path, max(first, 1))
