@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -39,28 +39,6 @@ def silent(stage: str, fraction: float, note: str = "") -> None:
     """Ignore every event; the default receiver."""
 
 
-def ignore_stop_search(progress: Progress) -> Progress:
-    """Return a receiver that ignores :class:`StopSearch`: once the search is over, the work is completed."""
-
-    def receive(stage: str, fraction: float, note: str = "") -> None:
-        with suppress(StopSearch):
-            progress(stage, fraction, note)
-
-    return receive
-
-
-@dataclass(slots=True, eq=False)
-class SearchNote:
-    """Receiver that puts the state of a search before the notes of the events."""
-
-    progress: Progress
-    note: str = ""  # the state, changed by the search
-
-    def __call__(self, stage: str, fraction: float, note: str = "") -> None:
-        """See :class:`Progress`."""
-        self.progress(stage, fraction, "; ".join(filter(None, [self.note, note])))
-
-
 # ``JobProgress``: one fraction of a job that never falls, and the seconds left, from the progress of its stages.
 
 Step = tuple[str, float]  # an expected stage, and the seconds that it takes on some machine
@@ -92,12 +70,13 @@ class JobProgress:
         """Fraction of the job that is done."""
         self.seconds_left: float | None = None
         """The expected seconds from the latest event to the end; None without expected steps."""
-        self._receive, self._cpu_began = with_seconds_left(receiver), time.process_time()
+        self.note = ""  # the state of a search, before the notes of the events
+        self.stops_search = True  # whether StopSearch of the receiver has an effect: the search is not over
+        self._call, self._cpu_began = with_seconds_left(receiver), time.process_time()
         self._began = self._latest = self._stage_began = time.perf_counter()
         self._stage: str | None = None
-        self._last_stage: str | None = None
         self._factor: dict[str, float] = {}  # by stage, of its seconds to those expected, the last time
-        self._steps, self._at = list[Step](), -1
+        self._steps, self._at, self._step_fraction = list[Step](), -1, 0.0
         self._deadline: Deadline | None = None
         self._expected = self._measured = 0.0  # seconds of the steps so far
         self.expect(steps)
@@ -105,19 +84,16 @@ class JobProgress:
     def expect(self, steps: Sequence[Step], deadline: Deadline | None = None) -> None:
         """Set the steps from here on, between two stages. Stages that are not among them count as parts of the current
         step. A job with a ``deadline`` is expected to end then if it has steps enough."""
-        now = time.perf_counter()
-        self._end_stage(now)
-        self._end_step(now)
+        self._end_step(time.perf_counter())
         self._steps, self._at, self._deadline = list(steps), -1, deadline or self._deadline
         self._prior = PRIOR * (self._expected + sum(seconds for _, seconds in steps))
-        self._step_began, self._step_first, self._step_fraction = now, 0.0, 0.0
 
     def __call__(self, stage: str, fraction: float, note: str = "") -> None:
         """Receive the ``fraction`` of a stage; a new stage ends the current one."""
         now, fraction = time.perf_counter(), min(max(float(fraction), 0.0), 1.0)
-        if stage != self._stage:
+        if stage != self._stage or self._at < 0:
             self._end_stage(now)
-            self._stage, self._stage_began = stage, now
+            self._stage = stage
             self._enter(stage, fraction, now)
         if self._at >= 0 and stage == self._steps[self._at][0] != LOADING:
             self._step_fraction = max(self._step_fraction, fraction)
@@ -127,22 +103,26 @@ class JobProgress:
             self.seconds_left = max(self._left(now), room * (now - self._began), LEAST_SECONDS)
             gained = (1 - self.fraction) * (now - since) / (now - since + self.seconds_left)
             self.fraction = max(self.fraction, min(self.fraction + gained, 1 - room))
-        self._latest, self._last_stage = now, stage
+        self._latest = now
         self._receive(stage, self.fraction, note, self.seconds_left)
 
     def stop(self) -> None:
         """End the job, whose last event has fraction 1: the work is done, and cannot be cancelled any more."""
         self._end_stage(time.perf_counter())
         self.cpu_seconds = time.process_time() - self._cpu_began
-        if self._last_stage is not None:
+        if self._stage is not None:
             self.fraction, self.seconds_left = 1.0, 0.0
             with suppress(Cancelled):
-                self._receive(self._last_stage, 1.0, "", 0.0)
+                self._receive(self._stage, 1.0, "", 0.0)
+
+    def _receive(self, stage: str, fraction: float, note: str, seconds_left: float | None) -> None:
+        with nullcontext() if self.stops_search else suppress(StopSearch):
+            self._call(stage, fraction, "; ".join(filter(None, [self.note, note])), seconds_left)
 
     def _end_stage(self, now: float) -> None:
         if self._stage is not None:
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._stage_began
-        self._stage = None
+        self._stage_began = now
 
     def _enter(self, stage: str, fraction: float, now: float) -> None:
         """Go to the next step of this stage, if it is one."""

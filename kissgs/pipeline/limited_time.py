@@ -216,27 +216,25 @@ class Expected:
         begin = self.stages("cameras") * bool(compact.auto_count)
         if not (compact.auto_count and self.captured):
             return [*begin, *self._measured(), *self.further(self.settings.encode.max_encodes)]
-        unit = fewer._images(STEP, compact.sparsify_steps / compact.prune_rounds, compact)
-        path = [*[("sparsify", unit), fewer._scored(0.8)] * POINTS, ("sparsify", unit), *self._evaluated()]
-        begin += [*self._pruned(), self._targets(compact), *path, ("sparsify", 2 * unit), *self._evaluated()]
+        unit = "sparsify", fewer._images(STEP, compact.sparsify_steps / compact.prune_rounds, compact)
+        begin += [*[self._scored(0.8), *self._evaluated()] * PRUNED, self._targets(compact)]
+        begin += [*[unit, fewer._scored(0.8)] * POINTS, *[unit, *self._evaluated()] * 2]
         return begin + self.further(compact.max_compactions, fewer.count)
-
-    def _pruned(self) -> list[Step]:
-        by_size = self.settings.encode.target_size is not None and not self.captured
-        return [self._scored(0.8), *self._evaluated()] * (PRUNED_FOR_SIZE if by_size else PRUNED)
 
     def further(self, left: int, count: int = 0) -> list[Step]:
         """Return the steps of a search when up to ``left`` further containers of the scene may follow, half of which
         are expected; with a ``count``, those of trained scenes with so many Gaussians."""
         compact, encode, trained = self.settings.compact, self.settings.encode, replace(self, count=count or self.count)
         by_size, tunes, steps = encode.target_size is not None, bool(self.settings.finetune.enabled), list[Step]()
-        evaluated = [] if by_size else self._evaluated()
+        evaluated, again = [] if by_size else self._evaluated(), list[Step]()
         if not count:
             steps = [*self._container(tuned=False), *evaluated] * (min(left, FOR_SIZE) if by_size else -(-left // 2))
             if compact.auto_count and not self.captured:
-                trained = self._fewer(FEWER)
-                steps += [*self._pruned(), self._targets(compact), *trained._measured()]
-        again = trained._measured() if self.captured and trained.count < self.count else []
+                trained, pruned = self._fewer(FEWER), PRUNED_FOR_SIZE if by_size else PRUNED
+                steps += [self._scored(0.8), *self._evaluated()] * pruned
+                steps += [self._targets(compact), *trained._measured()]
+        elif self.captured and count < self.count:
+            again = trained._measured()
         number = -(-(left if count else compact.max_compactions * tunes) // 2)
         steps += [*again, *trained._container(tuned=tunes), *evaluated] * number + self._evaluated() * by_size
         compared = count or (left < encode.max_encodes and not by_size)

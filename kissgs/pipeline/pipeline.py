@@ -11,7 +11,7 @@ import numpy as np
 
 from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.core.array_types import Int
-from kissgs.core.context import Context, Deadline, Device, JobProgress, Progress, ignore_stop_search, silent
+from kissgs.core.context import Context, Deadline, Device, JobProgress, Progress, silent
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.resources import peak_memory, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
@@ -206,8 +206,8 @@ def compact(
     file = Path(checkpoint) if checkpoint is not None else None
     result = compact_scene(splats, settings.compact, views, context, evaluate=evaluate, checkpoint=file)
     if target is not None:
-        receiver = ignore_stop_search(clock) if settings.searches else clock
-        save_ply(result.splats, target, overwrite=overwrite, progress=receiver)
+        clock.stops_search = not settings.searches
+        save_ply(result.splats, target, overwrite=overwrite, progress=clock)
         delete_checkpoints(result.checkpoint)
     clock.stop()
     report = replace(
@@ -312,20 +312,20 @@ def compress(
 
     # Compact, plan, tune and write the files: once, or several times towards a goal.
     compacted = _compact_first(work, checkpoint)
-    after_search = replace(context, progress=ignore_stop_search(clock)) if settings.searches else context
     if settings.encode.has_goal:
         made, trials, note = _search(work, clock, evaluate=evaluate, time_only=requested.time_only)
+        clock.stops_search = False
     else:
-        work.context = after_search
+        clock.stops_search = not settings.searches
         trials, note = (), ""
         made = _encode_once(work, checkpoint, disposable=not (evaluate or isinstance(source, Splats)))
     compacted, encoded = compacted or made.compacted, made.encoded
 
     # Evaluate, store, report.
-    evaluation = _evaluate(work.original, encoded.files, views, after_search) if evaluate else None
+    evaluation = _evaluate(work.original, encoded.files, views, context) if evaluate else None
     checkpoints = [None if compacted is None else compacted.checkpoint, made.checkpoint]
     if target is not None:
-        after_search.progress("write", 0.0)
+        clock("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite, names=FILES)
         delete_checkpoints(*checkpoints)
     clock.stop()
@@ -421,7 +421,7 @@ def _search(
 
     expected = Expected.of(work.splats, work.settings, work.views, work.context.threads)
     last = expected.stages("evaluate") * evaluate
-    search = Search(work, lambda left, count: job.expect([*expected.further(left, count), *last]), time_only)
+    search = Search(work, job, lambda left, count: job.expect([*expected.further(left, count), *last]), time_only)
     best = search.run()
     made = replace(best.made, compacted=search.compacted(best), finetuning=search.finetuning(best))
     return made, tuple(search.attempts), search.note(best)

@@ -15,7 +15,7 @@ from kissgs.compaction.budget import chosen_views, estimate_note, unchanged
 from kissgs.compaction.popspa import PathPoint, Popspa, TrainingPath
 from kissgs.compaction.result import Compacted, CountTrial
 from kissgs.compaction.search_evaluation import SearchEvaluation
-from kissgs.core.context import Context, SearchNote, ignore_stop_search
+from kissgs.core.context import Context, JobProgress
 from kissgs.core.errors import InvalidViewsError, StopSearch, UnsupportedError
 from kissgs.core.splats import Splats
 from kissgs.evaluation.results import ESTIMATED_DROP, Evaluation, drop_of
@@ -74,6 +74,7 @@ class Search:
     """A search for the container that serves the goal of the settings best."""
 
     work: Work
+    job: JobProgress
     expect: Callable[[int, int], None]  # receives the further containers that are expected, see Expected.further
     time_only: bool = False  # only the time is limited: if no container meets the usual loss, the closest one is kept
     compactor: Popspa | None = field(init=False, default=None)  # if fewer Gaussians may serve the goal
@@ -86,7 +87,6 @@ class Search:
     best: Attempt | None = field(init=False, default=None)  # of those that meet the goal
     closest: Attempt | None = field(init=False, default=None)  # of those that miss it
     stopped: bool = field(init=False, default=False)  # from outside, by StopSearch
-    _progress: SearchNote = field(init=False)  # the receiver of the work's context
     _pruned: list[Attempt] = field(init=False, default_factory=list)  # losses at points 1, 2 and so on
     _whole: Scene | None = field(init=False, default=None)
     _whole_searched: bool = field(init=False, default=False)
@@ -98,11 +98,10 @@ class Search:
     _best_loss: float | None = field(init=False, default=None)
     _overhead: int = field(init=False, default=OVERHEAD_BYTES)  # of the latest container
     _longest: float = field(init=False, default=0.0)  # attempt without training, seconds
+    _last: int = field(init=False, default=0)  # most attempts once the present curve is searched
 
     def __post_init__(self) -> None:
-        self._progress = SearchNote(self.work.context.progress)
-        work = self.work = replace(self.work, context=replace(self.work.context, progress=self._progress))
-        compact = work.settings.compact
+        work, compact = self.work, self.work.settings.compact
         self.goal = Goal.of(self.encode_settings)
         if not compact.auto_count or len(work.splats) < 2:
             self.plan = SearchPlan(TUNED_CONTAINERS)
@@ -192,7 +191,7 @@ class Search:
             if found is None:
                 raise
         finally:
-            self._progress.note = ""
+            self.job.note = ""
         if self.best is None and self.time_only:
             self.best = self.closest
         if self.best is None or self.best.bytes > (self.goal.most_bytes or math.inf):
@@ -308,7 +307,7 @@ class Search:
         For a quality it is the latest trained point that leaves at least half of the error to the encoder: most do not,
         as they are still to be fine-tuned."""
         latest, self.stopped = len(path.points) - 1, False
-        self._progress.progress = ignore_stop_search(self._progress.progress)
+        self.job.stops_search = False
         if not self.goal.by_size and path.points[latest].trained and latest not in self._margins:
             evaluation = self.compare(path.points[latest].splats, self.work.context.stage("evaluate"))
             figures = Attempt(len(path.points[latest]), None, 0).with_evaluation(evaluation)
@@ -425,15 +424,12 @@ class Search:
         another = self.best is not None and self._best_scene is not scene and not self.goal.by_size
         limit = self.best.bytes if another and self.best is not None else math.inf
 
-        end, count = len(self.attempts) + most, 0 if tuner is None else len(scene.measured.splats)
+        self._last = len(self.attempts) + most
         if self.attempts:
-            self.expect(most, count)
+            self.expect(most, 0 if tuner is None else len(scene.measured.splats))
 
         def encode_at(settings: EncodeSettings) -> Attempt:
             attempt = self._attempt(scene, settings, tuner)
-            near = self.goal.decisive(attempt).near_enough(trained=tuner is not None)
-            left = 0 if 0 <= self.goal.margin(attempt) <= near else end - len(self.attempts)
-            self.expect(left, count)
             if self.goal.margin(attempt) < 0 and self._expected_bytes(attempt) >= limit:
                 raise NoFurtherError
             return attempt
@@ -445,17 +441,14 @@ class Search:
         """Make trained containers of points of the path up to ``last``, the first one at point ``first``."""
 
         def encode_at(number: int, log2_lambda: float | None) -> Attempt:
-            self._progress.note = "; last: ".join(
+            self.job.note = "; last: ".join(
                 [f"{count_at(number, len(path.whole)):,} Gaussians", *(each.summary() for each in self.attempts[-1:])]
             )
             scene = self._scene_at(path, number)
             settings = scene.settings if log2_lambda is None else at_lambda(scene.settings, log2_lambda)
-            attempt = self._attempt(scene, settings, self._tuner)
-            left = 0 if 0 <= self.goal.log2_margin(attempt) <= near else end - len(self.attempts)
-            self.expect(left, len(scene.measured.splats))
-            return attempt
+            return self._attempt(scene, settings, self._tuner)
 
-        end = len(self.attempts) + self.plan.containers
+        self._last = len(self.attempts) + self.plan.containers
         near = NEAR_LOG2 if self.work.time is None and self.goal.most_bytes is None else NEAR_IN_TIME
         if self.plan.containers == 0:  # there is no time for training
             self._prune_to(path, max(first, 1))
@@ -482,6 +475,8 @@ class Search:
             self._longest = max(self._longest, time.perf_counter() - began)
         self._finetuning = made.finetuning or self._finetuning
         self._keep(attempt, scene)
+        near = 0 <= self.goal.margin(attempt) <= self.goal.decisive(attempt).near_enough(trained=tuner is not None)
+        self.expect(0 if near else self._last - len(self.attempts), 0 if tuner is None else attempt.count)
         return attempt
 
     def _expected_bytes(self, attempt: Attempt) -> float:
@@ -501,7 +496,7 @@ class Search:
 
     def _keep(self, attempt: Attempt, scene: Scene) -> None:
         self.attempts.append(replace(attempt, container=None))
-        self._progress.note = f"try {len(self.attempts) + 1}, last: {attempt.summary()}"
+        self.job.note = f"try {len(self.attempts) + 1}, last: {attempt.summary()}"
         if self.goal.margin(attempt) < 0:
             if self.closest is None or self.goal.margin(attempt) > self.goal.margin(self.closest):
                 self.closest = attempt
