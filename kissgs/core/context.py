@@ -56,20 +56,15 @@ class JobProgress:
 
     The seconds left are those of the expected steps, corrected by the speed so far, and by the pace of the current one.
     Steps that are left out are skipped, and a stage that comes again without being expected, or before others that have
-    not come at all, repeats the steps since it came last. The fraction gains its share of what is left: where that is
-    more than was expected, it becomes slower. It is below 1 until :meth:`stop`, since a search may go on after all
-    expected steps."""
+    not come at all, repeats the steps since it came last. The fraction gains its share of what is left: if that is more
+    than expected, it slows down. It is below 1 until :meth:`stop`, as a search may go on after all expected steps."""
 
     def __init__(self, receiver: Progress, steps: Sequence[Step] = ()) -> None:
         """Begin a job; see :meth:`expect` for ``steps``."""
-        self.seconds: dict[str, float] = {}
-        """Wall time of each stage."""
-        self.cpu_seconds = 0.0
-        """Processor time of this process up to the last :meth:`stop`."""
-        self.fraction = 0.0
-        """Fraction of the job that is done."""
-        self.seconds_left: float | None = None
-        """The expected seconds from the latest event to the end; None without expected steps."""
+        self.seconds: dict[str, float] = {}  # wall time of each stage
+        self.cpu_seconds = 0.0  # processor time of this process up to the last :meth:`stop`
+        self.fraction = 0.0  # of the job that is done
+        self.seconds_left: float | None = None  # expected from the latest event to the end; None without steps
         self.note = ""  # the state of a search, before the notes of the events
         self.stops_search = True  # whether StopSearch of the receiver has an effect: the search is not over
         self._call, self._cpu_began = with_seconds_left(receiver), time.process_time()
@@ -98,12 +93,12 @@ class JobProgress:
         if self._at >= 0 and stage == self._steps[self._at][0] != LOADING:
             self._step_fraction = max(self._step_fraction, fraction)
         if self._steps:
-            since = self._began if self.seconds_left is None else self._latest
-            room = self._room()
+            # Stages that have not begun get room: kernels compiled before them, which nobody expects, may take long.
+            room, since = ROOM * (1 + len(self._new(self._steps[self._at + 1 :]))), self._latest
             self.seconds_left = max(self._left(now), room * (now - self._began), LEAST_SECONDS)
             gained = (1 - self.fraction) * (now - since) / (now - since + self.seconds_left)
             self.fraction = max(self.fraction, min(self.fraction + gained, 1 - room))
-        self._latest = now
+            self._latest = now
         self._receive(stage, self.fraction, note, self.seconds_left)
 
     def stop(self) -> None:
@@ -145,11 +140,6 @@ class JobProgress:
             self._factor[name] = spent / seconds
             if name != LOADING:  # which says little about the speed of other stages
                 self._expected, self._measured = self._expected + seconds, self._measured + spent
-
-    def _room(self) -> float:
-        """Return the least share of the job to keep for its end and for the stages that have not begun: the compilation
-        of kernels before them may take most of the time, which nobody expects."""
-        return ROOM * (1 + len(self._new(self._steps[self._at + 1 :])))
 
     def _new(self, steps: Sequence[Step]) -> set[str]:
         """Return the stages of these steps that have not come yet."""

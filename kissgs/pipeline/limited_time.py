@@ -99,8 +99,10 @@ STAGE_SECONDS = {
 """Seconds of each stage with the preset balanced, in parts as those of :data:`ENCODE_SECONDS`."""
 
 OTHER_PRESETS = {
-    Preset.FAST: {"order": (0.2, 0.0, 0.2e-6), "codebook": (0.01, 0.0, 4e-6), "images": (0.0, 0.0, 1.4e-6)},
-    Preset.PAPER: {"order": (0.2, 0.0, 70e-6), "forms": (0.0, 0.0, 16e-6), "images": (0.02, 0.0, 7e-6)},
+    Preset.FAST: {"order": (0.2, 0.0, 0.2e-6), "codebook": (0.01, 0.0, 4e-6)}
+    | {"sort codebook": (0.0, 0.0, 0.6e-6), "images": (0.0, 0.0, 1.4e-6)},
+    Preset.PAPER: {"order": (0.2, 0.0, 70e-6), "forms": (0.0, 0.0, 16e-6)}
+    | {"sort codebook": (0.0, 0.0, 21e-6), "images": (0.02, 0.0, 7e-6)},
 }
 """The same with other presets; their first stage also loads what was compiled."""
 
@@ -110,11 +112,9 @@ FIRST_EVALUATION = 1.2  # seconds in which a search chooses the views that it ev
 STEP, TUNING_STEP, SCORE, TARGET = (3e-3, 1.2e-7, 3e-7), (8e-3, 2e-7, 1.2e-6), (5e-3, 1.2e-7, 1e-6), (2e-3, 8e-8, 1e-7)
 """Seconds of an image in training, fine-tuning, scoring and as a target: fixed, for each pixel, for each Gaussian."""
 
-FOR_SIZE, COMPACTIONS, PRUNED_FOR_SIZE, PRUNED, POINTS = 3, 7, 5, 2, 3
+FOR_SIZE, COMPACTIONS, PRUNED, POINTS, FEWER = 3, 7, 2, 3, 0.4
 """Results that searches usually make: containers of a scene for a size, compactions for a loss, scenes that are pruned
-without training, for a size and other goals, and others on the way."""
-
-FEWER = 0.4  # share of the Gaussians in these
+without training, twice as many for a size, and others on the way; share of the Gaussians in these."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,19 +226,17 @@ class Expected:
         are expected; with a ``count``, those of trained scenes with so many Gaussians."""
         compact, encode, trained = self.settings.compact, self.settings.encode, replace(self, count=count or self.count)
         by_size, tunes, steps = encode.target_size is not None, bool(self.settings.finetune.enabled), list[Step]()
-        evaluated, again = [] if by_size else self._evaluated(), list[Step]()
+        evaluated = [] if by_size else self._evaluated()
+        again = trained._measured() if self.captured and 0 < count < self.count else []
         if not count:
             steps = [*self._container(tuned=False), *evaluated] * (min(left, FOR_SIZE) if by_size else -(-left // 2))
             if compact.auto_count and not self.captured:
-                trained, pruned = self._fewer(FEWER), PRUNED_FOR_SIZE if by_size else PRUNED
-                steps += [self._scored(0.8), *self._evaluated()] * pruned
+                trained = self._fewer(FEWER)
+                steps += [self._scored(0.8), *self._evaluated()] * (PRUNED * (1 + by_size))
                 steps += [self._targets(compact), *trained._measured()]
-        elif self.captured and count < self.count:
-            again = trained._measured()
         number = -(-(left if count else compact.max_compactions * tunes) // 2)
         steps += [*again, *trained._container(tuned=tunes), *evaluated] * number + self._evaluated() * by_size
-        compared = count or (left < encode.max_encodes and not by_size)
-        return steps if compared else self._with_views(steps)
+        return steps if count or (left < encode.max_encodes and not by_size) else self._with_views(steps)
 
     def _with_views(self, steps: list[Step]) -> list[Step]:
         """Return the steps of a search, the first evaluation of which includes the choice of its views."""

@@ -24,7 +24,7 @@ from kissgs.pipeline import curves
 from kissgs.pipeline.curves import LambdaCurve, NoFurtherError, at_lambda, count_at, last_number
 from kissgs.pipeline.encoding import Measured, Work, encode, make_tuner, measure
 from kissgs.pipeline.goal import Attempt, Container, Goal
-from kissgs.pipeline.limited_time import SearchPlan
+from kissgs.pipeline.limited_time import Expected, SearchPlan
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import stored_sizes
@@ -75,7 +75,6 @@ class Search:
 
     work: Work
     job: JobProgress
-    expect: Callable[[int, int], None]  # receives the further containers that are expected, see Expected.further
     time_only: bool = False  # only the time is limited: if no container meets the usual loss, the closest one is kept
     compactor: Popspa | None = field(init=False, default=None)  # if fewer Gaussians may serve the goal
     goal: Goal = field(init=False)
@@ -421,12 +420,10 @@ class Search:
         self, scene: Scene, rd_lambda: float | None = None, *, tuner: Tuner | None = None, most: int
     ) -> None:
         """Make up to ``most`` containers of a scene, the first one at ``rd_lambda`` or as its settings say."""
-        another = self.best is not None and self._best_scene is not scene and not self.goal.by_size
-        limit = self.best.bytes if another and self.best is not None else math.inf
-
+        limit = math.inf if self.best is None or self._best_scene is scene or self.goal.by_size else self.best.bytes
         self._last = len(self.attempts) + most
         if self.attempts:
-            self.expect(most, 0 if tuner is None else len(scene.measured.splats))
+            self._expect(scene, tuner)
 
         def encode_at(settings: EncodeSettings) -> Attempt:
             attempt = self._attempt(scene, settings, tuner)
@@ -475,9 +472,15 @@ class Search:
             self._longest = max(self._longest, time.perf_counter() - began)
         self._finetuning = made.finetuning or self._finetuning
         self._keep(attempt, scene)
-        near = 0 <= self.goal.margin(attempt) <= self.goal.decisive(attempt).near_enough(trained=tuner is not None)
-        self.expect(0 if near else self._last - len(self.attempts), 0 if tuner is None else attempt.count)
+        if 0 <= self.goal.margin(attempt) <= self.goal.decisive(attempt).near_enough(trained=tuner is not None):
+            self._last = len(self.attempts)
+        self._expect(scene, tuner)
         return attempt
+
+    def _expect(self, scene: Scene, tuner: Tuner | None) -> None:
+        expected = Expected.of(self.work.splats, self.work.settings, self.work.views, self.work.context.threads)
+        count = 0 if tuner is None else len(scene.measured.splats)
+        self.job.expect(expected.further(self._last - len(self.attempts), count))
 
     def _expected_bytes(self, attempt: Attempt) -> float:
         """Return the size at which the scene of an attempt that misses the goal should meet it."""

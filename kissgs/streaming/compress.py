@@ -43,11 +43,11 @@ from kissgs.streaming.layout import (
 from kissgs.streaming.levels import row_bytes
 
 SECONDS = {
-    False: {"partition": 1.0, "merge": 6.4, "images": 8.6},
-    True: {"partition": 1.0, "merge": 6.4, "cameras": 0.7, "images": 27.0},
+    False: {"partition": (0.0, 1.0), "merge": (0.0, 6.4), "images": (0.0, 8.6)},
+    True: {"partition": (0.0, 1.0), "merge": (0.2, 6.4), "cameras": (1.2, 0.7), "images": (2.0, 27.0)},
 }
-"""Seconds of each stage for a million Gaussians of degree 3 on two processors, without and with rate-distortion
-planning, that is, with the presets ``fast`` and ``balanced``."""
+"""Seconds of each stage on two processors, fixed and for each million Gaussians of degree 3, without and with
+rate-distortion planning, that is, with the presets ``fast`` and ``balanced``."""
 
 
 REPORT = "report.json"  # file of the work folder: the report, once everything is made
@@ -319,8 +319,8 @@ def _partition(
 
 def _announce(job: JobProgress, work: Path, count: int, sh_degree: int, settings: Settings, threads: int) -> None:
     """Set the steps of the job, and report the size of the work folder."""
-    millions = count / 1e6 / speed(threads)
-    job.expect([(stage, each * millions) for stage, each in SECONDS[settings.encode.rate_distortion].items()])
+    millions, stages = count / 1e6, SECONDS[settings.encode.rate_distortion]
+    job.expect([(stage, (fixed + each * millions) / speed(threads)) for stage, (fixed, each) in stages.items()])
     needed = scratch.megabytes(scratch.needed_bytes(count, sh_degree))
     job("scratch", 1.0, f"{work} takes up to {needed} until the work is done")
 
