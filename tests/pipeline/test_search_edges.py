@@ -10,6 +10,7 @@ import kissgs
 from kissgs import OutputError, Settings, Splats, StopSearch, UnsupportedError
 from kissgs.compaction.search_evaluation import SearchEvaluation
 from kissgs.core.context import Context
+from kissgs.core.splats import ATTRIBUTES
 from kissgs.pipeline.goal import Attempt, Goal
 from kissgs.sogxt.encode import encode
 
@@ -20,7 +21,6 @@ def fractions_of_stages(monkeypatch):
     by_stages(monkeypatch)
 
 
-ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)
 FEW_VIEWS = {"sensitivity_views": 4, "sensitivity_view_size": 48}
 PRUNE = {"sparsify_steps": 0, "refine_steps": 0, "min_keep_per_scoring": 0.6, "views": 24, "view_size": 48}
