@@ -104,7 +104,7 @@ OTHER_PRESETS = {
     Preset.PAPER: {"order": (0.2, 0.0, 70e-6), "forms": (0.0, 0.0, 16e-6)}
     | {"sort codebook": (0.0, 0.0, 21e-6), "images": (0.02, 0.0, 7e-6)},
 }
-"""The same with other presets; their first stage also loads what was compiled."""
+"""Seconds that differ with other presets; the first stage also loads what was compiled."""
 
 SMALL_IMAGES = 0.75e-8  # seconds of images with high effort by the square of the number of Gaussians
 FIRST_EVALUATION = 1.2  # seconds in which a search chooses the views that it evaluates in
