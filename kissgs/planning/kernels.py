@@ -92,14 +92,14 @@ def _sort_four(items: np.ndarray, placed: np.ndarray, target: np.ndarray, cells:
     c0, c1, c2, c3 = cells[0], cells[1], cells[2], cells[3]
     for i in range(4):
         item = placed[cells[i]]
-        p0 = p1 = p2 = p3 = np.float32(0)  # four sums at once, since each waits for its last addition
+        s0 = s1 = s2 = s3 = np.float32(0)  # four sums at once, since each waits for its last addition
         for c in range(items.shape[1]):
             value = items[item, c]
-            p0 += value * target[c0, c]
-            p1 += value * target[c1, c]
-            p2 += value * target[c2, c]
-            p3 += value * target[c3, c]
-        product[i, 0], product[i, 1], product[i, 2], product[i, 3] = p0, p1, p2, p3
+            s0 += value * target[c0, c]
+            s1 += value * target[c1, c]
+            s2 += value * target[c2, c]
+            s3 += value * target[c3, c]
+        product[i, 0], product[i, 1], product[i, 2], product[i, 3] = s0, s1, s2, s3
     before = product[0, 0] + product[1, 1] + product[2, 2] + product[3, 3]
     best = before
     b0, b1, b2, b3 = 0, 1, 2, 3
