@@ -324,8 +324,3 @@ def test_the_order_leads_back_to_the_input_of_a_compaction(preset):
     assert len(found) == len(result.order) <= 60
     distances = np.linalg.norm(found.means[:, None] - SCENE.means[None], axis=2)
     assert (distances.argmin(axis=1) == result.order).all()
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_threads_do_not_change_the_result(threads):
-    assert compress(SCENE, threads=threads).to_zip() == compress(SCENE).to_zip()
