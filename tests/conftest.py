@@ -1,6 +1,7 @@
 """Fixtures and shape checks for all tests, and which tests ``make test`` runs."""
 
 import functools
+import gc
 import os
 import sys
 import zlib
@@ -117,6 +118,11 @@ def pytest_configure(config):
     """Let one of several processes compile each kernel."""
     if hasattr(config, "workerinput"):
         compile_once(Path(config.option.basetemp).parent)
+
+
+def pytest_collection_finish():
+    """Leave what the imports of all modules have made to no further garbage collection."""
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)
