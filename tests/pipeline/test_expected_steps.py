@@ -6,7 +6,6 @@ from helpers.photographed import FEW_VIEWS, photographs, with_photographs
 import kissgs
 from kissgs import Settings
 from kissgs.pipeline.limited_time import Expected, resolved
-from kissgs.streaming.compress import compress_streamed
 
 VIEWS = {"views": 24, "view_size": 48}
 TRAINED = {"sparsify_steps": 4, "refine_steps": 4, "prune_rounds": 2, **VIEWS}
@@ -95,24 +94,3 @@ def test_searches_on_photographs_never_go_back(tmp_path, goal):
     kissgs.compress(scene, settings=settings, views=views, progress=progress)
     assert set(progress.stages) - {"refit"} <= {*expected(scene, settings, views)}
     assert progress.fraction == 1.0
-
-
-@pytest.mark.quick(0)
-def test_other_work_never_goes_back(scene, tmp_path):
-    path, container = tmp_path / "scene.ply", tmp_path / "scene.zip"
-    kissgs.save(scene, path, progress=Recorder())
-    kissgs.compress(path, container, settings=few("fast"), evaluate=True, progress=Recorder())
-    for act in (
-        lambda progress: kissgs.load(path, progress=progress),
-        lambda progress: kissgs.load(container, progress=progress),
-        lambda progress: kissgs.decompress(container, tmp_path / "back.ply", progress=progress),
-        lambda progress: kissgs.evaluate(scene, scene, progress=progress),
-        lambda progress: kissgs.compact(path, tmp_path / "few.ply", settings=ONCE["trained"], progress=progress),
-        lambda progress: compress_streamed(
-            path, tmp_path / "lod" / "lod-meta.json", settings=few("fast"), progress=progress
-        ),
-    ):
-        progress = Recorder()
-        act(progress)
-        assert progress.stages
-        assert progress.fraction == 1.0

@@ -291,7 +291,7 @@ def test_a_scene_from_a_file_is_dropped_before_its_images_are_compressed(tmp_pat
     alive = []
 
     def progress(stage, fraction, note=""):
-        if stage == "images":
+        if stage == "images" and len(alive) < 3:  # looking at all objects takes long
             scenes = [thing for thing in gc.get_objects() if type(thing) is Splats]
             alive.append(sum(len(scene) == count for scene in scenes))
 
