@@ -81,7 +81,9 @@ def fewer_and_smaller_images(request, monkeypatch):
     if folder in WITH_FEWER_CAMERAS or smaller:
         from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
 
-        if folder != "service":  # where tests share containers
+        if folder == "pipeline":
+            try_fewer(monkeypatch, azimuths=4, radii=(1.1,))
+        elif folder != "service":  # where tests share containers
             try_fewer(monkeypatch)
         if smaller:
             evaluate_smaller(monkeypatch, searches=folder == "pipeline")

@@ -127,7 +127,7 @@ def test_scenes_of_which_nothing_is_left(degree, preset):
     nothing = replaced(random_scene(5, degree), means=np.full((5, 3), np.nan))
     faint = replaced(random_scene(5, degree), opacities=np.full(5, -9))
     for splats, removed, invisible in ((nothing, 5, 0), (nothing.select(slice(0, 0)), 0, 0), (faint, 0, 5)):
-        found, result = check(splats, preset)
+        found, result = check(splats, preset, prune_invisible=True)
         assert (len(found), found.sh_degree) == (0, degree)
         assert (result.report.cleaned, result.report.invisible) == (Cleaned(non_finite=removed), invisible)
 
