@@ -1,4 +1,4 @@
-"""What several processes of tests need at the same time is compiled by one of them, for all: kernels and modules."""
+"""Kernels and modules that several processes of tests need at the same time are compiled by one of them, for all."""
 
 import contextlib
 import fcntl
