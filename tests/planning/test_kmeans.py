@@ -169,6 +169,15 @@ def test_threads_and_repetition_do_not_matter_and_seeds_do():
     assert fractions[-1] == 1
 
 
+def test_the_input_is_not_modified():
+    vectors, weights = blobs(500), np.ones(500, np.float32)
+    before = vectors.copy()
+    vectors.flags.writeable = weights.flags.writeable = False
+    for size in (20, 500):
+        run(vectors, size, weights, lattice=0.9)
+    assert (vectors == before).all()
+
+
 def test_shares_add_up_and_keep_their_bounds():
     rng = np.random.default_rng(0)
     for size in (30, 100, 5000):

@@ -1,9 +1,15 @@
 """Oracle: brute force over all 24 permutations (itertools), over neighbour distances, and a direct box filter."""
 
+import itertools
+
 import numpy as np
 import pytest
+from helpers.examples import examples
+from hypothesis import given
+from hypothesis import strategies as st
 
 from kissgs.core.resources import blas_workers
+from kissgs.planning import kernels
 from kissgs.planning.layout import box_blur, plas
 
 
@@ -62,6 +68,27 @@ def test_items_that_are_all_alike_and_what_progress_raises():
     assert sorted(sort(alike)) == list(range(64))
     with pytest.raises(KeyboardInterrupt):
         sort(alike, report=stop)
+
+
+@examples(100)
+@given(st.integers(0, 10**6), st.integers(1, 6))
+def test_groups_of_four_get_the_cheapest_of_24_permutations(seed, channels):
+    rng = np.random.default_rng(seed)
+    items, target = (rng.normal(size=(9, channels)).astype(np.float32) for _ in range(2))
+    placed, cells = rng.permutation(9).astype(np.int32), rng.permutation(9)[:4].astype(np.int32)
+    before, score = placed.copy(), np.zeros(2)
+    kernels._sort_four(items, placed, target, cells, score)
+
+    def cost(group):
+        return np.square(items[list(group)].astype(np.float64) - target[cells]).sum()
+
+    untouched = np.setdiff1d(np.arange(9), cells)
+    assert (placed[untouched] == before[untouched]).all()
+    assert sorted(placed) == list(range(9))
+    least = min(cost(group) for group in itertools.permutations(before[cells]))
+    np.testing.assert_allclose(cost(placed[cells]), least, rtol=1e-5)
+    gained = cost(before[cells]) - cost(placed[cells])
+    np.testing.assert_allclose(2 * (score[1] - score[0]), gained, atol=1e-4)
 
 
 def blurred(image, radius):

@@ -9,8 +9,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from kissgs.core.resources import blas_workers
-from kissgs.planning import rotation_forms
+from kissgs.planning import kernels, rotation_forms
+from kissgs.planning.layout import box_blur
 from kissgs.planning.rotation_forms import (
+    PERMUTATIONS,
+    ROTATIONS,
     apply_forms,
     canonical_forms,
     covariance_error,
@@ -102,6 +105,32 @@ def test_constant_scales_are_no_trouble(gaussians):
     for value in (0, -30, 30):
         forms = smooth(quats, np.full((256, 3), value, np.float32))
         assert forms.max() < 48
+
+
+def test_each_gaussian_takes_the_form_nearest_to_its_target(gaussians):
+    """One radius on an 8 x 8 grid, by brute force: sums of absolute differences over seven channels."""
+    quats, scales = gaussians[0][:64], gaussians[1][:64]
+    proxies = np.concatenate([quats * 127.5, scales * 20], axis=1).astype(np.float32)
+    with blas_workers(1) as pool:
+        target = box_blur(proxies.reshape(8, 8, 7).copy(), 3, pool).reshape(64, 7)
+    forms = np.zeros(64, np.uint8)
+    quat_proxy, scale_proxy = (np.ascontiguousarray(part) for part in (proxies[:, :4], proxies[:, 4:]))
+    kernels.nearest_forms(quat_proxy, scale_proxy, target, ROTATIONS.astype(np.float32), PERMUTATIONS, forms)
+    candidates = np.stack(
+        [np.concatenate(form, axis=1) for form in in_all_forms(quat_proxy.astype(np.float64), scale_proxy)]
+    )
+    costs = np.abs(candidates - target).sum(axis=2)
+    np.testing.assert_allclose(costs[forms, np.arange(64)], costs.min(axis=0), rtol=1e-5)
+
+
+def test_the_current_form_wins_ties():
+    """Without this rule, equal candidates would make forms flicker from radius to radius."""
+    quats, scales = np.float32([[127.5, 0, 0, 0]]), np.float32([[5, 5, 5]])
+    target = np.float32([[0, 0, 0, 0, 5, 5, 5]])  # all of the first four rows, and their negatives, are as far
+    for current in (0, 1, 2, 3, 24, 25, 26, 27):
+        forms = np.array([current], np.uint8)
+        kernels.nearest_forms(quats, scales, target, ROTATIONS.astype(np.float32), PERMUTATIONS, forms)
+        assert forms[0] == current
 
 
 def test_covariance_error_measures_what_it_says(gaussians):
