@@ -40,6 +40,12 @@ def test_local_scale_is_the_distance_of_about_the_128th_neighbour():
     assert np.median(share / neighbour(scene, 128)[by_neighbours]) < 1.6
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_local_scale_follows_the_scale_of_the_scene(scale: float):
+    scene = sample_scene(2000)
+    assert local_scale(moved(scene, scale=scale)) == pytest.approx(scale * local_scale(scene), rel=2e-2)
+
+
 def test_a_far_object_does_not_change_local_scales():
     """Float32 positions could not represent its shape at ten times the distance."""
     scene = sample_scene(2000)
