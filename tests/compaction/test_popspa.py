@@ -139,9 +139,10 @@ def test_steps_are_reported():
 
 
 def test_the_result_depends_on_the_seed_but_not_on_threads():
-    found = [Popspa(cloud(300, 2), settings(), five_views(), Context(threads))(50) for threads in (1, 2, 3)]
+    before = torch.get_num_threads()
+    found = [Popspa(cloud(300, 2), settings(), five_views(), Context(threads))(50) for threads in (1, 3)]
+    assert torch.get_num_threads() == before
     assert same(found[0].splats, found[1].splats)
-    assert same(found[0].splats, found[2].splats)
     assert not same(found[0].splats, Popspa(cloud(300, 2), settings(seed=1), five_views())(50).splats)
 
 
@@ -222,8 +223,7 @@ def test_cameras_at_one_position(turn):
     assert np.abs(result.splats.scales - scene.scales[result.index]).max() < 0.15, "the smallest scales do not collapse"
 
 
-@pytest.mark.parametrize("other", ["scene", "count", "settings", "views", "dilation", "evaluation"])
-def test_a_checkpoint_of_other_work_is_rejected(tmp_path, monkeypatch, other):
+def test_a_checkpoint_of_other_work_is_rejected(tmp_path, monkeypatch):
     monkeypatch.setattr(Checkpoint, "due", True)
     path = tmp_path / "c.npz"
     task = Popspa(cloud(80), settings(), five_views())
@@ -232,15 +232,17 @@ def test_a_checkpoint_of_other_work_is_rejected(tmp_path, monkeypatch, other):
     four_views = SupervisionViews(around(4), around(4), around(3), black(), "four views")
     sampled = tuple(replace(view, camera=replace(view.camera, dilation=0.1)) for view in task.supervision.train)
     others = {
-        "dilation": replace(task, supervision=replace(task.supervision, train=sampled)),
-        "scene": replace(task, splats=cloud(80, seed=5)),
-        "settings": replace(task, settings=settings(admm_rho=1e-3)),
-        "views": replace(task, supervision=four_views),
+        "dilation": (replace(task, supervision=replace(task.supervision, train=sampled)), 20, False),
+        "scene": (replace(task, splats=cloud(80, seed=5)), 20, False),
+        "settings": (replace(task, settings=settings(admm_rho=1e-3)), 20, False),
+        "views": (replace(task, supervision=four_views), 20, False),
+        "count": (task, 21, False),
+        "evaluation": (task, 20, True),  # earlier steps would have no metrics
     }
-    count, evaluate = 21 if other == "count" else 20, other == "evaluation"  # earlier steps would have no metrics
-    with pytest.raises(OutputError, match="checkpoint of other work"):
-        others.get(other, task)(count, evaluate=evaluate, checkpoint=path)
-    assert path.exists()
+    for name, (other, count, evaluate) in others.items():
+        with pytest.raises(OutputError, match="checkpoint of other work"):
+            other(count, evaluate=evaluate, checkpoint=path)
+        assert path.exists(), name
 
 
 def test_a_checkpoint_that_cannot_be_written_is_reported_first(tmp_path, monkeypatch):

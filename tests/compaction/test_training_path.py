@@ -158,13 +158,3 @@ def test_states_can_be_forgotten():
     assert same(kept.points[-1].splats, forgotten.points[-1].splats)
     assert [point.state is None for point in kept.points] == [True, False, False]
     assert [point.state is None for point in forgotten.points] == [True, True, False]
-
-
-def test_the_path_does_not_depend_on_threads():
-    points = []
-    for threads in (1, 3):
-        walked = path(threads)
-        walked.prune(40)
-        walked.train()
-        points.append(walked.compacted(walked.points[-1], refine=True))
-    assert same(points[0].splats, points[1].splats)

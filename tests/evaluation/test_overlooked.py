@@ -33,6 +33,11 @@ def fifty():
     return objects(50)
 
 
+@pytest.fixture(scope="module")
+def views(fifty):
+    return evaluation_views(fifty[0], Context(1))
+
+
 def parts_of(scene):
     return find_parts(scene, prominence(scene))
 
@@ -97,10 +102,9 @@ def test_coincident_gaussians_are_one_part():
     assert part_of[0] != part_of[700]
 
 
-def test_the_loss_of_any_object_is_visible(fifty):
+def test_the_loss_of_any_object_is_visible(fifty, views):
     """24 drawn cameras show only some of fifty objects; the added ones show the others."""
     scene, object_of = fifty
-    views = evaluation_views(scene)
     assert 20 < sum(view.added for view in views.test) <= MAX_ADDED
     reference_images, unseen = {}, []
     for removed in range(0, 50, 20):
@@ -115,8 +119,8 @@ def test_the_loss_of_any_object_is_visible(fifty):
     assert f"{found.added} of the views were added for parts that the others overlook" in found.extremes
 
 
-def test_added_cameras_follow_the_drawn_ones_whatever_the_threads(fifty):
-    first, again = (evaluation_views(fifty[0], Context(threads)).test for threads in (1, 3))
+def test_added_cameras_follow_the_drawn_ones_whatever_the_threads(fifty, views):
+    first, again = views.test, evaluation_views(fifty[0], Context(3)).test
     assert [view.name for view in first] == [view.name for view in again] == sorted(view.name for view in first)
     for one, other in zip(first, again, strict=True):
         assert one.camera.viewmat.tobytes() == other.camera.viewmat.tobytes()

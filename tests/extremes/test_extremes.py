@@ -123,11 +123,13 @@ def test_one_outlier_among_thousands(attribute, outlier, preset):
 
 @pytest.mark.parametrize(("degree", "preset"), [(0, "fast"), (3, "balanced"), (3, "paper")])
 def test_scenes_of_which_nothing_is_left(degree, preset):
+    """A labels lookup without any entry once raised IndexError; a neutral Gaussian lends the padding its values."""
     nothing = replaced(random_scene(5, degree), means=np.full((5, 3), np.nan))
-    for splats, removed in ((nothing, 5), (nothing.select(slice(0, 0)), 0)):
-        found, result = check(splats, preset)
+    faint = replaced(random_scene(5, degree), opacities=np.full(5, -9))
+    for splats, removed, invisible in ((nothing, 5, 0), (nothing.select(slice(0, 0)), 0, 0), (faint, 0, 5)):
+        found, result = check(splats, preset, prune_invisible=True)
         assert (len(found), found.sh_degree) == (0, degree)
-        assert result.report.cleaned == Cleaned(non_finite=removed)
+        assert (result.report.cleaned, result.report.invisible) == (Cleaned(non_finite=removed), invisible)
 
 
 def arrays(*shape):

@@ -20,11 +20,13 @@ from kissgs.core.splats import ATTRIBUTES
 from kissgs.evaluation.evaluate import evaluate
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.tune import Tuner, _Result
-from kissgs.pipeline.encoding import DECODERS, MODELS, write_files
+from kissgs.pipeline.encoding import MODELS, write_files
 from kissgs.pipeline.scene_files import describe
 from kissgs.planning import rotation_forms
 from kissgs.rendering.sensitivity import measure_sensitivity
+from kissgs.sog.decode import decode as decode_sog
 from kissgs.sogxt.container import YAML_NAME, zip_bytes
+from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import train
 from kissgs.training.supervision import supervision_views, training_targets
@@ -41,7 +43,7 @@ both = pytest.mark.parametrize("container", ["sogxt", "sog"])
 def tuner(scene, container="sogxt", size=40, **changes):
     capture = Views(around(12, size), around(7, size)[1:3], black(), "circle")
     settings = FinetuneSettings(**{**SHORT, "synthetic_view_share": 0.0, **changes})
-    made_for = {"container": MODELS[container], "decode": DECODERS[container]}
+    made_for = {"container": MODELS[container], "decode": decode_sog if container == "sog" else decode_sogxt}
     supervision = supervision_views(scene, capture, settings, Context(1), scoring_stride=0)
     targets = training_targets(scene, supervision, Context(1))
     return Tuner(scene, settings, supervision, targets, Context(1), **made_for)

@@ -26,7 +26,7 @@ from helpers.reference_ply import (
 )
 
 import kissgs
-from kissgs.core.errors import Cancelled, InvalidSceneError
+from kissgs.core.errors import InvalidSceneError
 from kissgs.core.splats import Splats, concatenate
 from kissgs.io import ply
 from kissgs.io import ply_rows as ply_body
@@ -279,17 +279,6 @@ def test_written_and_read_again_bit_by_bit(degree, count):
     write_ply(pipe, splats, progress=lambda stage, fraction: seen.append((stage, fraction)))
     assert_identical(read_ply(pipe.data), splats)
     assert seen[-1:] == ([("write", 1.0)] if count else [])
-
-
-def test_cancelling():
-    def stop(stage, fraction):
-        raise Cancelled("stopped")
-
-    data = ply_bytes(random_columns(2, 0))
-    with pytest.raises(Cancelled):
-        read_ply(data, progress=stop)
-    with pytest.raises(Cancelled):
-        write_ply(io.BytesIO(), read_ply(data), progress=stop)
 
 
 def test_info_does_not_read_the_body():

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from helpers.captured_scene import SCENE as CAPTURED
 from helpers.captured_scene import write_capture
+from helpers.fewer_cameras import try_fewer
 
 import kissgs
 from kissgs import Cancelled, InvalidContainerError, InvalidSceneError, InvalidViewsError, OutputError, Settings
@@ -250,8 +251,9 @@ def test_files_have_the_permissions_that_new_files_have(tmp_path):
     assert (tmp_path / "folder" / "meta.json").stat().st_mode & 0o777 == 0o640
 
 
-def test_given_sensitivity_is_used():
+def test_given_sensitivity_is_used(monkeypatch):
     """Gaussians with a thousandth of the sensitivity are quantised more coarsely."""
+    try_fewer(monkeypatch)  # but not as few as in other tests here
     cameras = [view.camera for view in kissgs.virtual_views(SCENE, width=64, height=64, count=4).all]
     measured = kissgs.measure_sensitivity(
         SCENE, kissgs.WeightedCameras(cameras, [1.0] * 4, np.zeros(3, np.float32)), view_uncertainty=1
@@ -291,7 +293,7 @@ def test_a_scene_from_a_file_is_dropped_before_its_images_are_compressed(tmp_pat
     alive = []
 
     def progress(stage, fraction, note=""):
-        if stage == "images":
+        if stage == "images" and len(alive) < 3:  # looking at all objects takes long
             scenes = [thing for thing in gc.get_objects() if type(thing) is Splats]
             alive.append(sum(len(scene) == count for scene in scenes))
 
@@ -324,8 +326,3 @@ def test_the_order_leads_back_to_the_input_of_a_compaction(preset):
     assert len(found) == len(result.order) <= 60
     distances = np.linalg.norm(found.means[:, None] - SCENE.means[None], axis=2)
     assert (distances.argmin(axis=1) == result.order).all()
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_threads_do_not_change_the_result(threads):
-    assert compress(SCENE, threads=threads).to_zip() == compress(SCENE).to_zip()

@@ -105,15 +105,6 @@ def test_a_ply_is_exact_and_others_are_cleaned(tmp_path):
     assert np.isnan(scene.means[3]).all(), "the given scene is unchanged"
 
 
-def test_axes_of_spz(tmp_path):
-    scene = kissgs.sample_scene(50, sh_degree=1)
-    kissgs.save(scene, tmp_path / "up.spz")
-    kissgs.save(scene, tmp_path / "raw.spz", raw_axes=True)
-    up, raw = kissgs.load(tmp_path / "up.spz"), kissgs.load(tmp_path / "raw.spz", raw_axes=True)
-    np.testing.assert_allclose(up.means, raw.means, atol=1e-3)
-    np.testing.assert_allclose(kissgs.load(tmp_path / "raw.spz").means * [1, -1, -1], raw.means)
-
-
 @pytest.mark.parametrize("name", ["a.zip", "a.sog", "A.ZIP"])
 def test_names_of_containers_lead_to_compress(name, tmp_path):
     with pytest.raises(OutputError, match=r"is the name of a container; kissgs compress writes those$"):

@@ -4,7 +4,7 @@ import struct
 
 import numpy as np
 import pytest
-from helpers.reference_cameras import MODELS, PINHOLE, assert_camera, poses, write_binary, write_photo, write_text
+from helpers.reference_cameras import MODELS, PINHOLE, assert_camera, poses, write_binary, write_text
 
 from kissgs.cameras.captures.colmap import find_colmap, read_colmap
 from kissgs.cameras.captures.load import load_views
@@ -73,19 +73,6 @@ def test_text_with_a_byte_order_mark(tmp_path):
     for path, comments in ((tmp_path / "cameras.txt", 0), (tmp_path / "images.txt", 2)):
         path.write_bytes(b"\xef\xbb\xbf" + b"".join(path.read_bytes().splitlines(keepends=True)[comments:]))
     assert [posed.name for posed in read_colmap(tmp_path).images] == NAMES
-
-
-@WRITERS
-@pytest.mark.parametrize("start", ["C:\\data\\photos\\", "/data/photos/"])
-def test_absolute_names(tmp_path, write, start):
-    """Absolute paths that do not exist are searched for in the capture's folder."""
-    images = poses([f"{start}{name}" for name in ("1.jpg", "2.jpg")])
-    write(tmp_path / "sparse" / "0", {1: PINHOLE}, images)
-    write_photo(tmp_path / "images" / "1.jpg", 120, 80)
-    write_photo(tmp_path / "photos" / "2.jpg", 120, 80)
-    assert [posed.photo for posed in read_colmap(tmp_path / "sparse" / "0").images] == [pose.name for pose in images]
-    views = load_views(tmp_path, hold_out=0).train
-    assert [view.photo for view in views] == [tmp_path / "images" / "1.jpg", tmp_path / "photos" / "2.jpg"]
 
 
 @pytest.mark.parametrize("folder", ["", "sparse/0", "sparse", "colmap/sparse/0", "0"])
