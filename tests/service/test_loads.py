@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import hashlib
 import os
 import resource
 import signal
@@ -14,7 +13,7 @@ import uuid
 import pytest
 import uvicorn
 from helpers.running import wait_until
-from helpers.service import FAST, SLOW, SMALL, problem, read_response, scene_bytes
+from helpers.service import FAST, SLOW, SMALL, keys_of, problem, read_response, scene_bytes
 
 from service.core.metrics import Metrics
 from service.core.problems import ProblemError
@@ -149,7 +148,7 @@ def test_an_upload_while_the_service_stops(start, more):
     job = service.hold()
     head = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(BIG)
     with service.raw(head + BIG[:100_000]) as connection:
-        wait_until(lambda: "kissgs_uploads_in_flight 1.0" in service.http.get("/metrics").text)
+        service.wait_for_uploads(1)
         service.interrupt()
         with contextlib.suppress(ConnectionError):
             connection.sendall(BIG[100_000 : 100_000 + more])
@@ -236,8 +235,7 @@ def test_events_continue_after_a_restart(start):
 
 def test_nobody_holds_all_upload_slots(start):
     """One key once held all of them, with uploads of 9 kB/s."""
-    entries = [f"{owner}:{hashlib.sha256(owner.encode()).hexdigest()}" for owner in ("alice", "bob")]
-    service = start(KISSGS_KEYS=", ".join(entries), KISSGS_MAX_UPLOADS=6)
+    service = start(KISSGS_KEYS=keys_of(alice="alice", bob="bob"), KISSGS_MAX_UPLOADS=6)
     head = b"POST /v1/jobs HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer alice\r\nContent-Length: 5000\r\n\r\nply\n"
 
     def submit(owner):
@@ -245,7 +243,7 @@ def test_nobody_holds_all_upload_slots(start):
         return service.http.post("/v1/jobs", content=SMALL, params={"options": FAST}, headers=headers)
 
     with service.raw(head), service.raw(head):
-        wait_until(lambda: "kissgs_uploads_in_flight 2.0" in service.http.get("/metrics").text)
+        service.wait_for_uploads(2)
         assert "this key" in problem(submit("alice"), 429, "too-many-uploads")["detail"]
         assert submit("bob").status_code == 202
     wait_until(lambda: submit("alice").status_code == 202)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from helpers.service import problem, read_response
+from helpers.service import keys_of, problem, read_response
 
 from service.core.settings import ServiceSettings
 from service.http.app import create_app
@@ -154,7 +154,7 @@ def test_paths_outside_the_folder(service):
 
 def test_the_page_does_not_reveal_whether_a_job_exists(start):
     """The response is the same for an existing and a missing job, without a key."""
-    service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
+    service = start(KISSGS_KEYS=keys_of(alice="secret"))
     job = service.submit(Authorization="Bearer secret")
     existing, missing = (service.http.get(f"/preview/{id}") for id in (job["id"], "0" * 32))
     assert existing.status_code == missing.status_code == 200

@@ -105,7 +105,7 @@ def test_damage_in_any_page_is_detected(tmp_path, damage):
 def test_an_upload_during_the_removal_is_not_accepted(start):
     service = start()
     with service.raw(HEAD % len(SMALL) + SMALL[:-10]) as connection:
-        wait_until(lambda: "kissgs_uploads_in_flight 1.0" in service.http.get("/metrics").text)
+        service.wait_for_uploads(1)
         remove(service.folder)
         connection.sendall(SMALL[-10:])
         answer = read_response(connection)
