@@ -51,7 +51,7 @@ for name in CHECKED:  # a module that has moved must stay checked
 install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "helpers.shape_checks.typechecker")
 
 
-WITH_FEWER_CAMERAS = ("io", "sog", "sogxt", "extremes", "finetuning", "web", "preview")
+WITH_FEWER_CAMERAS = ("io", "sog", "sogxt", "extremes", "finetuning", "web")
 SMALLER_UNLESS_EXHAUSTIVE = ("cli", "compaction", "evaluation", "pipeline", "planning", "service", "streaming")
 AS_USERS_HAVE_IT = {
     "test_bench",  # measures in another process
@@ -78,8 +78,7 @@ def fewer_and_smaller_images(request, monkeypatch):
     if folder in WITH_FEWER_CAMERAS or smaller:
         from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
 
-        if folder != "service":  # where tests share containers, and its conftest.py does it for all
-            try_fewer(monkeypatch)
+        try_fewer(monkeypatch)
         if smaller:
             evaluate_smaller(monkeypatch, searches=folder == "pipeline")
 

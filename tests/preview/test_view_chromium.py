@@ -31,9 +31,7 @@ def shown(preview):  # noqa: F811
 
     def show(scene, count):
         with serving(scene) as server:
-            tab = preview()
-            tab.origin = server.url.partition("?")[0]
-            tab.page.goto(server.url)
+            tab = preview().visit(server)
             image = tab.shown(count)
             assert tab.page.locator("#title").inner_text() == scene.name
         return image

@@ -2,20 +2,11 @@
 
 import pytest
 from helpers.data_folders import jobs_folder, no_variables, sample_folder  # noqa: F401
-from helpers.fewer_cameras import try_fewer
 from helpers.page_browser import browser, visit  # noqa: F401
 from helpers.preview_browser import preview, software_browser  # noqa: F401
 from helpers.service import SMALL, Service, ServiceProcess
 
 import kissgs
-
-
-@pytest.fixture(autouse=True, scope="package")
-def _fewer_cameras():
-    """Choose virtual cameras from fewer, here and in the threads of jobs, but not in processes of jobs."""
-    with pytest.MonkeyPatch.context() as patch:
-        try_fewer(patch)
-        yield
 
 
 @pytest.fixture(scope="package")

@@ -32,6 +32,7 @@ def test_the_status_equals_the_report(service, job, local):
     assert "progress" not in job
     assert "estimate" not in job
     assert "cancel" not in job["links"]
+    assert job["links"]["preview"] == f"/preview/{job['id']}"
 
 
 def test_every_link_works(service, job):

@@ -160,11 +160,3 @@ def test_the_page_does_not_reveal_whether_a_job_exists(start):
     assert existing.status_code == missing.status_code == 200
     assert existing.content == missing.content
     assert stable_headers(existing) == stable_headers(missing)
-
-
-def test_only_a_result_has_a_preview(service):
-    job = service.submit()
-    assert "preview" not in job["links"]
-    assert service.ended(job)["links"]["preview"] == f"/preview/{job['id']}"
-    failed = service.http.post(service.submit()["links"]["cancel"]).json()
-    assert "preview" not in failed["links"] or failed["state"] == "succeeded"
