@@ -49,26 +49,6 @@ def test_choosing_files(preview, service):
     tab.error_message("graphics driver has reset")
 
 
-@pytest.mark.quick(0)
-def test_dropping_files(preview, service, tmp_path):
-    (tmp_path / "a.ply").write_bytes(PLY)
-    kissgs.save(kissgs.load(tmp_path / "a.ply"), tmp_path / "a.spz")
-    tab = preview().open(service)
-    page = tab.page
-    tab.drop(("a.ply", PLY))  # alone
-    alone = tab.shown(800)
-    assert colours(alone) > 3000
-    assert f"{len(PLY):,}" in page.locator("#statistics").inner_text()
-    assert not page.locator("#compare").is_visible()
-    tab.drop(("a.spz", (tmp_path / "a.spz").read_bytes()))
-    assert psnr(tab.shown(800), alone) > 25  # upright, and in the same place
-    tab.drop(("a.zip", ZIP), ("a.ply", PLY))  # both at once
-    page.get_by_role("slider").wait_for()
-    tab.shown(COUNT)
-    assert page.get_by_role("heading", name="a", exact=True).is_visible()
-    assert [url for method, url in tab.requests if method != "GET" or "/v1/" in url] == []
-
-
 UNSUITABLE = {
     "letter.txt": (b"Dear reader,\n" * 99, ["zip"]),
     "half.zip": (ZIP[: len(ZIP) // 2], ["zip"]),
