@@ -54,7 +54,7 @@ for name in CHECKED:  # a module that has moved must stay checked
 install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "helpers.shape_checks.typechecker")
 
 
-WITH_FEWER_CAMERAS = ("io", "sog", "sogxt", "extremes", "finetuning")
+WITH_FEWER_CAMERAS = ("io", "sog", "sogxt", "extremes", "finetuning", "web")
 SMALLER_UNLESS_EXHAUSTIVE = ("cli", "compaction", "evaluation", "pipeline", "planning", "service", "streaming")
 AS_USERS_HAVE_IT = {
     "test_bench",  # measures in another process
@@ -81,10 +81,8 @@ def fewer_and_smaller_images(request, monkeypatch):
     if folder in WITH_FEWER_CAMERAS or smaller:
         from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
 
-        if folder == "pipeline":
-            try_fewer(monkeypatch, azimuths=4, radii=(1.1,))
-        elif folder != "service":  # where tests share containers
-            try_fewer(monkeypatch)
+        few = {"azimuths": 4, "radii": (1.1,)} if folder == "pipeline" else {}
+        try_fewer(monkeypatch, **few)
         if smaller:
             evaluate_smaller(monkeypatch, searches=folder == "pipeline")
 

@@ -116,48 +116,53 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path, tmp_path_factory):
     assert same(kissgs.load(target), kissgs.clean(whole.splats)[0])
 
 
-UNTRAINED = ["-n", "9", "-o", "b.ply", "-p", "fast", "--method", "prune"]
-MERGE = ["-n", "9", "-o", "b.ply", "--method", "merge"]
+UNTRAINED = "-n 9 -o b.ply -p fast --method prune"
+MERGING = "--compact 20% --set compact.method=merge"
+REFUSED = {
+    "compact a.ply -o b.ply": (
+        "missing the number of Gaussians to keep: give -n 200k, --ratio 0.2 or --max-psnr-drop 0.2"
+    ),
+    "compact a.ply -n 9": "missing -o: by default the output would overwrite the input",
+    "compact a.ply -n many -o b.ply": (
+        "'many' is no number of Gaussians; give 200000, 200k or 1.5M, or a share with --ratio 0.2"
+    ),
+    "compact a.ply -n 0 -o b.ply": "setting count: input should be greater than or equal to 1, not 0",
+    "compact a.ply --ratio 20 -o b.ply": "setting ratio: input should be less than or equal to 1, not 20.0",
+    "compact a.ply -n 9 --ratio 0.2 -o b.ply": "count and ratio cannot both be met; give one",
+    "compact a.ply -n 9 -o b.ply --set speed=9": "there is no setting 'speed' of compact; there are count, ",
+    "compact a.ply -n 9 -o b.ply --set no.speed=9": "the groups are compact, encode and finetune",
+    "compact a.ply -n 9 -o b.zip/": "b.zip",
+    "compact a.ply --max-psnr-drop 1 -o b.ply --checkpoint": "keeps no checkpoint",
+    "compact a.ply -n 9 -o b.ply --device tpu": "--device tpu: choose cpu or cuda",
+    "compact a.ply -n 9 -o b.ply --method merge --checkpoint": (
+        "only apply to training: leave them out, the method merge"
+    ),
+    f"compact a.ply {UNTRAINED} --device cuda": "leave them out, these settings take no training steps",
+    f"compact a.ply {UNTRAINED} --checkpoint": "leave them out, these settings take no training steps",
+    f"compact a.ply {UNTRAINED} --method cluster": "setting method: input should be 'prune' or 'merge', not 'cluster'",
+    "compact a.ply -n 9 -o there.ply": "exists already",
+    "compress a.ply -o n.zip --device cuda": "add --compact or --finetune",
+    "compress a.ply -o n.zip --checkpoint": "add --compact or --finetune",
+    f"compress a.ply -o n.zip {MERGING} --device cuda": "the method merge does not train",
+    f"compress a.ply -o n.zip {MERGING} --checkpoint": "the method merge does not train",
+    "compress a.ply -o n.zip --set finetune.steps=0": (
+        "setting steps: input should be greater than or equal to 1, not '0'"
+    ),
+    "compress a.ply -o n.zip --finetune=many": (
+        "--finetune many: give a number of steps, or none for that of the preset"
+    ),
+    "compress a.ply -o n.zip --finetune --set finetune.speed=9": "there is no setting 'speed' of finetune; there are ",
+}
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["-o", "b.ply"], "missing the number of Gaussians to keep: give -n 200k, --ratio 0.2 or --max-psnr-drop 0.2"),
-        (["-n", "9"], "missing -o: by default the output would overwrite the input"),
-        (
-            ["-n", "many", "-o", "b.ply"],
-            "'many' is no number of Gaussians; give 200000, 200k or 1.5M, or a share with --ratio 0.2",
-        ),
-        (["-n", "0", "-o", "b.ply"], "setting count: input should be greater than or equal to 1, not 0"),
-        (["--ratio", "20", "-o", "b.ply"], "setting ratio: input should be less than or equal to 1, not 20.0"),
-        (["-n", "9", "--ratio", "0.2", "-o", "b.ply"], "count and ratio cannot both be met; give one"),
-        (["-n", "9", "-o", "b.ply", "--set", "speed=9"], "there is no setting 'speed' of compact; there are count, "),
-        (["-n", "9", "-o", "b.ply", "--set", "no.speed=9"], "the groups are compact, encode and finetune"),
-        (["-n", "9", "-o", "b.zip/"], "b.zip"),
-        (["--max-psnr-drop", "1", "-o", "b.ply", "--checkpoint"], "keeps no checkpoint"),
-        (["-n", "9", "-o", "b.ply", "--device", "tpu"], "--device tpu: choose cpu or cuda"),
-        ([*MERGE, "--checkpoint"], "only apply to training: leave them out, the method merge"),
-        ([*UNTRAINED, "--device", "cuda"], "leave them out, these settings take no training steps"),
-        ([*UNTRAINED, "--checkpoint"], "leave them out, these settings take no training steps"),
-        ([*UNTRAINED, "--method", "cluster"], "setting method: input should be 'prune' or 'merge', not 'cluster'"),
-        (["-n", "9", "-o", "there.ply"], "exists already"),
-    ],
-)
-def test_impossible_requests_are_refused(folder, tmp_path, words, sentence):
+def test_impossible_requests_are_refused(folder, tmp_path):
+    (tmp_path / "a.ply").write_bytes((folder / "a.ply").read_bytes())
     for name in ("b.zip", "there.ply"):
         (tmp_path / name).write_text("mine")
-    assert sentence in failure("compact", folder / "a.ply", *words, cwd=tmp_path)
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"b.zip": "mine", "there.ply": "mine"}
-
-
-def test_options_of_training_need_training(folder, tmp_path):
-    for word in (["--checkpoint"], ["--device", "cuda"]):
-        assert "add --compact or --finetune" in failure(
-            "compress", folder / "a.ply", "-o", "b.zip", *word, cwd=tmp_path
-        )
-        merging = ["--compact", "20%", "--set", "compact.method=merge", "-o", "b.zip"]
-        assert "the method merge does not train" in failure("compress", folder / "a.ply", *merging, *word, cwd=tmp_path)
+    for words, sentence in REFUSED.items():
+        assert sentence in failure(*words.split(), cwd=tmp_path), words
+    assert {path.name for path in tmp_path.iterdir()} == {"a.ply", "b.zip", "there.ply"}
+    assert (tmp_path / "b.zip").read_text() == (tmp_path / "there.ply").read_text() == "mine"
 
 
 def test_a_pipe_leaves_no_checkpoint(folder, tmp_path):
@@ -198,29 +203,22 @@ def test_missing_torch_is_reported(folder, tmp_path):
     assert len(kissgs.load(tmp_path / "b.ply")) == 99
 
 
-@pytest.mark.parametrize(
-    ("text", "budget"),
-    [
-        ("200k", {"count": 200_000}),
-        ("1.5M", {"count": 1_500_000}),
-        ("90,000", {"count": 90_000}),
-        ("12.5 %", {"ratio": 0.125}),
-        (".5 db", {"max_psnr_drop": 0.5}),
-    ],
-)
-def test_budgets(text, budget):
-    assert budget_of(text) == pytest.approx(budget)
+BUDGETS = {
+    "200k": {"count": 200_000},
+    "1.5M": {"count": 1_500_000},
+    "90,000": {"count": 90_000},
+    "12.5 %": {"ratio": 0.125},
+    ".5 db": {"max_psnr_drop": 0.5},
+}
+NO_BUDGETS = ("", "%", "-5", "20%%", "1e5", "k", "0.2 dBs", "nan", "1.2.3", "0.8", "0,2", "1,5M", "0x10", "½")
 
 
-@pytest.mark.parametrize(
-    "text", ["", "%", "-5", "20%%", "1e5", "k", "0.2 dBs", "nan", "1.2.3", "0.8", "0,2", "1,5M", "0x10", "½"]
-)
-def test_invalid_budgets(text):
-    with pytest.raises(kissgs.UnsupportedError, match=r"give a number of Gaussians \(200k\), a share"):
-        budget_of(text)
-
-
-def test_shares():
+def test_budgets_and_shares():
+    for text, budget in BUDGETS.items():
+        assert budget_of(text) == pytest.approx(budget), text
+    for text in NO_BUDGETS:
+        with pytest.raises(kissgs.UnsupportedError, match=r"give a number of Gaussians \(200k\), a share"):
+            budget_of(text)
     assert [share_of(text) for text in ("0.2", " 2.5 % ", "1e-3")] == pytest.approx([0.2, 0.025, 0.001])
     for text in ("a fifth", "%", "", "2%%"):
         with pytest.raises(kissgs.UnsupportedError, match=r"--ratio .*: give a share such as 0\.2 or 20%"):
@@ -255,18 +253,3 @@ def test_the_default_number_of_steps_is_that_of_the_preset():
     for preset, steps in (("fast", 200), ("balanced", 1000), ("paper", 4000)):
         assert chosen(preset, None, finetune=steps_of("auto")).finetune.steps == steps
     assert chosen("fast", None, finetune=steps_of("0")).finetune.enabled is False
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["--set", "finetune.steps=0"], "setting steps: input should be greater than or equal to 1, not '0'"),
-        (["--finetune=many"], "--finetune many: give a number of steps, or none for that of the preset"),
-        (["--finetune", "--set", "finetune.speed=9"], "there is no setting 'speed' of finetune; there are "),
-        (["--device", "cuda"], "add --compact or --finetune"),
-        (["--checkpoint"], "add --compact or --finetune"),
-    ],
-)
-def test_invalid_options(folder, tmp_path, words, sentence):
-    assert sentence in failure("compress", folder / "a.ply", "-o", tmp_path / "b.zip", *words)
-    assert not (tmp_path / "b.zip").exists()

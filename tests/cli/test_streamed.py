@@ -21,7 +21,7 @@ def scene(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("name", ["city/lod-meta.json", "city.sogxt/", "city/levels.json"])
+@pytest.mark.parametrize("name", ["city/lod-meta.json", "city.sogxt/"])
 def test_the_command_writes_what_the_library_writes(scene, tmp_path, name):
     target = f"{tmp_path}/{name}"
     folder = Path(name).parts[0]

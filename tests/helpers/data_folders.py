@@ -4,13 +4,10 @@ import contextlib
 import os
 import shutil
 import sqlite3
-import subprocess
-import sys
 import uuid
 
 import pytest
 
-from helpers.service import ROOT
 from service.core.models import Job, State
 from service.core.settings import ServiceSettings
 from service.http.app import build
@@ -93,15 +90,6 @@ def listing(folder):
 
 def names(folder):
     return {path.name for path in folder.iterdir()}
-
-
-def command(folder, **settings):
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
-    chosen = {"PYTHONPATH": str(ROOT), "KISSGS_PORT": "0", "KISSGS_DATA_DIR": str(folder), **settings}
-    return subprocess.run(
-        [sys.executable, "-P", "-m", "service"],
-        env={**kept, **chosen}, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
 
 
 def database(folder, *statements):

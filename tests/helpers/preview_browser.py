@@ -112,6 +112,12 @@ class Preview:
         self.page.goto(f"{service.url}/preview/{path}")
         return self
 
+    def visit(self, server):
+        """Open the page of ``kissgs view``."""
+        self.origin = server.url.partition("?")[0]
+        self.page.goto(server.url)
+        return self
+
     def shown(self, gaussians):
         """Wait for the scene and return its final image."""
         self.fact("Gaussians", f"{gaussians:,}")

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import copy
 import functools
+import hashlib
 import io
 import json
 import logging
@@ -25,6 +26,7 @@ from fastapi import FastAPI
 
 import kissgs
 import kissgs.runners
+from helpers.running import wait_until
 from helpers.thread_runner import HELD_SEED, ThreadRunner
 from kissgs.io.ply import write_ply
 from service.core.settings import ServiceSettings
@@ -34,11 +36,15 @@ from service.http.server import Server, listen
 ROOT = Path(__file__).parents[2]
 
 
+def ply_bytes(splats):
+    file = io.BytesIO()
+    write_ply(file, splats)
+    return file.getvalue()
+
+
 @functools.cache
 def scene_bytes(gaussians=300, degree=1, seed=0):
-    file = io.BytesIO()
-    write_ply(file, kissgs.sample_scene(gaussians, sh_degree=degree, seed=seed))
-    return file.getvalue()
+    return ply_bytes(kissgs.sample_scene(gaussians, sh_degree=degree, seed=seed))
 
 
 SMALL = scene_bytes()
@@ -68,6 +74,11 @@ SLOW = json.dumps(
     }
 )
 """Settings that keep a worker busy: a process for long, a thread until the job is cancelled."""
+
+
+def keys_of(**keys):
+    """Return the setting KISSGS_KEYS for keys by owner."""
+    return ", ".join(f"{owner}:{hashlib.sha256(key.encode()).hexdigest()}" for owner, key in keys.items())
 
 
 class Service:
@@ -153,6 +164,10 @@ class Service:
         assert answer.status_code == 202, answer.text
         return answer.json()
 
+    def newest(self):
+        """Return the status of the latest job."""
+        return self.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
+
     def cancel(self, job):
         answer = self.http.post(f"/v1/jobs/{job['id']}/cancel")
         assert answer.status_code == 200, answer.text
@@ -207,6 +222,10 @@ class Service:
     def stored(self):
         """Return the ids of all jobs that have files."""
         return {path.name for path in (self.folder / "jobs").iterdir()}
+
+    def wait_for_uploads(self, count):
+        """Wait until so many uploads are in progress."""
+        wait_until(lambda: f"kissgs_uploads_in_flight {count:.1f}" in self.http.get("/metrics").text)
 
     def uploads(self):
         """Return the names of uploads in progress."""

@@ -124,7 +124,7 @@ def is_failure(message):
 
 @contextlib.contextmanager
 def opened(name, browser, query=""):
-    """Yield a viewer, "spark", "playcanvas" or our "streaming", and the site that its page is from.
+    """Yield a viewer, "spark", "playcanvas", or our "preview" or "streaming", and the site that its page is from.
 
     The query "?defaults" leaves a viewer's own settings. No script may fail meanwhile.
     """

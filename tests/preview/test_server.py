@@ -9,6 +9,7 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+from helpers.fewer_cameras import try_fewer
 from helpers.page_server import ask, serving
 from helpers.small_page import FILES, UNSERVED
 
@@ -148,7 +149,8 @@ def test_a_folder_is_packed(tmp_path, splats):
             assert {name: archive.read(name) for name in archive.namelist()} == expected
 
 
-def test_other_formats_become_an_exact_ply_or_a_container(tmp_path, splats):
+def test_other_formats_become_an_exact_ply_or_a_container(tmp_path, splats, monkeypatch):
+    try_fewer(monkeypatch)
     for path in (tmp_path / "scene.ply", tmp_path / "scene.spz"):
         kissgs.save(splats, path)
         found = page_scene(path)

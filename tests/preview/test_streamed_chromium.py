@@ -49,15 +49,9 @@ def server(city, monkeypatch):
 
 @pytest.fixture
 def opened(server, preview):  # noqa: F811
-    """``opened(budget)`` opens the scene in a tab."""
+    """``opened()`` opens the scene in a tab."""
 
-    def begin(budget=None, **options):
-        tab = preview(**options)
-        tab.origin = server.url.partition("?")[0]
-        tab.page.goto(server.url + (f"&gaussians={budget}" if budget else ""))
-        return tab
-
-    return begin
+    return lambda **options: preview(**options).visit(server)
 
 
 def facts(tab):
@@ -174,9 +168,7 @@ def test_the_first_camera_is_within_the_sky(preview, tmp_path, monkeypatch, apar
     assert np.mean(np.linalg.norm(coarsest.means, axis=1) > 8) > 0.3
     assert (tmp_path / "city" / "environment").exists() == apart
     with serving(streamed_folder(tmp_path / "city")) as server:
-        tab = preview()
-        tab.origin = server.url.partition("?")[0]
-        tab.page.goto(server.url)
+        tab = preview().visit(server)
         settle(tab)
         image = tab.still_image()
     background = (image[:8] == (11, 10, 16)).all(axis=-1)

@@ -31,9 +31,7 @@ def shown(preview):  # noqa: F811
 
     def show(scene, count):
         with serving(scene) as server:
-            tab = preview()
-            tab.origin = server.url.partition("?")[0]
-            tab.page.goto(server.url)
+            tab = preview().visit(server)
             image = tab.shown(count)
             assert tab.page.locator("#title").inner_text() == scene.name
         return image
@@ -78,22 +76,3 @@ def test_served_and_from_disk(tmp_path, container, shown, preview):  # noqa: F81
     blocked = tab.page.evaluate(REACH_OUT)
     assert json.loads(blocked) == [["connect-src", "img-src", "script-src-elem"], False]
     tab.expect_errors("^Fetch API cannot load", "^other host: .*/x.png", "^failed: .*/x.png csp", "violates")
-
-
-@pytest.mark.quick(0)
-def test_a_sog(tmp_path, shown, preview):  # noqa: F811
-    scene, fast = kissgs.sample_scene(2000, sh_degree=3), kissgs.Settings(preset="fast")
-    sog = with_view(kissgs.compress(scene, container="sog", settings=fast).to_zip(), VIEW)
-    splats = kissgs.decompress(sog)
-    kissgs.save(splats, tmp_path / "scene.ply")
-    read = shown(page_scene(tmp_path / "scene.ply"), len(splats))
-    served = shown(page_scene(sog), len(splats))
-    assert psnr(read[:-80], served[:-80]) > 40  # below are the buttons, which differ
-    path = tmp_path / "page.html"
-    path.write_bytes(standalone_page(page_scene(sog)))
-    tab = preview(offline=True)
-    tab.origin = path.as_uri()
-    tab.page.goto(tab.origin)
-    assert psnr(tab.shown(len(splats)), served) > 60
-    tab.choose(("half.sog", sog[: len(sog) // 2]))
-    tab.error_message("zip", "cut off")

@@ -6,15 +6,12 @@ import shutil
 
 import pytest
 from helpers.running import item, wait_until
+from helpers.streamed_scenes import files_of as contents
 
 ray_node = pytest.importorskip("kissgs.runners.ray_node")  # which needs Ray
 changed, receive, times_of = ray_node.changed, ray_node.receive, ray_node.times_of
 
 BLOCK = 10
-
-
-def contents(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from kissgs.streaming.compress import compress_streamed
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    small_sizes(monkeypatch, chunk=1600, leaf=300, coarsest=1000)
+    small_sizes(monkeypatch, chunk=1600, leaf=300, coarsest=2000)
     by_stages(monkeypatch)
 
 

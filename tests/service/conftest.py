@@ -2,6 +2,7 @@
 
 import pytest
 from helpers.data_folders import jobs_folder, no_variables, sample_folder  # noqa: F401
+from helpers.page_browser import browser, visit  # noqa: F401
 from helpers.preview_browser import preview, software_browser  # noqa: F401
 from helpers.service import SMALL, Service, ServiceProcess
 

@@ -93,6 +93,7 @@ def test_a_running_job_and_its_cancellation(start):
     cancelled = service.cancel(job)
     assert cancelled["state"] == "cancelled"
     assert "problem" not in cancelled
+    assert not {"preview", "result", "source"} & {*job["links"], *cancelled["links"]}
     assert service.cancel(job)["state"] == "cancelled"  # no change
     problem(service.http.get(f"/v1/jobs/{job['id']}/result"), 409, "not-succeeded")
     assert service.stored() == set()

@@ -2,10 +2,7 @@
 
 import asyncio
 import contextlib
-import hashlib
-import os
 import resource
-import signal
 import socket
 import threading
 import time
@@ -14,7 +11,7 @@ import uuid
 import pytest
 import uvicorn
 from helpers.running import wait_until
-from helpers.service import FAST, SLOW, SMALL, problem, read_response, scene_bytes
+from helpers.service import FAST, SMALL, events, keys_of, problem, read_response, scene_bytes
 
 from service.core.metrics import Metrics
 from service.core.problems import ProblemError
@@ -124,32 +121,15 @@ def test_an_error_in_the_job_process_is_internal(tmp_path):
     assert (outcome.kind, outcome.code) == ("error", "internal")
 
 
-@pytest.mark.quick(0)
-def test_a_signal_to_the_process_group_requeues_the_job(start):
-    """Some supervisors signal the job process, too."""
-    service = start(processes=True, drain_seconds=0.5)
-    job = service.submit(BIG, SLOW)
-    service.running(job)
-    (child,) = service.children()
-    service.interrupt()
-    os.kill(child, signal.SIGTERM)
-    time.sleep(0.05)
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(child, signal.SIGKILL)
-    service.join()
-    service.restart()
-    status = service.status(job)
-    assert (status["state"] in ("queued", "running"), status["starts"] <= 1) == (True, True)
-
-
 @pytest.mark.parametrize("more", [0, 100_000])
 def test_an_upload_while_the_service_stops(start, more):
-    """A stalled upload does not delay the end, either, nor does a job after a second signal."""
+    """A stalled upload does not delay the end, either, nor does a job after a second signal. Events of the job go on
+    after the restart."""
     service = start(drain_seconds=3600 * more)
     job = service.hold()
     head = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(BIG)
     with service.raw(head + BIG[:100_000]) as connection:
-        wait_until(lambda: "kissgs_uploads_in_flight 1.0" in service.http.get("/metrics").text)
+        service.wait_for_uploads(1)
         service.interrupt()
         with contextlib.suppress(ConnectionError):
             connection.sendall(BIG[100_000 : 100_000 + more])
@@ -161,6 +141,9 @@ def test_an_upload_while_the_service_stops(start, more):
     service.join()
     service.restart()
     assert service.status(job)["state"] in ("queued", "running")
+    service.cancel(job)
+    numbers = [number for number, _, _ in events(service.http.get(job["links"]["events"]).text)]
+    assert numbers == list(range(1, len(numbers) + 1))
 
 
 def test_a_second_signal_at_once_is_no_failure(start, caplog):
@@ -214,30 +197,9 @@ def test_refused_methods_list_the_allowed_ones(service):
         assert (answer.headers["allow"], allowed in answer.json()["detail"]) == (allowed, True)
 
 
-@pytest.mark.quick(0)
-def test_events_continue_after_a_restart(start):
-    service = start(processes=True)
-    job = service.submit(scene_bytes(6_000, 2))
-    service.running(job)
-    seen = []
-    with service.http.stream("GET", job["links"]["events"]) as answer:
-        for line in answer.iter_lines():
-            if line.startswith("id: "):
-                seen.append(int(line[4:]))
-            if len(seen) == 3:
-                break
-    service.stop()
-    service.restart()
-    rest = service.http.get(job["links"]["events"], headers={"Last-Event-ID": str(seen[-1])}).text
-    seen += [int(line[4:]) for line in rest.splitlines() if line.startswith("id: ")]
-    assert seen == list(range(1, len(seen) + 1))
-    assert '"succeeded"' in rest
-
-
 def test_nobody_holds_all_upload_slots(start):
     """One key once held all of them, with uploads of 9 kB/s."""
-    entries = [f"{owner}:{hashlib.sha256(owner.encode()).hexdigest()}" for owner in ("alice", "bob")]
-    service = start(KISSGS_KEYS=", ".join(entries), KISSGS_MAX_UPLOADS=6)
+    service = start(KISSGS_KEYS=keys_of(alice="alice", bob="bob"), KISSGS_MAX_UPLOADS=6)
     head = b"POST /v1/jobs HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer alice\r\nContent-Length: 5000\r\n\r\nply\n"
 
     def submit(owner):
@@ -245,7 +207,7 @@ def test_nobody_holds_all_upload_slots(start):
         return service.http.post("/v1/jobs", content=SMALL, params={"options": FAST}, headers=headers)
 
     with service.raw(head), service.raw(head):
-        wait_until(lambda: "kissgs_uploads_in_flight 2.0" in service.http.get("/metrics").text)
+        service.wait_for_uploads(2)
         assert "this key" in problem(submit("alice"), 429, "too-many-uploads")["detail"]
         assert submit("bob").status_code == 202
     wait_until(lambda: submit("alice").status_code == 202)

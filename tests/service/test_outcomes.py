@@ -211,6 +211,14 @@ def test_a_repeated_record_does_not_touch_the_next_start(context, record, monkey
     assert list((context.storage.jobs / job_id).glob("work-*")) == [its_work]
 
 
+def test_a_crash_while_the_service_stops_does_not_count(context):
+    """Some supervisors signal the job process, too."""
+    job_id = add_a_job(context)
+    job, work = start(context)
+    context.worker.completion.record(job, Outcome("crashed", code="crashed"), work, True)
+    assert (context.store.get(job_id).state, context.store.get(job_id).starts) == (State.QUEUED, 0)
+
+
 @pytest.mark.parametrize("outcome", [DONE, Outcome("error", code="time-limit", message="the job took too long")])
 def test_a_repeated_record_of_an_end(context, record, monkeypatch, outcome):
     job_id = add_a_job(context)

@@ -1,21 +1,13 @@
 """The web page in Chromium; oracle: the API's status of the job."""
 
-import hashlib
 import io
 import json
-from urllib.parse import parse_qs, urlsplit
 
 import pytest
+from helpers.page_browser import sent_options
 from helpers.preview_browser import VENDOR
-from helpers.service import FAST, MESH, SLOW, SMALL, Service, problem, scene_bytes
-from helpers.viewers import NO_GPU, chromium
+from helpers.service import FAST, MESH, SLOW, SMALL, Service, keys_of, problem, scene_bytes
 from PIL import Image
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium(NO_GPU) as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module")
@@ -26,35 +18,9 @@ def busy(tmp_path_factory):
         yield service
 
 
-@pytest.fixture
-def visit(browser, service):
-    """``visit(at=service)`` opens the page; errors and requests to other hosts fail the test."""
-    contexts, errors = [], []
-
-    def begin(at=service, **options):
-        context = browser.new_context(**options)
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(20_000)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda line: errors.append(line.text) if "Content Security Policy" in line.text else None)
-        page.on("request", lambda sent: errors.append(sent.url) if not sent.url.startswith((at.url, "blob:")) else None)
-        page.goto(at.url)
-        return page
-
-    yield begin
-    for context in contexts:
-        context.close()
-    assert errors == []
-
-
 def choose(page, data=SMALL, name="my scene.ply"):
     page.locator("#drop").wait_for()
     page.set_input_files("#file", {"name": name, "mimeType": "application/octet-stream", "buffer": data})
-
-
-def newest(service):
-    return service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
 
 
 def test_upload_compression_and_download(visit, service, local, tmp_path):
@@ -70,7 +36,7 @@ def test_upload_compression_and_download(visit, service, local, tmp_path):
         page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     page.get_by_text("smaller").first.wait_for()
-    job = newest(service)
+    job = service.newest()
     assert (job["name"], job["options"]["preset"], job["state"]) == ("my scene", "fast", "succeeded")
     assert f"{job['sizes']['ratio']:#.3g}×" in page.locator("#job").inner_text()
     preview = page.get_by_role("link", name="Preview")
@@ -97,7 +63,7 @@ def compress_for(page, service, ending):
         page.get_by_role("link", name=f"Download ({ending})").click()
     assert download.value.suggested_filename == f"my scene{ending}"
     facts = dict(text.split("\n", 1) for text in page.locator("#job .facts > div").all_inner_texts())
-    return newest(service), facts
+    return service.newest(), facts
 
 
 def test_formats_by_what_opens_them(visit, service):
@@ -149,7 +115,11 @@ def test_what_to_expect_follows_the_scene(visit, service):
 
 
 def test_goals_and_a_time_limit(visit, busy):
+    """Regression: the size proposed for few Gaussians was below the least one, which prevented the submission."""
     page = visit(busy)
+    choose(page, scene_bytes(60, 0))
+    page.get_by_text("60 Gaussians").wait_for()
+    assert changed_options(page) == {}
     choose(page)
     page.get_by_text("300 Gaussians").wait_for()
     keep, time = page.get_by_label("Gaussians", exact=True), page.get_by_label("Time", exact=True)
@@ -163,40 +133,29 @@ def test_goals_and_a_time_limit(visit, busy):
     time.select_option("in 30 s")
     assert page.get_by_label("Quick").is_checked()  # whoever uses a control means its row
     assert (keep.is_disabled(), keep.input_value()) == (True, "")
-    assert sent_options(page, busy) == {"time_limit": 30}
+    assert changed_options(page) == {"time_limit": 30}
     page.get_by_label("Megabytes").fill("")
     page.get_by_role("button", name="Compress").click()
     assert page.get_by_label("Megabytes").evaluate("field => field.matches(':focus:invalid')")  # nothing was sent
     page.get_by_label("Megabytes").fill("0.008")
     goal = {"encode": {"target_size": 8000}}
-    assert sent_options(page, busy) == {**goal, "compact": {"auto_count": False}, "finetune": {"enabled": False}}
+    assert changed_options(page) == {**goal, "compact": {"auto_count": False}, "finetune": {"enabled": False}}
     page.get_by_label("Fine-tune").check()
     assert figures(page, "Balanced")[2] == "minutes"
-    assert sent_options(page, busy) == {**goal, "finetune": {"enabled": True}}
+    assert changed_options(page) == {**goal, "finetune": {"enabled": True}}
     keep.select_option("Keep half")
     assert figures(page, "Balanced") == ["–", "–", "–"]  # nothing was measured of fewer Gaussians
     page.get_by_label("Move to the origin").check()
     page.get_by_label("Opens in").select_option("spz")
     assert page.get_by_label("Fine-tune").is_disabled()
     assert keep.is_disabled()
-    assert sent_options(page, busy) == {"origin": "auto", "format": "spz"}
+    assert changed_options(page) == {"origin": "auto", "format": "spz"}
 
 
-def test_a_scene_of_few_gaussians_can_be_sent(visit, busy):
-    """Regression: the size that was proposed for it was below the least one, which prevented the submission."""
-    page = visit(busy)
-    choose(page, scene_bytes(60, 0))
-    page.get_by_text("60 Gaussians").wait_for()
-    assert sent_options(page, busy) == {}
-
-
-def sent_options(page, service):
+def changed_options(page):
     """Send the form in vain; return the options that differ from those of balanced."""
     usual = {"preset": "balanced", "format": "sogxt", "evaluate": False, "origin": None, "capture": None}
-    page.route("**/v1/jobs?**", lambda route: route.abort())
-    with page.expect_request("**/v1/jobs?**") as sent:
-        page.get_by_role("button", name="Compress").click()
-    options = json.loads(parse_qs(urlsplit(sent.value.url).query)["options"][0])
+    options = sent_options(page)
     page.get_by_role("button", name="Back").click()
     return {name: value for name, value in options.items() if (name, value) not in usual.items()}
 
@@ -261,7 +220,7 @@ def assert_options_are_kept(busy, job, page):
     page.get_by_text("300 Gaussians").wait_for()
     page.get_by_role("button", name="Compress").click()
     page.locator("#job-title").wait_for()
-    again = newest(busy)
+    again = busy.newest()
     busy.cancel(again)
     assert (again["id"] != job["id"], again["options"]) == (True, job["options"])
 
@@ -279,39 +238,20 @@ def test_options_that_the_form_lacks_are_described_and_can_be_replaced(repeat, b
     assert_options_are_kept(busy, job, page)
 
 
-def test_a_mesh_is_refused_before_the_estimate(visit, service):
-    """Regression: "3 Gaussians, estimated 39 bytes". Oracle: the service refuses it, too."""
-    page = visit()
-    choose(page, MESH, "a.ply")
-    page.locator("#file-error", has_text="a.ply is a mesh or a point cloud").wait_for()
-    assert "a million Gaussians" in page.locator("#choice-note").inner_text()
-    assert page.locator("#file-facts").is_hidden()
-    assert "mesh" in problem(service.http.post("/v1/jobs", content=MESH), 422, "invalid-scene")["detail"]
-
-
-def test_recent_jobs_show_their_results(visit, start):
-    """Images need a key here, which links cannot send. Oracle: the thumbnail over HTTP."""
-    service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
-    service.http.headers["Authorization"] = "Bearer secret"
-    job = service.ended(service.submit())
-    expected = Image.open(io.BytesIO(service.http.get(job["links"]["thumbnail"]).content))
-    page = visit(service)
-    page.get_by_role("textbox", name="Key").fill("secret")
-    page.get_by_role("button", name="Continue").click()
-    page.wait_for_function("() => document.querySelector('#recent-list img')?.naturalWidth > 0")
-    image = page.locator("#recent-list img")
-    assert image.evaluate("image => [image.naturalWidth, image.naturalHeight]") == list(expected.size)
-
-
 def test_unsuitable_files_are_rejected(visit, service):
+    """Regression: "3 Gaussians, estimated 39 bytes" of a mesh. Oracle: the service refuses it, too."""
     page = visit()
     sent = []
     page.on("request", lambda request: sent.append(request.method) if "/v1/jobs" in request.url else None)
-    for data, message in ((b"hello " * 99, "ply"), (SMALL.replace(b"vertex 300\n", b"vertex 99999\n"), "99,999")):
+    many = SMALL.replace(b"vertex 300\n", b"vertex 99999\n")
+    for data, message in ((MESH, "my scene.ply is a mesh or a point cloud"), (b"hello " * 99, "ply"), (many, "99,999")):
         choose(page, data)
         page.locator("#file-error", has_text=message).wait_for()
+        assert "a million Gaussians" in page.locator("#choice-note").inner_text()
+        assert page.locator("#file-facts").is_hidden()
         page.get_by_role("button", name="Compress").click()
         assert "POST" not in sent
+    assert "mesh" in problem(service.http.post("/v1/jobs", content=MESH), 422, "invalid-scene")["detail"]
     choose(page, SMALL.replace(b"opacity", b"opaqity"))  # found by the service
     page.get_by_role("button", name="Compress").click()
     page.get_by_role("alert").filter(has_text="opacity").wait_for()
@@ -366,8 +306,9 @@ def test_deletion_must_be_confirmed_and_names_are_text(visit, start):
     assert service.http.get("/v1/jobs").json() == {"jobs": []}
 
 
-def test_key_form(visit, start):
-    service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}", KISSGS_JOB_SECONDS=100)
+def test_a_service_with_keys(visit, start):
+    """Images need the key, too, which links cannot send. Oracle: the thumbnail over HTTP."""
+    service = start(KISSGS_KEYS=keys_of(alice="secret"), KISSGS_JOB_SECONDS=100)
     page = visit(service)
     page.get_by_role("textbox", name="Key").fill("wrong")
     page.get_by_role("button", name="Continue").click()
@@ -384,6 +325,12 @@ def test_key_form(visit, start):
     with page.expect_download() as download:
         page.get_by_role("button", name="Download (").click()
     assert download.value.suggested_filename == "my scene.zip"
+    page.goto(service.url)
+    page.wait_for_function("() => document.querySelector('#recent-list img')?.naturalWidth > 0")
+    service.http.headers["Authorization"] = "Bearer secret"
+    thumbnail = service.http.get(service.newest()["links"]["thumbnail"])
+    size = page.locator("#recent-list img").evaluate("image => [image.naturalWidth, image.naturalHeight]")
+    assert size == list(Image.open(io.BytesIO(thumbnail.content)).size)
 
 
 def test_no_horizontal_overflow(visit, service, job):

@@ -3,21 +3,13 @@
 import io
 import json
 import zipfile
-from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from helpers.captured_scene import SCENE, write_capture
-from helpers.service import SLOW
-from helpers.viewers import NO_GPU, chromium
+from helpers.page_browser import sent_options
+from helpers.service import SLOW, ply_bytes
 
 import kissgs
-from kissgs.io.ply import write_ply
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium(NO_GPU) as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module")
@@ -34,39 +26,42 @@ def archive(folder):
     return {"name": f"{'photographs_' * 10}.zip", "mimeType": "", "buffer": buffer.getvalue()}
 
 
-@pytest.fixture(scope="module")
-def scene():
-    file = io.BytesIO()
-    write_ply(file, SCENE)
-    return {"name": "statue.ply", "mimeType": "", "buffer": file.getvalue()}
+SCENE_FILE = {"name": "statue.ply", "mimeType": "", "buffer": ply_bytes(SCENE)}
 
 
 @pytest.fixture
-def page(browser, service, scene):
-    context, errors = browser.new_context(), []
-    page = context.new_page()
-    page.set_default_timeout(20_000)
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.goto(service.url)
+def page(visit):
+    page = visit()
     page.locator("#drop").wait_for()
-    page.set_input_files("#file", scene)
-    yield page
-    context.close()
-    assert errors == []
+    page.set_input_files("#file", SCENE_FILE)
+    return page
 
 
-def newest(service):
-    return service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
-
-
-def test_photographs_make_the_container_of_the_command_line(page, service, folder, scene, archive, tmp_path):
-    page.set_input_files("#capture", archive)
-    page.locator("#capture-title", has_text=".zip").wait_for()
-    page.get_by_text("More options").click()
-    page.get_by_label("Also measure quality").check()
+def compress(page):
     page.get_by_role("button", name="Compress").click()
     page.locator("#job .ratio").wait_for()
-    local = kissgs.compress(scene["buffer"], views=kissgs.load_views(folder), evaluate=True)
+
+
+def try_again(page, service, reference):
+    """Begin to repeat a job that has named photographs."""
+    cancelled = service.submit(SCENE_FILE["buffer"], json.dumps({**json.loads(SLOW), "capture": reference}))
+    service.cancel(cancelled)
+    page.goto(f"{service.url}/#{cancelled['id']}")
+    page.get_by_role("button", name="Try again").click()
+    page.locator("#capture-title", has_text="The photographs of the earlier job").wait_for()
+    page.set_input_files("#file", SCENE_FILE)
+
+
+def test_photographs_from_the_first_job_to_the_next_scene(page, service, folder, archive, tmp_path):
+    """Regression: they stayed chosen for the next scene."""
+    page.set_input_files("#capture", archive)
+    page.locator("#capture-title", has_text=".zip").wait_for()
+    page.get_by_label("Quick").check()
+    page.get_by_text("More options").click()
+    page.get_by_label("Also measure quality").check()
+    compress(page)
+    fast = kissgs.Settings(preset="fast")
+    local = kissgs.compress(SCENE_FILE["buffer"], settings=fast, views=kissgs.load_views(folder), evaluate=True)
     with page.expect_download() as download:
         page.get_by_role("link", name="Download (").click()
     download.value.save_as(tmp_path / "x.zip")
@@ -76,22 +71,37 @@ def test_photographs_make_the_container_of_the_command_line(page, service, folde
     assert f"{mean.candidate.psnr:.2f} dB" in shown
     assert f"{mean.reference.psnr:.2f} dB" in shown
 
+    page.get_by_role("link", name="Another scene").click()
+    page.locator("#capture-title", has_text="Add its photographs").wait_for()
+    assert page.locator("#capture-remove").is_hidden()
+
+    reference = service.newest()["options"]["capture"]
+    try_again(page, service, reference)
+    page.get_by_label("Quick").check()
+    compress(page)
+    repeated = service.newest()
+    assert (repeated["state"], repeated["options"]["capture"]) == ("succeeded", reference)
+
+    try_again(page, service, reference)
+    gone = {"title": "Gone", "detail": "send its archive in the field 'capture'", "code": "gone", "status": 410}
+    page.route("**/v1/jobs?**", lambda route: route.fulfill(status=410, json={**gone, "retryable": False}))
+    page.get_by_role("button", name="Compress").click()
+    page.locator("#upload .problem", has_text="choose their archive again").wait_for()
+    assert "field" not in page.locator("#upload .problem").inner_text(), "the words are those of the page"
+
 
 def test_a_goal_trains_on_the_photographs(page, service, archive):
     """The page leaves to the service what the command line does, too."""
     pytest.importorskip("torch")
     page.get_by_label("Quality", exact=True).select_option("at most 0.1 dB PSNR loss")
     page.set_input_files("#capture", archive)
-    page.route("**/v1/jobs?**", lambda route: route.abort())
-    with page.expect_request("**/v1/jobs?**") as sent:
-        page.get_by_role("button", name="Compress").click()
-    options = json.loads(parse_qs(urlsplit(sent.value.url).query)["options"][0])
+    options = sent_options(page)
     assert (options["encode"], "compact" in options, "finetune" in options) == ({"max_psnr_drop": 0.1}, False, False)
     page.get_by_text("The connection failed or was interrupted").wait_for()
     page.unroute("**/v1/jobs?**")
     page.get_by_role("button", name="Try again").click()
     page.locator("#job-title").wait_for()
-    job = newest(service)
+    job = service.newest()
     service.cancel(job)
     assert job["options"]["capture"].startswith("sha256:")
     assert (job["options"]["compact"]["auto_count"], job["options"]["finetune"]["enabled"]) == (True, True)
@@ -109,7 +119,7 @@ def test_what_is_no_archive_is_refused_before_the_upload(page, archive):
         assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
-def test_a_scene_and_its_photographs_are_dropped_anywhere(page, scene, archive):
+def test_a_scene_and_its_photographs_are_dropped_anywhere(page):
     page.evaluate(
         """(names) => {
             const data = new DataTransfer();
@@ -120,50 +130,3 @@ def test_a_scene_and_its_photographs_are_dropped_anywhere(page, scene, archive):
     )
     page.locator("#capture-title", has_text="photos.tar.xz, 9 bytes").wait_for()
     page.locator("#file-title", has_text="scene.spz").wait_for()
-
-
-def try_again(page, service, scene, archive):
-    """Compress a scene with photographs, and begin to repeat a job that has named them; return their reference."""
-    page.get_by_label("Quick").check()
-    page.set_input_files("#capture", archive)
-    page.get_by_role("button", name="Compress").click()
-    page.locator("#job .ratio").wait_for()
-    reference = newest(service)["options"]["capture"]
-    cancelled = service.submit(scene["buffer"], json.dumps({**json.loads(SLOW), "capture": reference}))
-    service.cancel(cancelled)
-    page.goto(f"{service.url}/#{cancelled['id']}")
-    page.get_by_role("button", name="Try again").click()
-    return reference
-
-
-def test_a_repeated_job_names_the_photographs(page, service, scene, archive):
-    reference = try_again(page, service, scene, archive)
-    page.locator("#capture-title", has_text="The photographs of the earlier job").wait_for()
-    page.set_input_files("#file", scene)
-    page.get_by_label("Quick").check()
-    page.get_by_role("button", name="Compress").click()
-    page.locator("#job .ratio").wait_for()
-    repeated = newest(service)
-    assert (repeated["state"], repeated["options"]["capture"]) == ("succeeded", reference)
-
-
-def test_photographs_are_those_of_one_scene(page, archive):
-    """Regression: they stayed chosen for the next scene."""
-    page.get_by_label("Quick").check()
-    page.set_input_files("#capture", archive)
-    page.locator("#capture-title", has_text=".zip").wait_for()
-    page.get_by_role("button", name="Compress").click()
-    page.locator("#job .ratio").wait_for()
-    page.get_by_role("link", name="Another scene").click()
-    page.locator("#capture-title", has_text="Add its photographs").wait_for()
-    assert page.locator("#capture-remove").is_hidden()
-
-
-def test_photographs_that_are_gone_are_asked_for_in_words_of_the_page(page, service, scene, archive):
-    try_again(page, service, scene, archive)
-    page.set_input_files("#file", scene)
-    gone = {"title": "Gone", "detail": "send its archive in the field 'capture'", "code": "gone", "status": 410}
-    page.route("**/v1/jobs?**", lambda route: route.fulfill(status=410, json={**gone, "retryable": False}))
-    page.get_by_role("button", name="Compress").click()
-    page.locator("#upload .problem", has_text="choose their archive again").wait_for()
-    assert "field" not in page.locator("#upload .problem").inner_text()

@@ -49,50 +49,49 @@ def test_choosing_files(preview, service):
     tab.error_message("graphics driver has reset")
 
 
-@pytest.mark.quick(0)
-def test_dropping_files(preview, service, tmp_path):
-    (tmp_path / "a.ply").write_bytes(PLY)
-    kissgs.save(kissgs.load(tmp_path / "a.ply"), tmp_path / "a.spz")
-    tab = preview().open(service)
-    page = tab.page
-    tab.drop(("a.ply", PLY))  # alone
-    alone = tab.shown(800)
-    assert colours(alone) > 3000
-    assert f"{len(PLY):,}" in page.locator("#statistics").inner_text()
-    assert not page.locator("#compare").is_visible()
-    tab.drop(("a.spz", (tmp_path / "a.spz").read_bytes()))
-    assert psnr(tab.shown(800), alone) > 25  # upright, and in the same place
-    tab.drop(("a.zip", ZIP), ("a.ply", PLY))  # both at once
-    page.get_by_role("slider").wait_for()
-    tab.shown(COUNT)
-    assert page.get_by_role("heading", name="a", exact=True).is_visible()
-    assert [url for method, url in tab.requests if method != "GET" or "/v1/" in url] == []
+UNSUITABLE = {
+    "letter.txt": (b"Dear reader,\n" * 99, ["zip"]),
+    "half.zip": (ZIP[: len(ZIP) // 2], ["zip"]),
+    "half.ply": (PLY[: len(PLY) // 2], ["half.ply"]),
+    "garden.glb": (b"anything", ["does not open glTF", '"kissgs view garden.glb"']),
+    "mesh.ply": (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", ["mesh.ply"]),
+}
 
 
-@pytest.mark.parametrize(
-    ("name", "data", "words"),
-    [
-        ("letter.txt", b"Dear reader,\n" * 99, ["zip"]),
-        ("half.zip", ZIP[: len(ZIP) // 2], ["zip"]),
-        ("half.ply", PLY[: len(PLY) // 2], ["half.ply"]),
-        ("garden.glb", b"anything", ["does not open glTF", '"kissgs view garden.glb"']),
-        ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", ["mesh.ply"]),
-    ],
-)
-@pytest.mark.quick(1)
-def test_unsuitable_files(preview, service, name, data, words):
-    """They are rejected with a message, and a scene that is shown stays."""
-    tab = preview().open(service)
-    tab.drop((name, data))
-    tab.error_message(*words)
-    assert tab.page.locator("#empty").is_visible()
+def test_what_cannot_be_shown(preview, service):
+    """Invalid addresses, files of other kinds, a scene without Gaussians, a small file that claims to be a large scene;
+    a scene that is shown stays."""
+    tab = preview()
+    for address in ("%25E0%25A4%25A.zip", "http://[bad"):
+        tab.open(service, f"?src={address}").error_message("not an address")
+        assert tab.page.locator("#empty").is_visible()
+    tab.open(service)
+    assert_progress_never_decreases(tab.page)
+    for name, (data, words) in UNSUITABLE.items():
+        tab.drop((name, data))
+        tab.error_message(*words)
+        assert tab.page.locator("#empty").is_visible()
     tab.drop(("b.zip", OTHER))
     before = tab.shown(OTHERS)
     assert not tab.page.locator("#problem").is_visible()
-    tab.drop((name, data))
-    tab.error_message(*words)
-    tab.page.get_by_role("button", name="Dismiss").click()
+    for name, (data, words) in UNSUITABLE.items():
+        tab.drop((name, data))
+        tab.error_message(*words)
+        tab.page.get_by_role("button", name="Dismiss").click()
     assert psnr(tab.shown(OTHERS), before) > 60
+
+    none = kissgs.compress(scene_bytes(0, 0), settings=kissgs.Settings(preset="fast")).to_zip()
+    tab.drop(("none.zip", none))
+    tab.shown(0)
+    tab.fact("Per Gaussian", "none")
+    assert not tab.page.locator("#problem").is_visible()
+    file = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(ZIP)) as original, zipfile.ZipFile(file, "w") as other:
+        meta = json.loads(original.read("meta.json")) | {"count": 11_000_000, "gridSide": 3400}
+        for name in original.namelist():
+            other.writestr(name, json.dumps(meta) if name == "meta.json" else original.read(name))
+    tab.drop(("large.zip", file.getvalue()))
+    assert "10000000" in re.sub("[ ,]", "", tab.error_message("arger than", "Gaussians"))
 
 
 @pytest.mark.quick(0)
@@ -124,6 +123,9 @@ def test_accessibility(preview, service, scheme):
     tab = preview(color_scheme=scheme, reduced_motion="reduce", viewport={"width": 820, "height": 700}).open(service)
     page = tab.page
     assert [node for node in controls(tab) if not node[1]] == []
+    page.set_viewport_size({"width": 360, "height": 500})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    page.set_viewport_size({"width": 820, "height": 700})
     tab.drop(("a.zip", ZIP), ("a.ply", PLY))
     page.get_by_role("slider").wait_for()
     tab.fact("Gaussians", f"{COUNT:,}")
@@ -140,6 +142,20 @@ def test_accessibility(preview, service, scheme):
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/[0-9]+/g).map(Number)")
     assert (np.mean(dark) < 60) == (scheme == "dark")
     assert page.evaluate(ANIMATED) == []
+    assert_no_horizontal_overflow(tab)
+
+
+def assert_no_horizontal_overflow(tab):
+    tab.drop((f"{'a-very-long-name' * 9}.zip", OTHER))
+    tab.fact("Gaussians", f"{OTHERS:,}")
+    tab.page.locator("#loading").wait_for(state="hidden")
+    for width in (360, 1400):
+        tab.page.set_viewport_size({"width": width, "height": 500})
+        assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
+        assert tab.page.locator("#panel").evaluate("(it) => it.scrollWidth <= it.clientWidth")
+        tools = tab.page.locator("#tools").bounding_box()
+        assert tools["x"] >= 0
+        assert tools["x"] + tools["width"] <= width
 
 
 def assert_focus_is_visible(page):
@@ -205,44 +221,6 @@ ANIMATED = """() => [...document.querySelectorAll("*")].filter((element) => {
   const { transitionDuration, transitionProperty, animationName } = getComputedStyle(element);
   return (transitionProperty !== "none" && parseFloat(transitionDuration) > 0) || animationName !== "none";
 }).map((element) => element.outerHTML)"""
-
-
-def test_no_horizontal_overflow_of_the_preview(preview, service):
-    tab = preview(viewport={"width": 360, "height": 500}).open(service)
-    assert tab.page.evaluate("document.documentElement.scrollWidth") <= 360
-    tab.drop((f"{'a-very-long-name' * 9}.zip", OTHER))
-    tab.fact("Gaussians", f"{OTHERS:,}")
-    tab.page.locator("#loading").wait_for(state="hidden")
-    for width in (360, 1400):
-        tab.page.set_viewport_size({"width": width, "height": 500})
-        assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
-        panel = tab.page.locator("#panel")
-        assert panel.evaluate("(it) => it.scrollWidth <= it.clientWidth")
-        tools = tab.page.locator("#tools").bounding_box()
-        assert tools["x"] >= 0
-        assert tools["x"] + tools["width"] <= width
-
-
-def test_what_cannot_be_shown(preview, service):
-    """Invalid addresses, a scene without Gaussians, and a small file that claims to be a large scene."""
-    tab = preview()
-    for address in ("%25E0%25A4%25A.zip", "http://[bad"):
-        tab.open(service, f"?src={address}").error_message("not an address")
-        assert tab.page.locator("#empty").is_visible()
-    tab.open(service)
-    assert_progress_never_decreases(tab.page)
-    none = kissgs.compress(scene_bytes(0, 0), settings=kissgs.Settings(preset="fast")).to_zip()
-    tab.drop(("none.zip", none))
-    tab.shown(0)
-    tab.fact("Per Gaussian", "none")
-    assert not tab.page.locator("#problem").is_visible()
-    file = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(ZIP)) as original, zipfile.ZipFile(file, "w") as other:
-        meta = json.loads(original.read("meta.json")) | {"count": 11_000_000, "gridSide": 3400}
-        for name in original.namelist():
-            other.writestr(name, json.dumps(meta) if name == "meta.json" else original.read(name))
-    tab.drop(("large.zip", file.getvalue()))
-    assert "10000000" in re.sub("[ ,]", "", tab.error_message("arger than", "Gaussians"))
 
 
 def assert_progress_never_decreases(page):

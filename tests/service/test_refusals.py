@@ -196,7 +196,7 @@ def test_idempotency_keys_work_with_a_full_queue(start):
 def test_too_many_uploads(start):
     service = start(KISSGS_MAX_UPLOADS=1)
     with service.raw(HEAD % 500_000 + b"ply\n"):
-        wait_until(lambda: "kissgs_uploads_in_flight 1.0" in service.http.get("/metrics").text)
+        service.wait_for_uploads(1)
         problem(submit(service), 429, "too-many-uploads")
     wait_until(lambda: submit(service).status_code == 202)
 
@@ -257,7 +257,7 @@ def test_a_client_that_disconnects(service):
         connection.shutdown(socket.SHUT_RDWR)
     wait_until(lambda: not service.uploads())
     assert latest() == before
-    wait_until(lambda: "kissgs_uploads_in_flight 0.0" in service.http.get("/metrics").text)
+    service.wait_for_uploads(0)
 
 
 def test_invalid_http(service):

@@ -1,6 +1,5 @@
 """The client, in Python and on the command line, with a real service; oracle: local kissgs.compress."""
 
-import hashlib
 import http.server
 import json
 import os
@@ -17,7 +16,7 @@ import httpx
 import pytest
 from helpers.command_line import KISSGS, run
 from helpers.running import wait_until
-from helpers.service import SMALL, ServiceProcess, scene_bytes
+from helpers.service import SMALL, ServiceProcess, keys_of, scene_bytes
 from helpers.thread_runner import HELD_SEED
 
 import kissgs
@@ -108,12 +107,6 @@ def test_the_note_about_a_service_that_is_down_leaves_its_address_to_the_command
     assert unreachable not in str(raised.value)
 
 
-def newest(service):
-    """Return the latest job, or one without a state where there is none yet."""
-    found = service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"]
-    return found[0] if found else {"state": None}
-
-
 def test_cancellation_by_either_side(service, scene, tmp_path):
     """``Cancelled`` raised by progress cancels the job, and a job that is cancelled on the server ends the client."""
 
@@ -123,16 +116,16 @@ def test_cancellation_by_either_side(service, scene, tmp_path):
 
     def cancel(stage, fraction):
         if stage == "order":
-            service.cancel(newest(service))
+            service.cancel(service.newest())
 
     with kissgs.Remote(service.url) as remote:
         with pytest.raises(kissgs.Cancelled):
             remote.compress(scene, tmp_path / "x.zip", settings=HELD, progress=stop)
-        stopped = newest(service)
+        stopped = service.newest()
         assert stopped["state"] == "cancelled"
         with pytest.raises(kissgs.RemoteError, match="cancelled"):
             remote.compress(scene, tmp_path / "x.zip", settings=HELD, progress=cancel)
-        assert newest(service)["id"] != stopped["id"]
+        assert service.newest()["id"] != stopped["id"]
 
 
 @pytest.mark.quick(0)
@@ -158,19 +151,6 @@ def test_the_service_restarts_during_a_job(tmp_path):
             service.restart()
             client.result(60)
     assert (tmp_path / "x.zip").read_bytes() == kissgs.compress(scene, settings=FAST).to_zip()
-
-
-@pytest.mark.quick(0)
-def test_a_full_queue_is_retried(start, scene, tmp_path):
-    service = start(KISSGS_MAX_QUEUE=1)
-
-    def run(i):
-        with kissgs.Remote(service.url) as remote:
-            remote.compress(scene, tmp_path / f"{i}.zip", settings=FAST)
-
-    with ThreadPoolExecutor() as pool:
-        list(pool.map(run, range(5)))
-    assert len({(tmp_path / f"{i}.zip").read_bytes() for i in range(5)}) == 1
 
 
 def test_a_container_damaged_in_transit(service, scene, tmp_path, monkeypatch):
@@ -230,7 +210,7 @@ class Answers:
                 status, content = left.pop(0)
                 body = (content if isinstance(content, str) else json.dumps(content)).encode()
                 handler.send_response(status)
-                if status == 503:
+                if status in (429, 503):
                     handler.send_header("Retry-After", "1")
                 handler.send_header("Content-Length", str(len(body)))
                 handler.end_headers()
@@ -277,7 +257,7 @@ def fractions_of(act):
 def test_uploads_that_are_repeated_never_go_back(scene, tmp_path):
     """Once as the service is overloaded, and once as it has no longer the capture."""
     (tmp_path / "capture.zip").write_bytes(bytes(100))
-    busy, gone = (503, {"code": "queue-full", "detail": "full"}), (410, {"code": "gone", "detail": "gone"})
+    busy, gone = (429, {"code": "queue-full", "detail": "full"}), (410, {"code": "gone", "detail": "gone"})
     with Answers(busy, gone, (202, {"id": "1"})) as server, kissgs.Remote(server.url) as remote:
         capture = tmp_path / "capture.zip"
         found = fractions_of(
@@ -311,7 +291,7 @@ def test_the_command_checks_everything_before_it_packs_photographs(unreachable, 
 
 @pytest.mark.quick(0)
 def test_the_command_with_keys(start, scene):
-    service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
+    service = start(KISSGS_KEYS=keys_of(alice="secret"))
     without = kissgs_command("compress", scene, "--server", service.url)
     assert (without.returncode, "requires a key" in without.stderr) == (2, True)
     assert kissgs_command("compress", scene, "--server", service.url, KISSGS_KEY="secret").returncode == 0
@@ -325,16 +305,16 @@ def test_invalid_commands(scene):
         assert len(done.stderr.splitlines()) == 1
 
 
-def test_interrupting_the_command_cancels_the_job(service, scene):
+def test_interrupting_the_command_cancels_the_job(service, job, scene):
     words = ["remote", "compress", scene, "-p", "fast", "--set", f"seed={HELD_SEED}", "--server", service.url]
     running = subprocess.Popen([KISSGS, *words], stderr=subprocess.PIPE, text=True)
-    wait_until(lambda: newest(service)["state"] == "running")
+    wait_until(lambda: service.newest()["state"] == "running")
     time.sleep(1)  # until the client has received the job's id
     running.send_signal(signal.SIGINT)
     assert running.wait(20) == 130
     assert "interrupted" in running.stderr.read()
     running.stderr.close()
-    assert newest(service)["state"] == "cancelled"
+    assert service.newest()["state"] == "cancelled"
     assert list(scene.parent.glob("*.zip")) == []
 
 

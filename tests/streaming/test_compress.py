@@ -178,9 +178,10 @@ def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(target, tmp_path,
     assert files_of(target.parent) == expected
 
 
-def test_work_is_continued_with_the_same_settings_for_the_same_container_alone(scene, tmp_path, monkeypatch):
-    """Work that goes on needs no room for what is done: new files take the place of others."""
-    target = tmp_path / "city" / "lod-meta.json"
+def test_work_is_continued_with_the_same_settings_for_the_same_container_alone(scene, written, tmp_path, monkeypatch):
+    """Work that goes on needs no room for what is done: new files take the place of others, and what a killed process
+    left incomplete is removed."""
+    target, expected = tmp_path / "city" / "lod-meta.json", files_of(written("city/lod-meta.json")[0].parent)
 
     def stop(stage, fraction, note=""):
         if stage == "images" and fraction > 0.5:
@@ -188,6 +189,8 @@ def test_work_is_continued_with_the_same_settings_for_the_same_container_alone(s
 
     with pytest.raises(Stop):
         compress_streamed(scene, target, settings=FAST, progress=stop)
+    (tmp_path / "city.partial" / "out" / ".kissgs.0.part").write_bytes(b"half")
+    (tmp_path / ".kissgs.city.partial.old").mkdir()
     other = Settings.research("fast", sh0_step=0.1)
     for destination, settings in ((target, other), (target.with_name("levels.json"), FAST)):
         with pytest.raises(OutputError, match=r"city\.partial belongs to other or older work; delete it"):
@@ -202,7 +205,8 @@ def test_work_is_continued_with_the_same_settings_for_the_same_container_alone(s
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100_000))
     compress_streamed(scene, target, settings=FAST, progress=again)
-    assert len(kissgs.load(target)) > 0
+    assert files_of(tmp_path / "city") == expected
+    assert [path.name for path in tmp_path.iterdir()] == ["city"]
 
 
 @pytest.mark.parametrize("name", TARGETS)

@@ -48,10 +48,11 @@ RANGES = (*(f"{field}.{end}" for field in FIELDS for end in ("mins", "maxs")), "
 
 ODD = [
     # Ranges
-    *(put(path, value) for path in RANGES for value in (*NO_NUMBER, "del")),
-    *(put(path, value, accepted=True) for path in RANGES for value in (1, [1.5], [1, "x"] * 30)),
+    *(put(path, value) for path in RANGES for value in ("7", [[7.0]], "del")),
+    *(put(path, value) for path in ("means.mins", "sh0.maxs", "shN.centroidsMins") for value in NO_NUMBER),
+    *(put(path, value, accepted=True) for path in ("quats.maxs", "shN.centroidsMaxs") for value in (1, [1.5])),
+    *(put(path, [1, "x"] * 30, accepted=True) for path in RANGES),
     *(put(path, value, accepted=True) for path in ("means.mins", "sh0.mins") for value in (0, -0.0, 1.5)),
-    *(put(path, [1.5] * 3, accepted=True) for path in RANGES),
     *(put(path, [1.5, 2, bad]) for path in ("scales.mins", "sh0.maxs") for bad in NO_NUMBER if bad is not False),
     *(put(path, [[1.5, 2, 3]]) for path in ("scales.mins", "sh0.maxs", "means.mins")),
     put("sh0.maxs", 3.4028235677973362e38, accepted=True),

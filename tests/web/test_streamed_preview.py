@@ -117,24 +117,6 @@ def test_a_small_budget_goes_to_what_is_near(viewer, city):
     assert reached > 36
 
 
-def test_a_file_that_is_missing(viewer, city):
-    folder, url = city
-    site = viewer[1]
-    lost = {path: site.files.pop(path) for path in [*site.files] if "/0_1/scales" in path}
-    site.asked.clear()
-    try:
-        found = draw(viewer, CAMERA, url=url, budget=MANY)
-    finally:
-        site.files.update(lost)
-    ((name, why),) = found["problems"]
-    assert name == "0_1/meta.json"
-    assert "scales.webp cannot be fetched: the server answers with status 404" in why
-    assert site.asked.count(*lost) == 2
-    levels = levels_drawn(folder, found["ranges"])
-    assert set(levels) == {0, 1}
-    assert psnr(found["image"], rendered(rows_of(folder, found["ranges"]))) > 38
-
-
 def test_sogxt_containers_and_an_environment(viewer, tmp_path):
     """A manifest of zips, as one for this project's own containers has them: two leaves, two levels, a sky."""
     scene = scattered(900, 1)

@@ -5,75 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.viewers import pinhole, psnr, seen_from, skewed
-from helpers.web_tools import DECODER
+from helpers.viewers import opened, pinhole, psnr, seen_from, skewed
 
 import kissgs
 from kissgs.core.splats import SH_REST_COUNTS
 
-pytestmark = pytest.mark.skipif(not (DECODER / "vendor").exists(), reason="scripts/vendor has not run")
-
-
-PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
-<script type="importmap">{"imports": {
-  "three": "/web_decoder/vendor/three/build/three.module.min.js",
-  "three/addons/": "/web_decoder/vendor/three/examples/jsm/",
-  "@sparkjsdev/spark": "/web_decoder/vendor/spark/dist/spark.module.min.js"}}</script>
-<script type="module" src="/page.js"></script>"""
-
-PROGRAM = """
-import { Viewer } from "/web_decoder/preview/viewer.js";
-
-const bytesOf = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-const floats = (text) => new Float32Array(bytesOf(text).buffer);
-const textOf = (bytes) => {
-  let text = "";
-  for (let at = 0; at < bytes.length; at += 32768) text += String.fromCharCode(...bytes.subarray(at, at + 32768));
-  return btoa(text);
-};
-const newViewer = () => new Viewer(document.body.appendChild(document.createElement("canvas")));
-const [one, other] = [newViewer(), newViewer()];
-
-function sceneOf({ count, degree, labels, meta, ...fields }) {
-  const arrays = Object.fromEntries(Object.entries(fields).map(([name, text]) => [name, floats(text)]));
-  return { count, degree, meta, labels: new Uint16Array(bytesOf(labels).buffer), ...arrays };
-}
-
-async function imagesOf(viewer, cameras) {
-  const images = [];
-  for (const camera of cameras) {
-    viewer.setCamera(camera);
-    await viewer.render();
-    images.push(textOf(viewer.readPixels().data));
-  }
-  return images;
-}
-
-window.draw = async ({ scene, cameras, background = "#000000", file = null }) => {
-  one.setScene(sceneOf(scene));
-  one.setBackground(background);
-  const found = { drawn: await imagesOf(one, cameras) };
-  if (file !== null) {
-    found.read = await other.setFile(file.type, bytesOf(file.bytes), one);
-    if (!file.beside) await other.setFile(file.type, bytesOf(file.bytes));
-    found.beside = await imagesOf(other, cameras);
-  }
-  return found;
-};
-"""
-
 
 @pytest.fixture(scope="module")
-def page(browser, site):
-    errors = []
-    site.files |= {"/page.html": PAGE.encode(), "/page.js": PROGRAM.encode()}
-    page = browser.new_page()
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    page.goto(f"{site.url}/page.html")
-    yield page
-    page.close()
-    assert errors == []
+def page(browser):
+    with opened("preview", browser) as (viewer, _):
+        yield viewer.page
 
 
 def encoded(array):
