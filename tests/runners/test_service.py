@@ -184,6 +184,17 @@ def test_the_limits_of_jobs(request, tmp_path, runner):
         assert "1.5 s" in problem["detail"]
 
 
+@pytest.mark.quick(0)
+def test_a_job_whose_node_is_killed_runs_elsewhere(whole_cluster, tmp_path):
+    with RayService(tmp_path / "data", whole_cluster) as service:
+        job = service.submit(MEDIUM, FAST)
+        (pid,) = processes_of(service, job)
+        whole_cluster.kill_node_of(pid)
+        assert result_of(service, job) == compressed(MEDIUM)
+        assert service.status(job)["starts"] == 2
+        assert service.leftovers() == []
+
+
 def test_no_job_starts_without_a_node_that_is_large_enough(on_the_cluster, whole_cluster, tmp_path):
     with Service(tmp_path / "data", **{**on_the_cluster, "KISSGS_JOB_MEMORY": "2GB"}) as service:
         job = service.submit()

@@ -4,7 +4,9 @@ the disk."""
 import contextlib
 import os
 import shutil
+import signal
 import sqlite3
+import threading
 import time
 from functools import partial
 
@@ -12,7 +14,7 @@ import pytest
 from helpers.data_folders import add_a_row as add
 from helpers.data_folders import database as execute
 from helpers.running import wait_until
-from helpers.service import SMALL, Service, problem, read_response, scene_bytes
+from helpers.service import SLOW, SMALL, Service, problem, read_response, scene_bytes
 
 from service.core.models import State
 from service.storage import database
@@ -111,6 +113,62 @@ def test_an_upload_during_the_removal_is_not_accepted(start):
     assert b'"code":"database"' in answer
     assert service.leftovers() == []
     assert list((service.folder / "jobs").iterdir()) == []
+
+
+@pytest.mark.quick(0)
+def test_no_accepted_job_is_lost(start_process):
+    """Jobs accepted with 202 keep their uploads if the database is removed during submissions, and a restart without
+    the database is refused."""
+    service = start_process(KISSGS_MAX_QUEUE=1000)
+    service.running(service.submit(scene_bytes(20_000, 3), SLOW))
+    accepted, refused = [], []
+
+    def submit():
+        while not refused:
+            answer = service.http.post("/v1/jobs", content=SMALL)
+            (accepted if answer.status_code == 202 else refused).append(answer)
+
+    threads = [threading.Thread(target=submit) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    time.sleep(1.5)
+    kept = [path.with_name(f"kept-{path.name}") for path in files(service.folder)]
+    for path, link in zip(files(service.folder), kept, strict=True):
+        os.link(path, link)
+    remove(service.folder)
+    for thread in threads:
+        thread.join(30)
+    for answer in refused:
+        problem(answer, 503, "database")
+    assert len(accepted) > 4
+    stored = {path.name for path in (service.folder / "jobs").iterdir()}
+    assert stored >= {answer.json()["id"] for answer in accepted}
+    time.sleep(1.5)
+    running = service.http.get("/v1/jobs", params={"state": "running"}).json()["jobs"]
+    assert len(running) == 1  # none was started after the removal
+    assert "no job is started: jobs.sqlite was removed" in service.log.read_text() or service.children()
+    service.kill(signal.SIGKILL)
+    with pytest.raises(AssertionError, match="is new and has none of them; restore"):
+        service.restart()
+    assert {path.name for path in (service.folder / "jobs").iterdir()} == stored
+    for link in kept:
+        link.rename(link.with_name(link.name.removeprefix("kept-")))
+    service.restart()
+    known = {job["id"]: job for job in all_jobs(service)}
+    assert known.keys() >= stored
+    written = [job for job_id, job in known.items() if job_id not in stored]  # just before the removal was detected
+    assert len(written) <= len(refused)
+    assert all(job["state"] == "failed" and "upload is no longer" in job["problem"]["detail"] for job in written)
+
+
+def all_jobs(service):
+    cursor = {}
+    while True:
+        page = service.http.get("/v1/jobs", params={"limit": 100, **cursor}).json()
+        yield from page["jobs"]
+        if "next" not in page:
+            return
+        cursor = {"cursor": page["next"]}
 
 
 @pytest.mark.quick(0)
