@@ -290,7 +290,7 @@ class EncodeSettings(StageSettings):
     sh_step: Annotated[float, Field(ge=0.01, le=4)] = of_preset(1.15, "Step of entries, in units of their RMS error.")
     sh_weight_power: Share = of_preset(0.35, "Exponent of the weights, opacity x projected area; 0: all equal.")
     sh_kmeans_iterations: Annotated[int, Field(ge=1, le=50)] = of_preset(6, "Iterations of codebook refinement.")
-    sh_neighbors: Annotated[int, Field(ge=8, le=512)] = of_preset(64, "Nearest entries that an iteration compares.")
+    sh_neighbors: Annotated[int, Field(ge=8, le=512)] = of_preset(96, "Nearest entries that an iteration compares.")
     codebook_order: Literal["axes", "refined", "plas"] = of_preset(
         "refined", "Order of entries: blocks along their axes, these refined by PLAS, or PLAS over all dimensions."
     )

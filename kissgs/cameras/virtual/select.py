@@ -119,7 +119,7 @@ def _ground_normal(axis: Vec3, normals: Float64[np.ndarray, "N 3"], weights: Flo
 
 # View scores: how useful a camera is, from a thumbnail of what it sees.
 
-PROXY_GAUSSIANS = 10_000  # largest number of Gaussians in the proxy scene that thumbnails show
+PROXY_GAUSSIANS = 30_000  # largest number of Gaussians in the proxy scene that thumbnails show
 OPAQUE = 0.01  # transmittance at which the list of a thumbnail's pixel ends
 TOO_NEAR = 0.35  # depth in radii of the scene; anything nearer to the camera counts as an obstruction
 CENTRE_SCALE = 30.0  # of the mark of central Gaussians, to use half the range of a colour channel
