@@ -1,4 +1,4 @@
-"""How long compressions take: the steps to expect, and how a limited time is divided among them."""
+"""How long compressions take: the steps to expect, what to do in a limited time, and how it is divided among them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the encoder: sorting, rotations' forms, and local search of the order."""
+"""Compiled inner loops of the encoder: sorting, rotations' forms, local search of the order, and choice of levels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Levels of each attribute with the least distortion and rate, given even steps or tables of values."""
+"""Costs of errors, steps by lambda, and the levels of each attribute with the least distortion and rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The SH codebook: its entries, their order in the codebook's image, and its optimal size."""
+"""The SH codebook: its entries, their order in the codebook's image, its optimal size, and errors by directions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``virtual_views``: virtual cameras that show a scene well, for people to look at."""
+"""Virtual cameras that show a scene well: its bounds, candidates, their scores by thumbnails, and the choice."""
 
 from __future__ import annotations
 
