@@ -95,9 +95,9 @@ def fitting_views(
         return _moved(views, None, splats.origin), ""
     load_kernels(context.progress)
     context.progress("cameras", 0.0)
-    samples, source = _samples(views), views.source
+    samples, given = _samples(views), views
     views, fit, note = _best(splats, views, samples, context.threads, guess=not force)
-    problem = _problem(fit, source, samples)
+    problem = _problem(fit, given, samples)
     refused = not fit.seen or (fit.psnr < LEAST_PSNR and fit.psnr_inside < USUAL_PSNR)
     if samples and not force and refused:
         problem = "; ".join(filter(None, [fit.unread, problem]))
@@ -109,19 +109,19 @@ def fitting_views(
     return views, "; ".join(filter(None, [note, problem]))
 
 
-def _problem(fit: _Fit, source: str, samples: Sequence[_Sample]) -> str:
+def _problem(fit: _Fit, views: Views, samples: Sequence[_Sample]) -> str:
     if not fit.seen:
-        return f"no rendering from the cameras of the capture ({source}) shows any of the scene"
+        return f"no rendering from the cameras of the capture ({views.source}) shows any of the scene"
     if not samples:
-        return NOT_COMPARED
+        return "; ".join(filter(None, [views.note, NOT_COMPARED]))
     if fit.psnr >= USUAL_PSNR:
         return ""
     paths = [view.photo for view, _ in samples if view.photo is not None]
     turned = "; their EXIF orientation is ignored here: turn the pixels ('mogrify -auto-orient')"
     turned = turned if any(orientation(path) != 1 for path in paths) else ""
     return (
-        f"the photographs of the capture ({source}) differ much from renderings of the scene: PSNR {fit.psnr:.1f} dB, "
-        f"the median of {len(samples)}, where more than {USUAL_PSNR:g} are usual{turned}"
+        f"the photographs of the capture ({views.source}) differ much from renderings of the scene: PSNR "
+        f"{fit.psnr:.1f} dB, the median of {len(samples)}, where more than {USUAL_PSNR:g} are usual{turned}"
     )
 
 

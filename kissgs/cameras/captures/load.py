@@ -31,6 +31,7 @@ from kissgs.cameras.captures.transforms_json import (
     DATAPARSER_TRANSFORMS,
     dataparser_files,
     read_split_transforms,
+    read_trained_cameras,
     read_transforms,
     similarities,
 )
@@ -49,6 +50,7 @@ published results depend; INRIA's code limits only the width, so that portrait p
 
 HOLD_OUT = 8  # every eighth view, starting with the first, is held out: the protocol of 3DGS and Mip-NeRF 360
 JSONS = ("transforms.json", "transforms_train.json")
+ARGUMENTS, TRAINED_CAMERAS = "cfg_args", "cameras.json"  # of INRIA's trainer, in the folder of a scene
 MAX_ARGUMENTS_BYTES = 1 << 16  # of cfg_args that are read; INRIA's trainer writes 300
 EVERY_EIGHTH = "cfg_args says eval=False, so the scene was trained on every eighth photograph, which is held out here"
 MAX_ASPECT_ERROR = 0.01  # relative difference of aspect ratios of photograph and camera; scaled copies round sides
@@ -78,7 +80,8 @@ def load_views(
     Cameras are in the coordinates of the camera file. nerfstudio trains scenes in others: its
     ``dataparser_transforms.json``, in the folder of its run that ``scene`` is from, in the capture's folder or beside
     the camera file, is read for those who compare the views with a scene (:attr:`Views.similarities`). A folder of
-    INRIA's trainer stands for the capture, the folder of photographs and the background that its ``cfg_args`` names.
+    INRIA's trainer stands for the capture, the folder of photographs and the background that its ``cfg_args`` names;
+    where that capture is elsewhere, for the cameras of its ``cameras.json``.
 
     If there is no folder of photographs, views have cameras only, without distortion, and ``note`` says so. If only
     some photographs are missing, an error is raised, because results from fewer views could pass for those of all.
@@ -125,15 +128,14 @@ def load_views(
     source = capture.source
     if unpacked:  # where it is unpacked is nobody's concern
         source = source.replace(f"{archive}/", "").replace(f"{archive}", "the archive")
-    if photos is not None:
-        source = f"{source}, photographs of {_folders(photos)}"
-        return Views(
-            train, test, background, source, place.note if test else "", similarities=moves, points=capture.points
-        )
-    searched = searched_folders(names, capture.root)
-    note = f"no photographs were found (searched {searched}); name their folder with --images"
-    note = "the archive has no photographs" if unpacked else note
-    return Views(train, test, background, f"{source}, no photographs", note, moves)
+    notes = [place.note, EVERY_EIGHTH if place.trained_on_all and test else ""]
+    if photos is None:
+        searched = f"no photographs were found (searched {searched_folders(names, capture.root)})"
+        notes.append("the archive has no photographs" if unpacked else f"{searched}; name their folder with --images")
+    source = f"{source}, no photographs" if photos is None else f"{source}, photographs of {_folders(photos)}"
+    note = "; ".join(filter(None, notes))
+    points = None if photos is None else capture.points
+    return Views(train, test, background, source, note, similarities=moves, points=points)
 
 
 def _posed_views(
@@ -156,6 +158,8 @@ def as_views(views: Views | str | PathLike[str] | None, scene: Path | None = Non
 
 def _read_capture(path: Path) -> Capture:
     if path.is_file():
+        if path.name == TRAINED_CAMERAS:
+            return read_trained_cameras(path)
         if path.name == "transforms_train.json":
             return read_split_transforms(path.parent)
         if path.suffix.lower() == ".json":
@@ -194,6 +198,7 @@ class _Place(NamedTuple):
     scale: int | None = None
     images: Path | None = None
     white: bool | None = None  # whether the background is; None: as the capture says
+    trained_on_all: bool = False  # also on views that are held out here
     note: str = ""
 
 
@@ -222,9 +227,10 @@ def _run(scene: Path | None) -> list[Path]:
 
 
 def _trained_on(folder: Path) -> _Place | None:
-    """Return what ``cfg_args`` of INRIA's trainer names; None of a folder without it, or with cameras of its own. It is
-    Python's text of a ``Namespace``, which is parsed and never evaluated."""
-    file, given = folder / "cfg_args", dict[str | None, object]()
+    """Return what ``cfg_args`` of INRIA's trainer names, or its cameras if that is not here; None of a folder that it
+    has not written, or with a capture of its own. It is Python's text of a ``Namespace``, which is parsed and never
+    evaluated."""
+    file, cameras, given = folder / ARGUMENTS, folder / TRAINED_CAMERAS, dict[str | None, object]()
     if not file.is_file() or _has_cameras(folder):
         return None
     with suppress(SyntaxError, ValueError, RecursionError, MemoryError), open_file(file) as (opened, _):
@@ -233,14 +239,14 @@ def _trained_on(folder: Path) -> _Place | None:
         given = {each.arg: each.value.value for each in keywords if isinstance(each.value, ast.Constant)}
     named, photographs = str(given.get("source_path") or ""), str(given.get("images"))
     capture = next((each for each in (Path(named), folder / named) if named and each.is_dir()), None)
+    white, on_all = given.get("white_background") is True, given.get("eval") is False
     if capture is None:
-        cameras = ", and its cameras.json, which names no photographs, is not read"
-        cameras = cameras if (folder / "cameras.json").is_file() else ""
-        remedy = "name the capture's folder with --views"
-        raise InvalidViewsError(f"{file} names no capture that is here: {quoted(named)}{cameras}; {remedy}")
+        missing = f"{file} names no capture that is here: {quoted(named)}"
+        if not cameras.is_file():
+            raise InvalidViewsError(f"{missing}; name the capture's folder with --views")
+        return _Place(cameras, white=white, trained_on_all=on_all, note=f"{missing}, so its {TRAINED_CAMERAS} is used")
     usual = photographs == IMAGES or not (capture / photographs).is_dir()
-    white, note = given.get("white_background") is True, EVERY_EIGHTH if given.get("eval") is False else ""
-    return _Place(capture, images=None if usual else capture / photographs, white=white, note=note)
+    return _Place(capture, images=None if usual else capture / photographs, white=white, trained_on_all=on_all)
 
 
 def capture_of(path: Path, scene: Path | None) -> Path:
@@ -267,7 +273,7 @@ def capture_of(path: Path, scene: Path | None) -> Path:
 def is_capture(path: Path) -> bool:
     """Whether a folder has cameras, or names those that INRIA's trainer was given."""
     with suppress(OSError, ValueError):
-        return _has_cameras(path) or (path / "cfg_args").is_file() or _of_scale(path)[1] is not None
+        return _has_cameras(path) or (path / ARGUMENTS).is_file() or _of_scale(path)[1] is not None
     return False
 
 
@@ -371,7 +377,9 @@ def pack_capture(path: Path, destination: Path, progress: Progress = silent, *, 
     its camera files, and the photographs of its views, those that are used reduced without further loss. Equal captures
     make equal files."""
     load_views(path, scene=scene)  # refuses what a service would refuse
-    path, scale, images, white, _ = _place(path)
+    path, scale, images, white, *_ = _place(path)
+    if path.name == TRAINED_CAMERAS:
+        raise InvalidViewsError(f"the cameras of {path} cannot be sent to a service without a capture; name its folder")
     capture = _read_capture(path)
     names = [posed.photo for posed in capture.images]
     photos = find_photos(names, capture.root, scale=scale, images=images) or ()

@@ -254,6 +254,16 @@ def read_transforms(path: Path) -> Capture:
     return Capture(tuple(images), path.parent, f"cameras of {path}", {"transforms.json": path}, white, applied)
 
 
+def read_trained_cameras(path: Path) -> Capture:
+    """Read the ``cameras.json`` of INRIA's trainer, which names photographs without endings and folders."""
+    images = []
+    for index, view in enumerate(read_cameras(path)):
+        (fx, _, cx), (_, fy, cy), _ = view.camera.K.tolist()
+        intrinsics = Intrinsics(view.camera.width, view.camera.height, fx, fy, cx, cy)
+        images.append(PosedImage(view.name, view.name, f"{path}, camera {index}", view.camera.viewmat, intrinsics))
+    return Capture(tuple(images), path.parent, f"cameras of {path}", {path.name: path})
+
+
 def read_split_transforms(folder: Path) -> Capture:
     """Read ``transforms_train.json``, and ``transforms_test.json`` or else ``transforms_val.json`` as held out."""
     train_path = folder / "transforms_train.json"

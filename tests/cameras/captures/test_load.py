@@ -9,7 +9,7 @@ import pytest
 from helpers.reference_cameras import PINHOLE, assert_camera, frames, poses, write_json, write_photo, write_text
 from PIL import Image
 
-from kissgs.cameras.captures.load import capture_of, load_views, pack_capture
+from kissgs.cameras.captures.load import capture_of, is_capture, load_views, pack_capture
 from kissgs.core.errors import InvalidViewsError
 
 NAMES = [f"{letter}.jpg" for letter in "jihgfedcba"]
@@ -300,13 +300,37 @@ def test_a_folder_of_inrias_trainer_is_packed_as_it_is_loaded(tmp_path):
         pack_capture(tmp_path / "model", tmp_path / "packed.zip")
 
 
-def test_a_downloaded_model_names_what_it_lacks(tmp_path):
-    trained(tmp_path, source_path="/no\n/data")
-    (tmp_path / "cameras.json").write_text("[]")
-    assert message(tmp_path) == (
-        f"{tmp_path}/cfg_args names no capture that is here: '/no\\n/data', and its cameras.json, which names no "
-        "photographs, is not read; name the capture's folder with --views"
-    )
+def test_a_downloaded_model_has_the_cameras_it_was_trained_with(tmp_path):
+    """Without photographs, or with those in a folder that is named; the capture wins where it is here."""
+    folder, data = tmp_path / "model", tmp_path / "data"
+    capture(data, size=(120, 80))
+    trained(folder, source_path="/no\n/data", white_background=True, eval=False)
+    missing = f"{folder}/cfg_args names no capture that is here: '/no\\n/data'"
+    assert message(folder) == f"{missing}; name the capture's folder with --views"
+    here, entries = load_views(data), []
+    for view in reversed(here.all):  # as camera_to_JSON of 3DGS, at twice the size; names lose their endings
+        (fx, fy), pose = view.camera.K[[0, 1], [0, 1]], np.linalg.inv(view.camera.viewmat)
+        entry = {"img_name": Path(view.name).stem, "width": 240, "height": 160, "rotation": pose[:3, :3].tolist()}
+        entries.append({**entry, "position": pose[:3, 3].tolist(), "fx": 2 * fx, "fy": 2 * fy})
+    write_json(folder / "cameras.json", entries)
+    views = load_views(folder)
+    assert views.note.startswith(f"{missing}, so its cameras.json is used; cfg_args says eval=False")
+    assert views.note.endswith("name their folder with --images")
+    assert (views.background.tolist(), views.has_photographs, is_capture(folder)) == ([1] * 3, False, True)
+    with_photographs = load_views(folder, images=data / "images")
+    for found in (views, with_photographs, load_views(folder / "cameras.json")):
+        assert [view.name for view in found.test] == [Path(view.name).stem for view in here.test]
+        for one, other in zip(found.all, here.all, strict=True):
+            np.testing.assert_allclose(one.camera.viewmat, other.camera.viewmat, atol=1e-12)
+    for one, other in zip(with_photographs.all, here.all, strict=True):
+        np.testing.assert_allclose(np.diag(one.camera.K), np.diag(other.camera.K))  # centred, as that trainer has it
+        np.testing.assert_array_equal(one.load_photo(), other.load_photo())
+    with pytest.raises(InvalidViewsError, match="cannot be sent to a service without a capture; name its folder"):
+        pack_capture(folder, tmp_path / "packed.zip")
+    trained(folder, source_path=str(data))
+    assert load_views(folder).source == here.source
+    write_json(folder / "cameras.json", [{**entries[0], "fx": -1}])
+    assert message(folder / "cameras.json") == f"{folder}/cameras.json, camera 0, fx: input should be greater than 0"
 
 
 def test_archives_from_elsewhere_name_no_capture_of_this_machine(tmp_path):
