@@ -89,6 +89,7 @@ CAMERA_FILES = frozenset(
         "cameras.txt",
         "images.txt",
         "points3D.bin",
+        "points3D.txt",
         "dataparser_transforms.json",
         "transforms.json",
         "transforms_train.json",

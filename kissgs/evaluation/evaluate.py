@@ -103,7 +103,7 @@ def fitting_views(
         problem = "; ".join(filter(None, [fit.unread, problem]))
         raise InvalidViewsError(
             f"{problem}: give the capture of this scene, with dataparser_transforms.json beside it if nerfstudio "
-            "trained the scene, or its COLMAP model with points3D.bin if gsplat did, or --force-views (in Python "
+            "trained the scene, or its COLMAP model with its points3D if gsplat did, or --force-views (in Python "
             "force_views) to use it all the same"
         )
     return views, "; ".join(filter(None, [note, problem]))

@@ -220,7 +220,7 @@ def test_gsplats_frame_is_not_guessed_without_photographs_that_show_the_scene(tm
     scene = gsplat_scene(POINTS, (1, 1, 1))
     assert "gsplat's" not in fitting_views(scene, kissgs.load_views(tmp_path))[1]
     write_photos(tmp_path / "images", OTHERS["noise"])
-    with pytest.raises(InvalidViewsError, match=r"or its COLMAP model with points3D\.bin if gsplat did"):
+    with pytest.raises(InvalidViewsError, match=r"or its COLMAP model with its points3D if gsplat did"):
         fitting_views(scene, kissgs.load_views(tmp_path))
 
 
@@ -250,6 +250,22 @@ def test_damaged_points_are_named(tmp_path, data):
     path.write_bytes(data)
     with pytest.raises(InvalidViewsError, match=r"points3D\.bin.* (truncated|last point|declares)"):
         gsplat_similarities(path, [each.viewmat for each in CAMERAS])
+
+
+def test_points_of_a_model_in_text(tmp_path):
+    write_photos(tmp_path / "images")
+    write_colmap(tmp_path)
+    path = tmp_path / "sparse/0/points3D.txt"
+    lines = [f"{n} {x!r} {y!r} {z!r} 9 8 7 0.5 1 2\n" for n, (x, y, z) in enumerate(POINTS.tolist())]
+    path.write_text("".join(["# Number of points\n", *lines]))
+    viewmats = [each.viewmat for each in CAMERAS]
+    found = gsplat_similarities(kissgs.load_views(tmp_path).points, viewmats)
+    (tmp_path / "same.bin").write_bytes(point_bytes(POINTS))
+    for one, other in zip(found, gsplat_similarities(tmp_path / "same.bin", viewmats), strict=True):
+        np.testing.assert_array_equal(one.matrix, other.matrix)
+    path.write_text("# Number of points\n1 0.5 0.5\n")
+    with pytest.raises(InvalidViewsError, match=r"points3D\.txt, line 2: not a point"):
+        gsplat_similarities(path, viewmats)
 
 
 @pytest.mark.parametrize("points", [POINTS[:1], POINTS[:0], POINTS * np.nan])

@@ -28,6 +28,7 @@ from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
 MAX_NAME_BYTES = 4096  # maximum bytes of an image's name; no file system has longer paths
+POINTS = ("points3D.bin", "points3D.txt")  # of which the first is read
 MAX_LINE_BYTES = 1 << 26  # of a text file; the points of an image take about 40 MB per million
 
 # Model number: name and number of parameters in a binary file.
@@ -307,7 +308,7 @@ def read_colmap(folder: Path) -> Capture:
         raise InvalidViewsError(f"{images_path} has no images; reconstruct the capture again")
     root = _root(folder)
     within = folder.resolve().relative_to(root)  # the files themselves may be links to others
-    points = folder / "points3D.bin" if (folder / "points3D.bin").is_file() else None
+    points = next((path for name in POINTS if (path := folder / name).is_file()), None)
     files = {str(within / path.name): path for path in (cameras_path, images_path, points) if path is not None}
     return Capture(tuple(posed_images), root, f"COLMAP model {folder}", files, points=points)
 
@@ -360,7 +361,9 @@ def _viewmat(record: ImageRecord, where: str) -> Float64[np.ndarray, "4 4"]:
 
 
 def read_points(path: Path) -> Float32[np.ndarray, "P 3"]:
-    """Return the positions of all points of a ``points3D.bin``."""
+    """Return the positions of all points of a ``points3D.bin`` or ``points3D.txt``."""
+    if path.suffix == ".txt":
+        return _read_text_points(path)
     with open_file(path) as (file, size):
         reader, found = _Reader(path, file, size), list[float]()
         for _ in range(reader.count("points", _POINT3D.size)):
@@ -368,6 +371,19 @@ def read_points(path: Path) -> Float32[np.ndarray, "P 3"]:
             found += position
             reader.skip(images * _TRACK_BYTES)
         reader.finish("point")
+    return np.array(found, dtype=np.float32).reshape(-1, 3)
+
+
+def _read_text_points(path: Path) -> Float32[np.ndarray, "P 3"]:
+    found = list[float]()
+    for number, line in _lines(path):
+        if _is_comment(line):
+            continue
+        try:
+            _, x, y, z = line.split(maxsplit=4)[:4]
+            found += float(x), float(y), float(z)
+        except ValueError as error:
+            raise InvalidViewsError(f"{path}, line {number}: not a point (POINT3D_ID X Y Z …)") from error
     return np.array(found, dtype=np.float32).reshape(-1, 3)
 
 
