@@ -92,7 +92,7 @@ class JobProgress:
             self._enter(stage, fraction, now)
         if self._at >= 0 and stage == self._steps[self._at][0] != LOADING:
             self._step_fraction = max(self._step_fraction, fraction)
-        if self._steps:
+        if self._steps or self.seconds_left is not None:
             # Stages that have not begun get room: kernels compiled before them, which nobody expects, may take long.
             room, since = ROOM * (1 + len(self._new(self._steps[self._at + 1 :]))), self._latest
             self.seconds_left = max(self._left(now), room * (now - self._began), LEAST_SECONDS)
@@ -137,7 +137,8 @@ class JobProgress:
             name, seconds = self._steps[self._at]
             end = self._latest if self._step_fraction == 1 else now  # loading the next stage may take longer
             spent, seconds = end - self._step_began, max(seconds * (1 - self._step_first), 1e-3)
-            self._factor[name] = spent / seconds
+            if self._step_first < 1:  # else nothing of it was seen
+                self._factor[name] = spent / seconds
             if name != LOADING:  # which says little about the speed of other stages
                 self._expected, self._measured = self._expected + seconds, self._measured + spent
 

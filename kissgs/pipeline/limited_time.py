@@ -219,24 +219,27 @@ class Expected:
         unit = "sparsify", fewer._images(STEP, compact.sparsify_steps / compact.prune_rounds, compact)
         begin += [*[self._scored(0.8), *self._evaluated()] * PRUNED, self._targets(compact)]
         begin += [*[unit, fewer._scored(0.8)] * POINTS, *[unit, *self._evaluated()] * 2]
-        return begin + self.further(compact.max_compactions, fewer.count)
+        return begin + self.further(compact.max_compactions, fewer.count, tuned=bool(self.settings.finetune.enabled))
 
-    def further(self, left: int, count: int = 0) -> list[Step]:
+    def further(self, left: int, count: int | None = None, *, tuned: bool = False) -> list[Step]:
         """Return the steps of a search when up to ``left`` further containers of the scene may follow, half of which
-        are expected; with a ``count``, those of trained scenes with so many Gaussians."""
-        compact, encode, trained = self.settings.compact, self.settings.encode, replace(self, count=count or self.count)
-        by_size, tunes, steps = encode.target_size is not None, bool(self.settings.finetune.enabled), list[Step]()
-        evaluated = [] if by_size else self._evaluated()
-        again = trained._measured() if self.captured and 0 < count < self.count else []
-        if not count:
+        are expected; with a ``count``, those of scenes with so many Gaussians, fine-tuned or not, and none else."""
+        compact, encode, steps = self.settings.compact, self.settings.encode, list[Step]()
+        by_size, fewer = encode.target_size is not None, replace(self, count=self.count if count is None else count)
+        evaluated, again = [] if by_size else self._evaluated(), list[Step]()
+        number = -(-left // 2)
+        if count is not None:
+            again = fewer._measured() if self.captured and count < self.count else []
+        else:
+            tuned = bool(self.settings.finetune.enabled)
+            number = -(-compact.max_compactions * tuned // 2)
             steps = [*self._container(tuned=False), *evaluated] * (min(left, FOR_SIZE) if by_size else -(-left // 2))
             if compact.auto_count and not self.captured:
-                trained = self._fewer(FEWER)
+                fewer = self._fewer(FEWER)
                 steps += [self._scored(0.8), *self._evaluated()] * (PRUNED * (1 + by_size))
-                steps += [self._targets(compact), *trained._measured()]
-        number = -(-(left if count else compact.max_compactions * tunes) // 2)
-        steps += [*again, *trained._container(tuned=tunes), *evaluated] * number + self._evaluated() * by_size
-        return steps if count or (left < encode.max_encodes and not by_size) else self._with_views(steps)
+                steps += [self._targets(compact), *fewer._measured()]
+        steps += [*again, *fewer._container(tuned=tuned), *evaluated] * number + self._evaluated() * by_size
+        return steps if count is not None or (left < encode.max_encodes and not by_size) else self._with_views(steps)
 
     def _with_views(self, steps: list[Step]) -> list[Step]:
         """Return the steps of a search, the first evaluation of which includes the choice of its views."""

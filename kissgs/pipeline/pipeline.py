@@ -313,7 +313,7 @@ def compress(
     # Compact, plan, tune and write the files: once, or several times towards a goal.
     compacted = _compact_first(work, checkpoint)
     if settings.encode.has_goal:
-        made, trials, note = _search(work, clock, time_only=requested.time_only)
+        made, trials, note = _search(work, clock, evaluates=evaluate, time_only=requested.time_only)
         clock.stops_search = False
     else:
         clock.stops_search = not settings.searches
@@ -413,11 +413,13 @@ def _compact_first(work: Work, checkpoint: Path | None) -> Compacted | None:
     return compacted
 
 
-def _search(work: Work, job: JobProgress, *, time_only: bool) -> tuple[Container, tuple[Attempt, ...], str]:
+def _search(
+    work: Work, job: JobProgress, *, evaluates: bool, time_only: bool
+) -> tuple[Container, tuple[Attempt, ...], str]:
     """Make containers until one meets the goal; return the best one, all attempts and a note."""
     from kissgs.pipeline.search import Search
 
-    search = Search(work, job, time_only)
+    search = Search(work, job, evaluates, time_only)
     best = search.run()
     made = replace(best.made, compacted=search.compacted(best), finetuning=search.finetuning(best))
     return made, tuple(search.attempts), search.note(best)

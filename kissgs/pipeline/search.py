@@ -75,6 +75,7 @@ class Search:
 
     work: Work
     job: JobProgress
+    evaluates: bool = False  # whether the result is evaluated after the search
     time_only: bool = False  # only the time is limited: if no container meets the usual loss, the closest one is kept
     compactor: Popspa | None = field(init=False, default=None)  # if fewer Gaussians may serve the goal
     goal: Goal = field(init=False)
@@ -425,8 +426,12 @@ class Search:
         if self.attempts:
             self._expect(scene, tuner)
 
+        def near(attempt: Attempt) -> bool:
+            decisive = self.goal.decisive(attempt)
+            return decisive.margin(attempt) <= decisive.near_enough(trained=tuner is not None)
+
         def encode_at(settings: EncodeSettings) -> Attempt:
-            attempt = self._attempt(scene, settings, tuner)
+            attempt = self._attempt(scene, settings, tuner, near)
             if self.goal.margin(attempt) < 0 and self._expected_bytes(attempt) >= limit:
                 raise NoFurtherError
             return attempt
@@ -438,12 +443,14 @@ class Search:
         """Make trained containers of points of the path up to ``last``, the first one at point ``first``."""
 
         def encode_at(number: int, log2_lambda: float | None) -> Attempt:
+            if self.stopped:
+                raise StopSearch
             self.job.note = "; last: ".join(
                 [f"{count_at(number, len(path.whole)):,} Gaussians", *(each.summary() for each in self.attempts[-1:])]
             )
             scene = self._scene_at(path, number)
             settings = scene.settings if log2_lambda is None else at_lambda(scene.settings, log2_lambda)
-            return self._attempt(scene, settings, self._tuner)
+            return self._attempt(scene, settings, self._tuner, lambda attempt: self.goal.log2_margin(attempt) <= near)
 
         self._last = len(self.attempts) + self.plan.containers
         near = NEAR_LOG2 if self.work.time is None and self.goal.most_bytes is None else NEAR_IN_TIME
@@ -454,8 +461,11 @@ class Search:
         if self.goal.by_size and self.best is None and len(path.points) > 1:  # lambda alone makes it small enough
             self._along_lambda(self._untrained(path, path.points[-1]), most=self.encode_settings.max_encodes)
 
-    def _attempt(self, scene: Scene, settings: EncodeSettings, tuner: Tuner | None) -> Attempt:
-        """Make a container, evaluate it, and keep it if it serves the goal best so far, unless there is no time."""
+    def _attempt(
+        self, scene: Scene, settings: EncodeSettings, tuner: Tuner | None, near: Callable[[Attempt], bool]
+    ) -> Attempt:
+        """Make a container, evaluate it, and keep it if it serves the goal best so far, unless there is no time. One
+        that meets the goal and is ``near`` to it is the last of its curve."""
         if self.stopped:
             raise StopSearch
         self._check_time(trained=tuner is not None)
@@ -472,15 +482,17 @@ class Search:
             self._longest = max(self._longest, time.perf_counter() - began)
         self._finetuning = made.finetuning or self._finetuning
         self._keep(attempt, scene)
-        if 0 <= self.goal.margin(attempt) <= self.goal.decisive(attempt).near_enough(trained=tuner is not None):
+        if self.goal.margin(attempt) >= 0 and near(attempt):
             self._last = len(self.attempts)
         self._expect(scene, tuner)
         return attempt
 
     def _expect(self, scene: Scene, tuner: Tuner | None) -> None:
         expected = Expected.of(self.work.splats, self.work.settings, self.work.views, self.work.context.threads)
-        count = 0 if tuner is None else len(scene.measured.splats)
-        self.job.expect(expected.further(self._last - len(self.attempts), count))
+        count = None if tuner is None and scene is self._whole else len(scene.measured.splats)
+        left = max(self._last - len(self.attempts), 0)
+        steps = expected.further(left, count, tuned=tuner is not None)
+        self.job.expect([*steps, *expected.stages("evaluate") * self.evaluates])
 
     def _expected_bytes(self, attempt: Attempt) -> float:
         """Return the size at which the scene of an attempt that misses the goal should meet it."""

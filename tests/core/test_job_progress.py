@@ -162,6 +162,30 @@ def test_announced_steps_are_as_slow_as_those_before(clock):
     assert left[2] == pytest.approx(4.0)
 
 
+def test_the_estimate_does_not_stand_still_once_no_steps_are_expected(clock):
+    left, job = [], JobProgress(lambda stage, fraction, note="", seconds_left=None: left.append(seconds_left))
+    job.expect([("images", 10.0)] * 5)
+    for stage, steps in (("images", None), ("evaluate", [])):
+        if steps is not None:
+            job.expect(steps)
+        for tenth in range(10):
+            job(stage, tenth / 10)
+            clock.now += 1.0
+    assert left[9] > 30
+    assert max(left[10:]) < 1
+
+
+def test_a_stage_that_begins_at_its_end_says_nothing_about_its_repetitions(clock):
+    left = []
+    receive = lambda stage, fraction, note="", seconds_left=None: left.append(seconds_left)  # noqa: E731
+    job = JobProgress(receive, [("targets", 4.0), ("order", 4.0), ("targets", 4.0)])
+    for stage, seconds in (("targets", 0.0), ("order", 4.0)):
+        job(stage, 1.0 if stage == "targets" else 0.0)
+        clock.now += seconds
+    job("order", 1.0)
+    assert left[-1] == pytest.approx(4.0)
+
+
 def test_work_that_goes_on_from_a_checkpoint(clock):
     """The stage begins at 60 %: its pace is that of what is left of it."""
     events = []
