@@ -122,6 +122,7 @@ def pytest_configure(config):
 
 def pytest_collection_finish():
     """Leave what the imports of all modules have made to no further garbage collection."""
+    gc.collect()
     gc.freeze()
 
 

@@ -38,6 +38,13 @@ def test_a_psnr_is_met(wanted):
     assert found.report.evaluation.mean.candidate_vs_reference.psnr not in [trial.psnr for trial in found.report.trials]
 
 
+@pytest.mark.quick(0)
+def test_the_codebook_grows_for_a_large_target_size():
+    scene = kissgs.sample_scene(4000, sh_degree=3, seed=4)
+    found = kissgs.compress(scene, settings=Settings.research("balanced", target_size=140_000, **UNTRAINED))
+    assert 0.97 * 140_000 <= len(found.to_zip()) <= 140_000
+
+
 @pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.quick(1)
 def test_a_target_size_above_every_container_takes_two_encodings(degree):
@@ -62,6 +69,34 @@ def test_a_target_size_just_above_the_finest_container_is_searched_for():
     assert found.files == finest.files
     assert len(found.report.trials) > 2
     assert "is above the finest container" in found.report.note
+
+
+@pytest.mark.quick(0)
+def test_equal_gaussians_can_meet_a_psnr():
+    """The PSNR over lambda is a staircase: the goal is met only after several attempts without gain."""
+    equal = kissgs.sample_scene(400, sh_degree=1, seed=3).select([5] * 400)
+    found = kissgs.compress(equal, settings=Settings.research("balanced", psnr=30, **FEW_VIEWS))
+    assert max(trial.psnr for trial in found.report.trials) >= 30
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        (
+            {"psnr": 150},
+            r"psnr 150 dB cannot be met: .* has \d+\.\d\d dB; ask for at most that; each view counts for at most",
+        ),
+        (
+            {"target_size": 900},
+            r"target_size 900 bytes cannot be met: the smallest container found has [\d,]+; ask for at least",
+        ),
+    ],
+)
+@pytest.mark.quick(0)
+def test_unreachable_goals_are_refused_and_nothing_is_written(tmp_path, goal, message):
+    with pytest.raises(UnsupportedError, match=message):
+        kissgs.compress(SCENE, tmp_path / "a.zip", settings=Settings.research("balanced", **goal, **FEW_VIEWS))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

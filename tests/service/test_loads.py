@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+import os
 import resource
+import signal
 import socket
 import threading
 import time
@@ -11,7 +13,7 @@ import uuid
 import pytest
 import uvicorn
 from helpers.running import wait_until
-from helpers.service import FAST, SMALL, events, keys_of, problem, read_response, scene_bytes
+from helpers.service import FAST, SLOW, SMALL, events, keys_of, problem, read_response, scene_bytes
 
 from service.core.metrics import Metrics
 from service.core.problems import ProblemError
@@ -121,6 +123,24 @@ def test_an_error_in_the_job_process_is_internal(tmp_path):
     assert (outcome.kind, outcome.code) == ("error", "internal")
 
 
+@pytest.mark.quick(0)
+def test_a_signal_to_the_process_group_requeues_the_job(start):
+    """Some supervisors signal the job process, too."""
+    service = start(processes=True, drain_seconds=0.5)
+    job = service.submit(BIG, SLOW)
+    service.running(job)
+    (child,) = service.children()
+    service.interrupt()
+    os.kill(child, signal.SIGTERM)
+    time.sleep(0.05)
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(child, signal.SIGKILL)
+    service.join()
+    service.restart()
+    status = service.status(job)
+    assert (status["state"] in ("queued", "running"), status["starts"] <= 1) == (True, True)
+
+
 @pytest.mark.parametrize("more", [0, 100_000])
 def test_an_upload_while_the_service_stops(start, more):
     """A stalled upload does not delay the end, either, nor does a job after a second signal. Events of the job go on
@@ -195,6 +215,26 @@ def test_refused_methods_list_the_allowed_ones(service):
     for path, allowed in (("/livez", "GET, HEAD"), ("/v1/jobs", "GET, POST"), ("/v1/jobs/x", "DELETE, GET, HEAD")):
         answer = service.http.patch(path)
         assert (answer.headers["allow"], allowed in answer.json()["detail"]) == (allowed, True)
+
+
+@pytest.mark.quick(0)
+def test_events_continue_after_a_restart(start):
+    service = start(processes=True)
+    job = service.submit(scene_bytes(6_000, 2))
+    service.running(job)
+    seen = []
+    with service.http.stream("GET", job["links"]["events"]) as answer:
+        for line in answer.iter_lines():
+            if line.startswith("id: "):
+                seen.append(int(line[4:]))
+            if len(seen) == 3:
+                break
+    service.stop()
+    service.restart()
+    rest = service.http.get(job["links"]["events"], headers={"Last-Event-ID": str(seen[-1])}).text
+    seen += [int(line[4:]) for line in rest.splitlines() if line.startswith("id: ")]
+    assert seen == list(range(1, len(seen) + 1))
+    assert '"succeeded"' in rest
 
 
 def test_nobody_holds_all_upload_slots(start):

@@ -56,12 +56,10 @@ def test_photographs_from_the_first_job_to_the_next_scene(page, service, folder,
     """Regression: they stayed chosen for the next scene."""
     page.set_input_files("#capture", archive)
     page.locator("#capture-title", has_text=".zip").wait_for()
-    page.get_by_label("Quick").check()
     page.get_by_text("More options").click()
     page.get_by_label("Also measure quality").check()
     compress(page)
-    fast = kissgs.Settings(preset="fast")
-    local = kissgs.compress(SCENE_FILE["buffer"], settings=fast, views=kissgs.load_views(folder), evaluate=True)
+    local = kissgs.compress(SCENE_FILE["buffer"], views=kissgs.load_views(folder), evaluate=True)
     with page.expect_download() as download:
         page.get_by_role("link", name="Download (").click()
     download.value.save_as(tmp_path / "x.zip")
