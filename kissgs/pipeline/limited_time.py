@@ -222,8 +222,8 @@ class Expected:
         return begin + self.further(compact.max_compactions, fewer.count, tuned=bool(self.settings.finetune.enabled))
 
     def further(self, left: int, count: int | None = None, *, tuned: bool = False) -> list[Step]:
-        """Return the steps of a search when up to ``left`` further containers of the scene may follow, half of which
-        are expected; with a ``count``, those of scenes with so many Gaussians, fine-tuned or not, and none else."""
+        """Return the steps of a search when up to ``left`` further containers may follow, half of which are expected:
+        of ``count`` Gaussians, fine-tuned or not; or without a count, of the whole scene, and then of fewer."""
         compact, encode, steps = self.settings.compact, self.settings.encode, list[Step]()
         by_size, fewer = encode.target_size is not None, replace(self, count=self.count if count is None else count)
         evaluated, again = [] if by_size else self._evaluated(), list[Step]()
@@ -231,9 +231,9 @@ class Expected:
         if count is not None:
             again = fewer._measured() if self.captured and count < self.count else []
         else:
+            steps = [*self._container(tuned=False), *evaluated] * (min(left, FOR_SIZE) if by_size else number)
             tuned = bool(self.settings.finetune.enabled)
             number = -(-compact.max_compactions * tuned // 2)
-            steps = [*self._container(tuned=False), *evaluated] * (min(left, FOR_SIZE) if by_size else -(-left // 2))
             if compact.auto_count and not self.captured:
                 fewer = self._fewer(FEWER)
                 steps += [self._scored(0.8), *self._evaluated()] * (PRUNED * (1 + by_size))
@@ -242,9 +242,12 @@ class Expected:
         return steps if count is not None or (left < encode.max_encodes and not by_size) else self._with_views(steps)
 
     def _with_views(self, steps: list[Step]) -> list[Step]:
-        """Return the steps of a search, the first evaluation of which includes the choice of its views."""
+        """Return the steps of a search, the first evaluation of which includes the choice of its views; a capture has
+        them."""
+        if self.captured:
+            return steps
         first = next(at for at, (name, _) in enumerate(steps) if name == "evaluate")
-        steps[first] = "evaluate", steps[first][1] + (not self.captured) * FIRST_EVALUATION / self.speed
+        steps[first] = "evaluate", steps[first][1] + FIRST_EVALUATION / self.speed
         return steps
 
 
@@ -333,6 +336,8 @@ class SearchTime:
         """Return the deadline of the next of so many containers."""
         return Deadline.after(max(self.deadline.seconds, 0.0) / containers)
 
+
+# ``Choice``: compaction, fine-tuning and the preset where the settings leave them open, or the time is too short.
 
 NOT_TRAINED = (
     f"nothing was trained, which needs {TORCH_MISSING}; training makes containers smaller at equal quality, much "

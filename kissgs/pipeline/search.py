@@ -426,12 +426,12 @@ class Search:
         if self.attempts:
             self._expect(scene, tuner)
 
-        def near(attempt: Attempt) -> bool:
+        def is_near(attempt: Attempt) -> bool:
             decisive = self.goal.decisive(attempt)
             return decisive.margin(attempt) <= decisive.near_enough(trained=tuner is not None)
 
         def encode_at(settings: EncodeSettings) -> Attempt:
-            attempt = self._attempt(scene, settings, tuner, near)
+            attempt = self._attempt(scene, settings, tuner, is_near)
             if self.goal.margin(attempt) < 0 and self._expected_bytes(attempt) >= limit:
                 raise NoFurtherError
             return attempt
@@ -462,10 +462,10 @@ class Search:
             self._along_lambda(self._untrained(path, path.points[-1]), most=self.encode_settings.max_encodes)
 
     def _attempt(
-        self, scene: Scene, settings: EncodeSettings, tuner: Tuner | None, near: Callable[[Attempt], bool]
+        self, scene: Scene, settings: EncodeSettings, tuner: Tuner | None, is_near: Callable[[Attempt], bool]
     ) -> Attempt:
         """Make a container, evaluate it, and keep it if it serves the goal best so far, unless there is no time. One
-        that meets the goal and is ``near`` to it is the last of its curve."""
+        that meets the goal and ``is_near`` it is the last of its curve."""
         if self.stopped:
             raise StopSearch
         self._check_time(trained=tuner is not None)
@@ -482,7 +482,7 @@ class Search:
             self._longest = max(self._longest, time.perf_counter() - began)
         self._finetuning = made.finetuning or self._finetuning
         self._keep(attempt, scene)
-        if self.goal.margin(attempt) >= 0 and near(attempt):
+        if self.goal.margin(attempt) >= 0 and is_near(attempt):
             self._last = len(self.attempts)
         self._expect(scene, tuner)
         return attempt

@@ -481,6 +481,9 @@ def improve(
             break
 
 
+# Choice of levels by squared error and bits.
+
+
 @njit(nogil=True, error_model="numpy")
 def _form_hessian(packed: np.ndarray, order: np.ndarray, floor: np.ndarray, hessian: np.ndarray) -> None:
     """Unpack a Hessian of :class:`kissgs.Sensitivity` for a form with its axes in ``order``, ``(3,)``. ``floor``:

@@ -110,8 +110,8 @@ def box_blur(image: Float32[np.ndarray, "H W C"], radius: int, pool: Workers) ->
 # Arrange vectors on a square grid by their principal axes, so that neighbours are similar.
 #
 # The first axis decides the band of rows, the second the block of columns in it, and inside a block the third the row
-# and the fourth the column. Four sorts take milliseconds where PLAS, which moves
-# vectors until neighbours are as similar as possible, takes seconds.
+# and the fourth the column. Four sorts take milliseconds where PLAS, which moves vectors until neighbours are as
+# similar as possible, takes seconds.
 
 BLOCK = 8  # side of a block, cells; sides of codebooks are multiples of it
 

@@ -176,9 +176,8 @@ def test_the_estimate_does_not_stand_still_once_no_steps_are_expected(clock):
 
 
 def test_a_stage_that_begins_at_its_end_says_nothing_about_its_repetitions(clock):
-    left = []
-    receive = lambda stage, fraction, note="", seconds_left=None: left.append(seconds_left)  # noqa: E731
-    job = JobProgress(receive, [("targets", 4.0), ("order", 4.0), ("targets", 4.0)])
+    left, steps = [], [("targets", 4.0), ("order", 4.0), ("targets", 4.0)]
+    job = JobProgress(lambda stage, fraction, note="", seconds_left=None: left.append(seconds_left), steps)
     for stage, seconds in (("targets", 0.0), ("order", 4.0)):
         job(stage, 1.0 if stage == "targets" else 0.0)
         clock.now += seconds

@@ -55,7 +55,7 @@ class Recorder:
     def __call__(self, stage, fraction, note="", seconds_left=None):
         assert self.fraction <= fraction <= 1
         assert self.fraction < 1, "an event after the end"
-        assert seconds_left >= 0 if self.seconds_left is not None else seconds_left is None or seconds_left >= 0
+        assert (seconds_left is None and self.seconds_left is None) or seconds_left >= 0
         self.stages.append(stage)
         self.fraction, self.seconds_left = fraction, seconds_left
 
