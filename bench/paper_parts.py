@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt8
-from kissgs.core.context import Context
-from kissgs.core.resources import blas_workers
+from kissgs.core.context import Context, blas_workers
 from kissgs.core.splats import Splats
 from kissgs.io.images import compress_images
 from kissgs.planning.planner import EncodingPlan, plan_encoding

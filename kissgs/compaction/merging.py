@@ -9,9 +9,8 @@ import numpy as np
 from numba import njit
 
 from kissgs.core.array_types import Bool, Float32, Float64, Int32, Int64
-from kissgs.core.context import DEFAULT_CONTEXT, Context
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Workers
 from kissgs.core.numba_kernels import compiled
-from kissgs.core.resources import Workers
 from kissgs.core.splats import LOG_SCALE_LIMIT, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, Splats
 from kissgs.rendering.cpu.neighbours import SEARCH_LEAF, leaves_of, nearest_neighbours, unique_pairs
 from kissgs.rendering.cpu.tiles import each_part, even

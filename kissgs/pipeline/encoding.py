@@ -14,25 +14,34 @@ import numpy as np
 from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Device, load_kernels
+from kissgs.core.context import (
+    DEFAULT_CONTEXT,
+    TORCH_MISSING,
+    Context,
+    Device,
+    blas_workers,
+    has_torch,
+    load_kernels,
+    return_free_memory,
+)
 from kissgs.core.errors import OutputError, UnsupportedError
-from kissgs.core.resources import TORCH_MISSING, blas_workers, has_torch, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, NOTHING_CLEANED, Cleaned, Splats
 from kissgs.formats import ContainerName
 from kissgs.io.files import atomic_file, reason_of, refuse_existing
-from kissgs.pipeline.goal import Container
 from kissgs.planning.planner import ColorRefit, Encoded, EncodingPlan, plan_encoding, refine_order
 from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
 from kissgs.rendering.rasterizer import need_cuda
 from kissgs.settings import EncodeSettings, FinetuneSettings, Settings
+from kissgs.sog import FILES as SOG_FILES
 from kissgs.sog import encode as sog
-from kissgs.sog.encode import SOG
 from kissgs.sogxt import encode as sogxt
 from kissgs.sogxt.container import FILES as SOGXT_FILES
 
 if TYPE_CHECKING:
     from kissgs.compaction.popspa import Popspa
+    from kissgs.compaction.result import Compacted
+    from kissgs.finetuning.result import FinetuneReport
     from kissgs.finetuning.tune import Tuner
     from kissgs.pipeline.limited_time import SearchTime
     from kissgs.rendering.sensitivity import WeightedCameras
@@ -40,8 +49,8 @@ if TYPE_CHECKING:
 
 # The containers that ``compress`` writes: what each can hold, and how its files are made.
 
-MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}  # for the planner
-FILES = frozenset({*SOGXT_FILES, *sog.FILES})  # a folder with no others may be replaced by a container
+MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": sog.SOG}  # for the planner
+FILES = frozenset({*SOGXT_FILES, *SOG_FILES})  # a folder with no others may be replaced by a container
 
 
 def write_files(
@@ -124,6 +133,17 @@ class Measured:
     sensitivity: Sensitivity | None = None
     recolor: ColorRefit | None = None
     first_view: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Container:
+    """A container in memory: its files with the report of the encoder, and how they were made."""
+
+    encoded: Encoded
+    settings: EncodeSettings
+    finetuning: FinetuneReport | None = None
+    compacted: Compacted | None = None
+    checkpoint: Path | None = None  # with the final state of its fine-tuning
 
 
 def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:

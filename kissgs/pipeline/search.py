@@ -22,8 +22,8 @@ from kissgs.evaluation.results import ESTIMATED_DROP, Evaluation, drop_of
 from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline import curves
 from kissgs.pipeline.curves import LambdaCurve, NoFurtherError, at_lambda, count_at, last_number
-from kissgs.pipeline.encoding import Measured, Work, encode, make_tuner, measure
-from kissgs.pipeline.goal import Attempt, Container, Goal
+from kissgs.pipeline.encoding import Container, Measured, Work, encode, make_tuner, measure
+from kissgs.pipeline.goal import Attempt, Goal
 from kissgs.pipeline.limited_time import Expected, SearchPlan
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.settings import EncodeSettings

@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, Int32, UInt16
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.planning.quantize import clip_outliers, for_each_block
 from kissgs.settings import EncodeSettings
 

@@ -11,9 +11,8 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, Int32, Integer, Shaped, UInt8, UInt16, UInt64
-from kissgs.core.context import Progress
+from kissgs.core.context import Progress, Workers
 from kissgs.core.positions import signed_log
-from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.settings import EncodeSettings
 

@@ -9,7 +9,7 @@ from functools import cache, partial
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, Int32
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import MAX_CODEBOOK_SIDE, SH_REST_COUNTS, Splats
 from kissgs.planning import kmeans

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, silent
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, Workers, return_free_memory, silent
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.resources import Workers, return_free_memory
 from kissgs.core.sensitivity import BLOCK, LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import SH_C0, Splats
 from kissgs.rendering.camera import Camera

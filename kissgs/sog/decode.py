@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt8
-from kissgs.core.context import Progress, silent
+from kissgs.core.context import Progress, Workers, silent
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.positions import recorded, signed_exp
-from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats, empty_splats
 from kissgs.formats import LOD_NAME
 from kissgs.io.containers import META_NAME, Source, open_source, stored_size
@@ -21,7 +20,8 @@ from kissgs.io.files import refuse_more_than
 from kissgs.io.images import decode_plane, decode_png, is_png, probe_png, probe_webp
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions, SceneSource, titled
 from kissgs.io.streamed import Container, StreamedFormat
-from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, MAX_SH_ENTRIES, Rest, SogLayout, read_layout
+from kissgs.sog import ENTRIES_PER_ROW, FIRST_TAG
+from kissgs.sog.metadata import MAX_SH_ENTRIES, Rest, SogLayout, read_layout
 
 _FREE_PIXELS = 1 << 20  # beyond four per Gaussian: encoders may round sides up to powers of two
 

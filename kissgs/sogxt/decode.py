@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, UInt8, UInt16
-from kissgs.core.context import Progress, silent
+from kissgs.core.context import Progress, Workers, silent
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.positions import recorded, signed_exp
-from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
 from kissgs.formats import LEVELS_NAME
 from kissgs.io.containers import Source, ZipSource, open_source, stored_size

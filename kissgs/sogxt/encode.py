@@ -8,8 +8,7 @@ import numpy as np
 
 from kissgs._version import __version__
 from kissgs.core.array_types import Float32, UInt8
-from kissgs.core.context import DEFAULT_CONTEXT, Context, load_kernels
-from kissgs.core.resources import blas_workers
+from kissgs.core.context import DEFAULT_CONTEXT, Context, blas_workers, load_kernels
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
 from kissgs.io.images import compress_images, pixels_crc32

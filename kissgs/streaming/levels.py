@@ -14,9 +14,8 @@ import numpy as np
 
 from kissgs.compaction.merging import covariances_of, merged_levels
 from kissgs.core.array_types import Bool, Float32, Float64, Int64
-from kissgs.core.context import Progress, silent
+from kissgs.core.context import Progress, Workers, silent
 from kissgs.core.errors import OutputError
-from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_REST_COUNTS, Splats, concatenate
 from kissgs.io.files import atomic_file, reason_of
 from kissgs.rendering.camera import Camera, look_at

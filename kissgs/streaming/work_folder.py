@@ -16,7 +16,7 @@ from kissgs.core.errors import OutputError
 from kissgs.formats import MANIFESTS
 from kissgs.io.files import move_into_place, path_state, reason_of
 from kissgs.io.streamed import MAX_TREE_BYTES
-from kissgs.sog.encode import FILES
+from kissgs.sog import FILES
 from kissgs.streaming.build import CHUNK
 from kissgs.streaming.layout import OUT, continuation, write_json
 from kissgs.streaming.levels import row_bytes

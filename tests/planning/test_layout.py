@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import kissgs
+from kissgs.core.context import blas_workers
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.resources import blas_workers
 from kissgs.core.splats import MAX_GRID_SIDE
 from kissgs.planning import planner
 from kissgs.planning.layout import axes_order, grid_side, hilbert_order, layout_grid, principal_axes

@@ -25,8 +25,7 @@ from kissgs.cameras.virtual.select import (
     with_size,
 )
 from kissgs.core.array_types import Bool, Float32, Int
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress
-from kissgs.core.resources import Workers
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, Workers
 from kissgs.core.sensitivity import BLOCK, Sensitivity
 from kissgs.core.splats import Splats, concatenate
 from kissgs.rendering.camera import Camera, look_at
