@@ -23,7 +23,7 @@ from bench.external import measure_external
 from bench.rendering import resampled
 from kissgs.core.context import Context
 from kissgs.core.splats import ATTRIBUTES, SH_C0
-from kissgs.sogxt.container import zip_bytes
+from kissgs.io.containers import zip_bytes
 from kissgs.sogxt.encode import encode
 
 STUDIES = sorted(path.stem for path in Path(__file__).parents[1].glob("bench/[a-z]*.py"))

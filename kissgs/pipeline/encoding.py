@@ -34,9 +34,8 @@ from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
 from kissgs.rendering.rasterizer import need_cuda
 from kissgs.settings import EncodeSettings, FinetuneSettings, Settings
 from kissgs.sog import FILES as SOG_FILES
-from kissgs.sog import encode as sog
+from kissgs.sogxt import FILES as SOGXT_FILES
 from kissgs.sogxt import encode as sogxt
-from kissgs.sogxt.container import FILES as SOGXT_FILES
 
 if TYPE_CHECKING:
     from kissgs.compaction.popspa import Popspa
@@ -49,8 +48,16 @@ if TYPE_CHECKING:
 
 # The containers that ``compress`` writes: what each can hold, and how its files are made.
 
-MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": sog.SOG}  # for the planner
 FILES = frozenset({*SOGXT_FILES, *SOG_FILES})  # a folder with no others may be replaced by a container
+
+
+def model_of(container: ContainerName) -> ContainerModel:
+    """Return what a container can hold, for the planner."""
+    if container == "sogxt":
+        return EVEN_LEVELS
+    from kissgs.sog.encode import SOG
+
+    return SOG
 
 
 def write_files(
@@ -65,6 +72,8 @@ def write_files(
 ) -> Encoded:
     """Make the files of a plan for a container; the counts are for the metadata of SOG-XT."""
     if container == "sog":
+        from kissgs.sog import encode as sog
+
         return sog.write_files(plan, settings, context)
     return sogxt.write_files(
         plan, settings, context, cleaned=cleaned, compacted=compacted, finetune_steps=finetune_steps
@@ -181,7 +190,7 @@ def plan(work: Work, scene: Measured, settings: EncodeSettings, context: Context
         context,
         sensitivity=scene.sensitivity,
         recolor=scene.recolor,
-        container=MODELS[work.container],
+        container=model_of(work.container),
         keep_costs=bool(work.settings.finetune.enabled),
     )
     return replace(chosen, scene=replace(chosen.scene, first_view=scene.first_view))
@@ -250,7 +259,7 @@ def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: 
     else:
         supervision = supervision_views(work.original, work.views, settings, work.context, scoring_stride=0)
         targets = training_targets(work.original, supervision, work.context)
-    model, decode = MODELS[work.container], decode_sog if work.container == "sog" else decode_sogxt
+    model, decode = model_of(work.container), decode_sog if work.container == "sog" else decode_sogxt
     return Tuner(work.original, settings, supervision, targets, work.context, model, decode)
 
 

@@ -24,12 +24,12 @@ from kissgs.core.errors import UnsupportedError
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Cleaned, Splats, empty_splats
 from kissgs.formats import ContainerName, named_container
+from kissgs.io.containers import check_destination, is_packed, stored_sizes, write_container, zip_bytes
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.encoding import FILES, Container, Work, check_finetuning, encode, make_tuner, measure, plan, write
 from kissgs.pipeline.limited_time import Expected, choose, resolved
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
 from kissgs.settings import GOALS, EncodeSettings, Settings
-from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views

@@ -16,7 +16,7 @@ from kissgs.planning.planner import ColorRefit, Encoded, EncodingPlan, plan_enco
 from kissgs.planning.quantize import Quantized, observed_range
 from kissgs.planning.sh_codebook import Codebook
 from kissgs.settings import GOALS, EncodeSettings
-from kissgs.sogxt import container, metadata
+from kissgs.sogxt import JSON_NAME, SCENE_NAME, YAML_NAME, metadata
 
 
 def encode(
@@ -75,8 +75,8 @@ def write_files(
         ),
         crc32={name: pixels_crc32(image) for name, image in images.items()},
     )
-    files = {container.JSON_NAME: layout.to_meta_json(), **files}
-    files = {container.YAML_NAME: layout.to_yaml(), container.SCENE_NAME: metadata.scene_json(files), **files}
+    files = {JSON_NAME: layout.to_meta_json(), **files}
+    files = {YAML_NAME: layout.to_yaml(), SCENE_NAME: metadata.scene_json(files), **files}
     return Encoded.of(plan, files)
 
 
