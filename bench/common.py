@@ -9,10 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
-from pydantic import ValidationError
-
-from kissgs import EncodeSettings, KissgsError, Settings, Views, load_views
-from kissgs.settings import GOALS
+from kissgs import KissgsError, Views, load_views
 
 
 def parser_of(about: str | None) -> argparse.ArgumentParser:
@@ -77,16 +74,6 @@ def run(study: Callable[[], None]) -> None:
     except (KissgsError, OSError) as error:
         sys.stderr.write(f"{Path(sys.argv[0]).name}: {error}\n")
         raise SystemExit(2) from error
-
-
-def at_quality_offset(settings: Settings, decibels: float) -> Settings:
-    """Return settings with rate-distortion planning at another quality offset, without a lambda or a goal."""
-    changes = {"quality_offset_db": decibels, "rd_lambda": None, **dict.fromkeys(GOALS)}
-    try:
-        encode = EncodeSettings(**{**settings.encode.model_dump(), **changes})
-    except ValidationError as error:
-        raise KissgsError(f"a quality offset of {decibels:g}: {error.errors()[0]['msg'].lower()}") from error
-    return settings.model_copy(update={"encode": encode})
 
 
 def write(*lines: str) -> None:

@@ -368,11 +368,11 @@ def converted(work: Work, ending: str) -> Job:
 def ablation(work: Work) -> Iterator[Job]:
     """Return the containers of preset ``paper`` with one part left out, which no decoder reads."""
     settings, before = work.manifest.with_changes().encode, work.compaction.key
-    whole = cache(lambda: encode_parts(kissgs.load(work.compacted()), settings, 0))
+    whole = cache(lambda: encode_parts(kissgs.load(work.compacted()), settings))
 
-    def make(leave_out: LeaveOut | None) -> Made:
-        parts = whole() if leave_out is None else leave_out(whole(), settings, 0)
-        return Made(parts.decoded, {"bytes": parts.size(settings, 0)})
+    def make(leave_out: LeaveOut) -> Made:
+        parts = leave_out(whole())
+        return Made(parts.decoded, {"bytes": parts.size()})
 
     for name, (leave_out, _, _) in PARTS.items():
         if work.original.sh_degree or name not in OF_CODEBOOK:
