@@ -185,14 +185,16 @@ class NewDatabaseError(SettingsError):
     """The database does not exist or is empty, although the data folder has jobs."""
 
 
-def connect(file: Path, *, create: bool = True) -> tuple[sa.Engine, Sessions, Sessions]:
-    """Open the database, check that it is intact, and ``create`` it and its tables if there are none. Return the
-    engine, sessions for writing, each with exclusive access, and sessions for reading, which wait for none."""
+def connect(file: Path, *, jobs: int = 0) -> tuple[sa.Engine, Sessions, Sessions]:
+    """Open the database, check that it is intact, and create it and its tables if there are none, unless the data
+    folder has ``jobs``. Return the engine, sessions for writing, each with exclusive access, and sessions for reading,
+    which wait for none."""
+    create = not jobs
     opened: list[Any] = []
     first = _engine(file, START_SECONDS, opened)
     try:
         if not create and not (file.exists() and file.stat().st_size):
-            raise NewDatabaseError("the job database is new")
+            raise NewDatabaseError
         with _writing(first).begin() as session:
             _check(session, create=create)
         engine = _engine(file, LOCK_SECONDS)
@@ -200,6 +202,12 @@ def connect(file: Path, *, create: bool = True) -> tuple[sa.Engine, Sessions, Se
     except Exception as error:
         for connection in opened:
             keep_open(connection)  # so that an existing journal stays unchanged
+        if isinstance(error, NewDatabaseError):
+            raise NewDatabaseError(
+                f"KISSGS_DATA_DIR: {file.parent / 'jobs'} has the files of {jobs} jobs, but the job database {file} is "
+                "new and has none of them; restore it, choose another folder, or move the folder of jobs away to start "
+                "without jobs"
+            ) from None
         if isinstance(error, SettingsError):
             raise
         reason = error_text(error)
@@ -250,7 +258,7 @@ def _check(session: Session, *, create: bool) -> None:
     version = values.get("schema")
     if version is None and not _has_rows(session, existing - {"meta"}):
         if not create:
-            raise NewDatabaseError("the job database is empty")
+            raise NewDatabaseError
         Base.metadata.create_all(connection)
         session.add_all(
             [Meta(name="schema", value=SCHEMA_VERSION), Meta(name=IDENTITY, value=secrets.randbits(IDENTITY_BITS))]
