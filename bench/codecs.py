@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.common import capture, head, parser_of, row, run, signed, write
+from bench.common import head, parser_with_views, row, run, signed, write
 from bench.curves import bytes_at
 from bench.external import FORMATS, Measured, measure_external
 from kissgs import KissgsError, Preset, Settings, Views, sample_scene, save
@@ -32,10 +32,9 @@ IMAGES = "PSNR to photographs", "change, dB", "SSIM", "PSNR to the original", "S
 
 def main() -> None:
     """Print a table for each scene, and the bytes at equal PSNR; samples are on disk only while they are measured."""
-    parser = parser_of(__doc__)
+    parser = parser_with_views(__doc__)
     parser.add_argument("scenes", nargs="+", metavar="SCENE", help="file, or number of Gaussians of a sample scene")
     parser.add_argument("--degree", type=int, default=3, choices=range(4), help="of sample scenes")
-    parser.add_argument("--views", type=capture, metavar="DATA", help="capture with cameras and photographs")
     parser.add_argument("-p", "--presets", nargs="+", default=list(Preset))
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="change a setting of all presets"

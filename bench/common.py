@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
-from kissgs import KissgsError, Views, load_views
+from kissgs import KissgsError, load_views
 
 
 def parser_of(about: str | None) -> argparse.ArgumentParser:
@@ -17,20 +17,11 @@ def parser_of(about: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
-def arguments(about: str | None) -> argparse.ArgumentParser:
-    """Return a parser with a scene and a capture, which most studies need."""
+def parser_with_views(about: str | None) -> argparse.ArgumentParser:
+    """Return a parser with a capture, which most studies take."""
     parser = parser_of(about)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("--views", type=capture, metavar="DATA", help="capture with cameras and photographs")
+    parser.add_argument("--views", type=lambda folder: load_views(Path(folder)), metavar="DATA", help="capture")
     return parser
-
-
-def capture(path: str) -> Views:
-    """Return the capture in a folder."""
-    try:
-        return load_views(Path(path))
-    except KissgsError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 views_of = cache(load_views)

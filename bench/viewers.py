@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from helpers.viewers import chromium, opened
 
-from bench.common import arguments, head, positive, row, run
+from bench.common import head, parser_with_views, positive, row, run
 from kissgs import Camera, KissgsError, Splats, Views, clean, load
 from kissgs.core.context import Context
 from kissgs.core.positions import with_origin
@@ -58,7 +58,8 @@ class Drawn:
 
 def main() -> None:
     """Print the table; write it, and the contact sheet beside it."""
-    parser = arguments(__doc__)
+    parser = parser_with_views(__doc__)
+    parser.add_argument("scene", type=Path)
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--size", nargs=2, type=positive, default=(480, 360), metavar=("W", "H"), help="of images")
     parser.add_argument("--cameras", type=positive, default=6, help="largest number of cameras")
