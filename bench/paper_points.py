@@ -262,7 +262,23 @@ class Work:
     @cached_property
     def compaction(self) -> Job:
         """The job of the ``.ply`` that is encoded."""
-        return compaction(self)
+        source = self.checkpoint.scene
+        if not self.checkpoint.budget:
+            series = BASE if self.tier == REFERENCE else "popspa-ply"
+            return Job(series, self.key(), lambda: Made(self.original, {"bytes": source.stat().st_size}, source))
+        settings = self.manifest.with_changes(compact=self.checkpoint.budget)
+
+        def make(source: Path, path: Path) -> Mapping[str, float]:
+            views, checkpoint, device = self.training_views, path.with_suffix(".checkpoint"), self.given.device
+            report = kissgs.compact(
+                source, path, settings=settings, views=views, checkpoint=checkpoint, overwrite=True, device=device
+            ).report
+            stages = defaultdict[str, float](float)
+            for step in report.steps:
+                stages[step.name] += step.seconds
+            return stages
+
+        return self.file("popspa-ply", ".ply", make, settings.compact, small=False)
 
     def compacted(self) -> Made:
         """Return the scene that is encoded, compacted now unless that is done; what has failed fails again at once."""
@@ -296,27 +312,6 @@ def rate_distortion(work: Work) -> Iterator[Job]:
     yield encoding(work, "popspa-sogxt-ft", finetune={"enabled": True})
     yield converted(work, "sog") if work.given.splat_transform else encoding(work, "popspa-sog-kissgs", ".sog")
     yield converted(work, "spz")
-
-
-def compaction(work: Work) -> Job:
-    """Return the job of the ``.ply`` that is encoded."""
-    source = work.checkpoint.scene
-    if not work.checkpoint.budget:
-        series = BASE if work.tier == REFERENCE else "popspa-ply"
-        return Job(series, work.key(), lambda: Made(work.original, {"bytes": source.stat().st_size}, source))
-    settings = work.manifest.with_changes(compact=work.checkpoint.budget)
-
-    def make(source: Path, path: Path) -> Mapping[str, float]:
-        views, checkpoint, device = work.training_views, path.with_suffix(".checkpoint"), work.given.device
-        report = kissgs.compact(
-            source, path, settings=settings, views=views, checkpoint=checkpoint, overwrite=True, device=device
-        ).report
-        stages = defaultdict[str, float](float)
-        for step in report.steps:
-            stages[step.name] += step.seconds
-        return stages
-
-    return work.file("popspa-ply", ".ply", make, settings.compact, small=False)
 
 
 def encoding(work: Work, series: str, ending: str = ".zip", **changes: Mapping[str, object]) -> Job:
