@@ -32,6 +32,7 @@ from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import in_scene_frame, render_clamped
 from kissgs.evaluation.html import heat_map, rms_difference
 from kissgs.evaluation.results import MAX_VIEW_PSNR
+from kissgs.io.files import atomic_file
 from kissgs.io.ply import write_ply
 from kissgs.rendering.images import Label, contact_sheet, png
 from kissgs.rendering.metrics import psnr, ssim
@@ -79,9 +80,12 @@ def main() -> None:
     for cells in table[1:]:
         row(*cells)
     if given.output:
-        with given.output.open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows(table)
-        given.output.with_suffix(".png").write_bytes(sheet_of(files))
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(table)
+        sheet = given.output.with_suffix(".png")
+        for path, data in ((given.output, text.getvalue().encode()), (sheet, sheet_of(files))):
+            with atomic_file(path, overwrite=True) as file:
+                file.write(data)
 
 
 def as_ply(splats: Splats) -> bytes:
