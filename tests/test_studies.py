@@ -118,10 +118,10 @@ def test_the_logarithm_of_positions_saves_the_near_ones_of_a_scene_that_extends_
     for far in (1, 300):
         means = np.where(sky[:, None], np.float32(far) * near.means, near.means)
         scales = near.scales + np.where(sky, np.float32(np.log(far)), 0)[:, None].astype(np.float32)
-        whole = paper_parts.encode_parts(replace(near, means=means, scales=scales), settings, 1)
-        found = paper_parts.signed_log(whole, settings, 1)
+        whole = paper_parts.encode_parts(replace(near, means=means, scales=scales), settings)
+        found = paper_parts.signed_log(whole)
         psnr = [kissgs.evaluate(whole.exact, each.decoded).mean.candidate_vs_reference.psnr for each in (whole, found)]
-        changes.append((found.size(settings, 1) / whole.size(settings, 1) - 1, psnr[1] - psnr[0]))
+        changes.append((found.size() / whole.size() - 1, psnr[1] - psnr[0]))
     (_, beside), (fewer, lost) = changes
     assert abs(beside) < 0.5
     assert fewer < -0.05
