@@ -152,29 +152,12 @@ class Remote:
         force_views: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
-        """Upload a scene; retry if the connection breaks or the service is overloaded, without a second job.
-
-        Args:
-            source: the scene: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.ksplat`` or ``.glb``.
-            settings: None for the preset ``balanced``.
-            container: ``"sogxt"`` or ``"sog"``.
-            evaluate: whether the service also compares rendered images.
-            origin: see :class:`kissgs.ReadOptions`.
-            capture: see :meth:`compress`.
-            force_views: see :meth:`compress`.
-            progress: receives "upload" and "wait for server".
-
-        Returns:
-            The status of the job.
-
-        Raises:
-            KissgsError: see :meth:`compress`.
-        """
+        """Upload a scene, and return the status of its job; retry if the connection breaks or the service is
+        overloaded, without a second job. Arguments and errors are those of :meth:`compress`."""
         path, key, progress = Path(source), uuid.uuid4().hex, Share(progress)
-        options = {**_given(settings or Settings()), "format": container, "evaluate": evaluate}
-        options |= {} if origin is None else {"origin": origin}
-        options |= {} if capture is None else {"capture": f"sha256:{_sha256(Path(capture))}"}
-        options |= {"force_views": True} if force_views else {}  # which services of older versions do not know
+        options = {**_given(settings or Settings()), "format": container, "evaluate": evaluate, "origin": origin}
+        named = None if capture is None else f"sha256:{_sha256(Path(capture))}"
+        options |= {"capture": named, "force_views": force_views}
         params = {"options": json.dumps(options), "name": path.name}
 
         def send(kind: str, parts: Sequence[bytes | Path]) -> dict[str, Any]:
@@ -197,10 +180,7 @@ class Remote:
             raise _with_file_name(error, path) from error
 
     def follow(self, job: str, progress: Progress = silent) -> dict[str, Any]:
-        """Wait until a job has ended, and pass its progress on.
-
-        Returns:
-            The status of the job, which has succeeded.
+        """Wait until a job has succeeded, pass its progress on, and return its status.
 
         Raises:
             KissgsError: the job failed or was cancelled.
@@ -232,12 +212,7 @@ class Remote:
     def download(
         self, status: dict[str, Any], destination: Path, *, overwrite: bool = False, progress: Progress = silent
     ) -> None:
-        """Write the container of a job that has succeeded, and verify its checksum.
-
-        Raises:
-            KissgsError: see :meth:`compress`.
-        """
-
+        """Write the container of a job that has succeeded, and verify its checksum; for errors see :meth:`compress`."""
         progress = Share(progress)
 
         def fetch() -> None:
@@ -351,10 +326,7 @@ def _given(settings: Settings) -> dict[str, Any]:
 
 def _sha256(capture: Path) -> str:
     with open_scene_file(capture, "; name an archive", InvalidViewsError) as opened:
-        digest = hashlib.sha256()
-        while block := opened.file.read(BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(opened.file, "sha256").hexdigest()
 
 
 def _form(boundary: str, **files: Path) -> list[bytes | Path]:
@@ -422,10 +394,9 @@ def _checked(response: httpx.Response) -> httpx.Response:
 
 def _error(code: str, detail: str) -> KissgsError:
     """Return the error of a problem of the scene or the settings that the library itself would raise, or another."""
-    kinds: dict[str, type[KissgsError]] = {
-        kind.code: kind for kind in (InvalidSceneError, InvalidViewsError, UnsupportedError)
-    }
-    error = kinds.get(code, RemoteError)(detail)
-    if isinstance(error, RemoteError):
-        error.problem = code
+    for kind in (InvalidSceneError, InvalidViewsError, UnsupportedError):
+        if kind.code == code:
+            return kind(detail)
+    error = RemoteError(detail)
+    error.problem = code
     return error

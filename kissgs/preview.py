@@ -387,13 +387,17 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = SLOWEST_SECONDS
 
     def do_GET(self) -> None:
-        self._answer(body=True)
-
-    def do_HEAD(self) -> None:
-        self._answer(body=False)
-
-    def _answer(self, *, body: bool) -> None:
-        status, content, media_type = self._find(unquote(urlsplit(self.path).path))
+        path, status, content, suffix = unquote(urlsplit(self.path).path), HTTPStatus.OK, b"", ""
+        if self.headers.get("Host") not in self.server.hosts:
+            status, content = HTTPStatus.FORBIDDEN, b"this server answers requests to this machine only\n"
+        else:
+            try:
+                found = self.server.contents[path]
+                content = found if isinstance(found, bytes) else found.read_bytes()
+                suffix = ".html" if path == "/" else Path(path).suffix
+            except (KeyError, OSError):  # a file of a streamed scene may have been removed meanwhile
+                status, content = HTTPStatus.NOT_FOUND, b"there is no such file\n"
+        media_type = _TYPES.get(suffix, "application/octet-stream")
         self.send_response(status)
         for name, value in _HEADERS.items():
             self.send_header(name, value)
@@ -402,20 +406,10 @@ class _Handler(BaseHTTPRequestHandler):
         if media_type == _TYPES[".html"]:
             self.send_header("Content-Security-Policy", self.server.policy)
         self.end_headers()
-        if body:
+        if self.command != "HEAD":
             self.wfile.write(content)
 
-    def _find(self, path: str) -> tuple[HTTPStatus, bytes, str]:
-        """Return the status, the content and its media type."""
-        if self.headers.get("Host") not in self.server.hosts:
-            return HTTPStatus.FORBIDDEN, b"this server answers requests to this machine only\n", _TYPES[""]
-        try:
-            found = self.server.contents[path]
-            content = found if isinstance(found, bytes) else found.read_bytes()
-        except (KeyError, OSError):  # a file of a streamed scene may have been removed meanwhile
-            return HTTPStatus.NOT_FOUND, b"there is no such file\n", _TYPES[""]
-        suffix = ".html" if path == "/" else Path(path).suffix
-        return HTTPStatus.OK, content, _TYPES.get(suffix, "application/octet-stream")
+    do_HEAD = do_GET
 
     def version_string(self) -> str:
         """Return the header ``Server``."""

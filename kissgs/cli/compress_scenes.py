@@ -20,10 +20,10 @@ from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 from rich.text import Text
 
-from kissgs.cli.files import CHECKPOINT, Result, output, progress_bar, say_notes, sibling, source, write_stdout
+from kissgs.cli import files
+from kissgs.cli.files import CHECKPOINT, Result, progress_bar, say_notes, sibling, source, stoppable, write_stdout
 from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
 from kissgs.cli.options import open_views
-from kissgs.cli.signals import stoppable
 from kissgs.cli.tables import report_table, streamed_table
 from kissgs.core.context import Progress, silent, with_seconds_left
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
@@ -33,7 +33,8 @@ from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline.limited_time import resolved
 from kissgs.pipeline.pipeline import Compressed, compress
 from kissgs.pipeline.scene_files import scene_root
-from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of
+from kissgs.runners import INTERNAL, Outcome, Resources, RunHandle, Runner, WorkItem, error_of
+from kissgs.runners.ray_runner import RayRunner
 from kissgs.settings import Settings
 from kissgs.sogxt.container import check_destination
 from kissgs.training.checkpoint import delete_checkpoints
@@ -93,7 +94,7 @@ def compress_here(options: SceneCompression, scene: str, target: Path) -> Result
         say_notes(scene, (made.report.note, *made.report.cleaned.notes), options.quiet)
         write_stdout(made.to_zip())
         delete_checkpoints(*made.checkpoints)
-    return Result(made.report.as_dict(), report_table(made.report, str(target)))
+    return made.report.as_dict(), report_table(made.report, str(target))
 
 
 # ``kissgs compress -o FOLDER/lod-meta.json`` of one scene, into levels of detail.
@@ -112,7 +113,7 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
     if scene == "-":
         raise UnsupportedError("levels of detail need a file: it is read more than once")
     with progress_bar(options.quiet) as bar, contextlib.ExitStack() as ending:
-        from kissgs.streaming.layout import continuation, work_folder
+        from kissgs.streaming.work_folder import continuation, work_folder
 
         work = work_folder(target)
         say_when_interrupted(lambda: continuation(work) if work.exists() else NOTHING_LEFT)
@@ -141,7 +142,7 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
             threads=options.threads,
             progress=progress,
         )
-    return Result(asdict(report), streamed_table(report, str(target)))
+    return asdict(report), streamed_table(report, str(target))
 
 
 # ``kissgs compress --ray``: scenes as work items on the nodes of a Ray cluster.
@@ -230,7 +231,7 @@ class ClusterCompression:
             raise self._error(outcome, target)
         check_destination(target, overwrite=self.options.force)
         move_into_place(Path(outcome.result["written"]), target)
-        return Result(outcome.result["report"], Text.from_ansi(outcome.result["table"].removesuffix("\n")))
+        return outcome.result["report"], Text.from_ansi(outcome.result["table"].removesuffix("\n"))
 
     def _request(self, runner: Runner, count: int) -> Resources:
         """Return the processors and GPUs of each of ``count`` scenes, which share all without ``--threads``."""
@@ -256,7 +257,7 @@ class ClusterCompression:
         file = scene_root(scene)
         size = file.stat().st_size if file.is_file() else 0
         resources = with_memory(runner, requested, self._memory(file, size))
-        console = output()
+        console = files.output()
         arguments = {
             "scene": str(scene),
             "bytes": size,

@@ -21,7 +21,8 @@ from kissgs.cli.options import (
     output_option,
     with_option_groups,
 )
-from kissgs.core.errors import OutputError, UnsupportedError
+from kissgs.core.context import with_seconds_left
+from kissgs.core.errors import OutputError, RemoteError, UnsupportedError
 from kissgs.formats import OUTPUT_FORMATS, ending_of, named_container
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def compress(
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job."""
-    from kissgs.cameras.captures.load import capture_of
+    from kissgs.cameras.captures.load import capture_of, pack_capture
     from kissgs.cli.tables import status_table
     from kissgs.io.files import open_scene_file, refuse_existing
     from kissgs.pipeline.scene_files import scene_root
@@ -68,8 +69,15 @@ def compress(
 
         @functools.cache
         def packed(capture: Path, within: Path) -> Path:
-            _check_reachable(remote)
-            return _pack(capture, within / "scene", Path(tempfile.mkdtemp(dir=folder)), quiet or as_json)
+            try:
+                remote.jobs(1)  # here, as packing may take minutes
+            except RemoteError as error:
+                if error.retry_after is None:  # else it is overloaded for a while
+                    raise
+            archive = Path(tempfile.mkdtemp(dir=folder)) / "capture.zip"
+            with progress_bar(quiet or as_json) as progress:
+                pack_capture(capture, archive, progress, scene=within / "scene")
+            return archive
 
         def work(scene: str, target: Path) -> Result:
             refuse_existing(target, overwrite=force)  # here, as packing may take minutes
@@ -88,7 +96,7 @@ def compress(
                     overwrite=force,
                     progress=_announcing(progress, server, quiet),
                 )
-            return Result(status, status_table(status, str(target)))
+            return status, status_table(status, str(target))
 
         for_each_input(scenes, output, ending_of(kind), work, as_json=as_json, quiet=quiet)
 
@@ -123,7 +131,7 @@ def get(
     with _service(server) as remote, progress_bar(False) as bar:
         progress = _announcing(bar, server, False)
         known = remote.status(job)
-        kind = known["options"].get("format") or named_container(None, output)  # older services state none
+        kind = known["options"]["format"]
         ending = f".{kind}" if kind in OUTPUT_FORMATS else ending_of(kind)
         target = output or Path(f"{known['name']}{ending}")
         if not target.name.lower().endswith(ending):
@@ -147,31 +155,9 @@ def _service(server: str) -> Remote:
     return Remote(server, key=os.environ.get("KISSGS_KEY"))
 
 
-def _check_reachable(remote: Remote) -> None:
-    """Raise RemoteError if the service cannot be reached or refuses the key; it may be overloaded for a while."""
-    from kissgs.core.errors import RemoteError
-
-    try:
-        remote.jobs(1)
-    except RemoteError as error:
-        if error.retry_after is None:
-            raise
-
-
-def _pack(views: Path, scene: Path, folder: Path, quiet: bool) -> Path:
-    """Pack a capture for a scene into an archive in the folder."""
-    from kissgs.cameras.captures.load import pack_capture
-
-    archive = folder / "capture.zip"
-    with progress_bar(quiet) as progress:
-        pack_capture(views, archive, progress, scene=scene)
-    return archive
-
-
 def _announcing(progress: Progress, server: str, quiet: bool) -> Progress:
     """Return a receiver that prints a line when the service refuses a request for the first time."""
     from kissgs.client import WAIT
-    from kissgs.core.context import with_seconds_left
 
     said, forward = quiet, with_seconds_left(progress)
 

@@ -305,7 +305,7 @@ def render(
         cameras = [{"name": view.name, **camera_as_dict(view.camera)} for view in rendered.views]
         report = {"width": width, "height": height, "frames": len(rendered.images), "bytes": len(data)}
         line = f"{target}  {width}x{height}, {rendered.description}{saved}"
-        return Result({**report, "cameras": cameras}, line)
+        return {**report, "cameras": cameras}, line
 
     for_each_input([file], output, suffix, work, as_json=as_json, quiet=quiet)
 

@@ -34,6 +34,8 @@ CHANGES = {
 }
 """Text for each kind of removed or changed Gaussians, by key of the report."""
 
+TARGETS = {"photos": "photographs", "renderings": "renderings of the scene"}  # of training
+
 
 def table_of(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     """Return a table: names at the left, figures at the right."""
@@ -70,7 +72,7 @@ def _how_to_view(target: str) -> list[Text]:
 def report_table(report: Report, target: str) -> RenderableType:
     """Format the report of one compression."""
     sizes, counts = (report.source_bytes, report.container_bytes), (report.source_count, report.count)
-    head = _result(target, sizes, counts, report.sh_degree, sum(report.seconds.values()), report.cpu_seconds)
+    head = _result(target, sizes, counts, report.sh_degree, (sum(report.seconds.values()), report.cpu_seconds))
     head.append(f", peak memory {size(report.peak_memory)}")
     details: list[RenderableType] = []
     if report.compaction is not None:
@@ -89,44 +91,34 @@ def report_table(report: Report, target: str) -> RenderableType:
 
 def status_table(status: Mapping[str, Any], target: str) -> RenderableType:
     """Format the status of a job of a service that has succeeded, as :func:`report_table` does it for a report."""
-    timings, sizes, evaluation = status["timings"], status["sizes"], status.get("evaluation")
-    counts, seconds = (status["gaussians"], status["kept"]), sum(timings["stages"].values())
-    bytes_of = status["upload_bytes"], sizes["container"]
-    head = _result(target, bytes_of, counts, status["sh_degree"], seconds, timings["cpu_seconds"])
+    timings, evaluation = status["timings"], status.get("evaluation")
+    sizes, counts = (status["upload_bytes"], status["sizes"]["container"]), (status["gaussians"], status["kept"])
+    times = sum(timings["stages"].values()), timings["cpu_seconds"]
+    head = _result(target, sizes, counts, status["sh_degree"], times)
     details = _noted(status.get("note") or "")
     if evaluation is not None:
         psnr = evaluation.get("psnr")  # null: infinite
         mean = ImageMetrics(
             psnr=float("inf" if psnr is None else psnr), ssim=evaluation["ssim"], ms_ssim=evaluation["ms_ssim"]
         )
-        patches = evaluation.get("detail")  # services of older versions state none
-        detail = "" if patches is None else f"; {detail_text(_detail(patches), 'renderings')}"
-        details.append(Text(f"{mean.summary} to the scene's own renderings{detail}"))
+        # A failed rendering is the text "NaN".
+        detail = Detail(*(float(evaluation["detail"][name]) for name in ("worst", "worst_percent", "share_below")))
+        details.append(Text(f"{mean.summary} to the scene's own renderings; {detail_text(detail, 'renderings')}"))
     changed = {"invisible": status.get("invisible") or 0, **(status.get("cleaned") or {})}
     return Group(head, *details, *_changes(changed), *_how_to_view(target))
 
 
-def _detail(patches: Mapping[str, Any]) -> Detail:
-    """Return the figures of a service's JSON, where a failed rendering is the text "NaN"."""
-    return Detail(*(float(patches[name]) for name in ("worst", "worst_percent", "share_below")))
-
-
 def _result(
-    target: str,
-    bytes_of: tuple[int, int],
-    counts: tuple[int, int],
-    sh_degree: int,
-    seconds: float,
-    cpu_seconds: float,
+    target: str, sizes: tuple[int, int], counts: tuple[int, int], degree: int, times: tuple[float, float]
 ) -> Text:
-    """Format the result of a compression: sizes and counts of the scene and of the container, and its time."""
-    (before, after), (all_of_them, kept) = bytes_of, counts
+    """Format the result of a compression: sizes and counts before and after it, and its wall and CPU time."""
+    (before, after), (all_of_them, kept), (seconds, cpu_seconds) = sizes, counts, times
     return Text.assemble(
         (target, "bold"),
         f"  {size(before)} -> {size(after)}, ",
         (f"{before / after:.1f}x smaller", "bold green"),
         f", {after / max(all_of_them, 1):.2f} bytes per Gaussian\n",
-        f"{kept:,} of {gaussians(all_of_them)}, SH degree {sh_degree}; {seconds:.1f} s ({cpu_seconds:.1f} CPU s)",
+        f"{kept:,} of {gaussians(all_of_them)}, SH degree {degree}; {seconds:.1f} s ({cpu_seconds:.1f} CPU s)",
     )
 
 
@@ -164,9 +156,9 @@ def _compaction(report: CompactionReport, *, search: bool = True) -> list[Render
         lines.append(Text(f"search: {'; '.join(trial.summary() for trial in report.trials)}"))
     if not report.steps:
         return lines
-    trained = {"photos": "trained on photographs", "renderings": "trained on renderings of the scene"}
     if report.source:
-        lines.append(Text(f"{trained.get(report.target_source, 'scored with')}: {report.source}"))
+        how = f"trained on {TARGETS[report.target_source]}" if report.target_source in TARGETS else "scored with"
+        lines.append(Text(f"{how}: {report.source}"))
     heads, rows = ["step", "Gaussians", "seconds"], []
     if report.steps[0].bytes is not None:
         heads += ["PSNR", "SSIM", "MS-SSIM", "bytes"]
@@ -181,11 +173,10 @@ def _compaction(report: CompactionReport, *, search: bool = True) -> list[Render
 
 def _finetuning(report: FinetuneReport) -> list[Text]:
     """Format the result of fine-tuning in one line, and its note."""
-    targets = "photographs" if report.target_source == "photos" else "renderings of the scene"
     first_size = "" if report.bytes_before is None else f"{size(report.bytes_before)} -> "
     first_psnr = "" if report.psnr_before is None else f"{format_metric(report.psnr_before, 2)} -> "
     line = (
-        f"fine-tuned on {targets}: {first_size}{size(report.bytes_after)}, held-out PSNR "
+        f"fine-tuned on {TARGETS[report.target_source]}: {first_size}{size(report.bytes_after)}, held-out PSNR "
         f"{first_psnr}{format_metric(report.psnr_after, 2)} dB, {report.seconds:.0f} s"
     )
     return [Text(line), *_noted(report.note)]
@@ -278,29 +269,22 @@ def evaluation_table(
         )
     if evaluation.split == "train" != asked:
         notes.append("no view is held out: the scene may have been trained on these views")
-    return Group(
-        _sizes(evaluation, reference, candidate),
-        f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}",
-        *_noted(*notes),
-        "",
-        *_metrics_of_views(evaluation),
-        "",
-        _sentence(evaluation.extremes),
-        *([] if surroundings is None else [_sentence(_beyond(surroundings))]),
-    )
-
-
-def _sentence(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}."
-
-
-def _sizes(evaluation: Evaluation, reference: ReportScene, candidate: ReportScene) -> Text:
     head = Text.assemble((candidate.name, "bold"), " compared with ", (reference.name, "bold"))
     if reference.bytes is not None and candidate.bytes:
         ratio = reference.bytes / candidate.bytes
         change = f"{ratio:.1f}x smaller" if ratio >= 1 else f"{1 / ratio:.1f}x larger"
         head.append(f"  {size(reference.bytes)} -> {size(candidate.bytes)}, ").append(change, "bold green")
-    return head.append(f"; {evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians")
+    head.append(f"; {evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians")
+    extremes = [evaluation.extremes, *([] if surroundings is None else [_beyond(surroundings)])]
+    return Group(
+        head,
+        f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}",
+        *_noted(*notes),
+        "",
+        *_metrics_of_views(evaluation),
+        "",
+        *(f"{text[0].upper()}{text[1:]}." for text in extremes),
+    )
 
 
 def _metrics_of_views(evaluation: Evaluation) -> list[RenderableType]:

@@ -19,7 +19,7 @@ from typing import Any
 
 from kissgs.core.context import Progress
 from kissgs.core.errors import KissgsError
-from kissgs.runners.contract import MEMORY_LIMIT
+from kissgs.runners import MEMORY_LIMIT
 
 EVENT_SECONDS = 0.25  # minimum seconds between progress events of a stage
 
@@ -33,7 +33,10 @@ Send = Callable[[dict[str, Any]], None]
 
 def main() -> None:
     """Read the task, run it, and send its result or its error."""
-    task = json.loads(_first_line())
+    line = os.fdopen(0, "rb", closefd=False).readline()  # nothing follows it
+    if not line.endswith(b"\n"):
+        os._exit(1)
+    task = json.loads(line)
     for number in (signal.SIGINT, signal.SIGTERM):  # sent to the parent, which ends this process if needed
         signal.signal(number, signal.SIG_IGN)
     _die_with(task["parent"])
@@ -125,16 +128,6 @@ def _load_numba() -> None:
 
     cpu_target.typing_context.refresh()
     cpu_target.target_context.refresh()
-
-
-def _first_line() -> bytes:
-    line = b""
-    while not line.endswith(b"\n"):
-        block = os.read(0, 65536)  # nothing follows the line, so no data is lost
-        if not block:
-            os._exit(1)
-        line += block
-    return line
 
 
 def _die_with(parent: int) -> None:

@@ -22,21 +22,9 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import IO, Any
 
+from kissgs import runners
 from kissgs.core.context import Progress, silent
-from kissgs.runners.contract import (
-    CRASHED,
-    INTERNAL,
-    MEMORY_LIMIT,
-    NODE_UNUSABLE,
-    NOT_STARTED,
-    TIME_LIMIT,
-    Outcome,
-    Resources,
-    RunHandle,
-    WorkItem,
-    log,
-    report,
-)
+from kissgs.runners import Outcome, RunHandle, Runner, WorkItem, log, report
 
 PREFIX = "kissgs-item-"  # beginning of the names of temporary folders of items
 
@@ -150,9 +138,9 @@ class ItemProcess:
         of_folder = isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError)
         if self._item.folder is not None and of_folder:
             message = f"the machine {machine} cannot use the folder of the work: {reason}"
-            return Outcome("error", code=NODE_UNUSABLE, message=message, log=str(self._item.folder))
+            return Outcome("error", code=runners.NODE_UNUSABLE, message=message, log=str(self._item.folder))
         message = f"the machine {machine} could not start a process: {reason}"
-        return Outcome("lost", code=NOT_STARTED, message=message)
+        return Outcome("lost", code=runners.NOT_STARTED, message=message)
 
     def _start(self, errors: IO[bytes], folder: Path | str) -> subprocess.Popen[bytes]:
         process = subprocess.Popen(
@@ -204,25 +192,25 @@ class ItemProcess:
                 self._peak_data = max(self._peak_data, pages * os.sysconf("SC_PAGE_SIZE"))
 
     def _explain(self, final: Outcome | None, status: int, errors: IO[bytes]) -> Outcome:
-        if final is not None and final.code != MEMORY_LIMIT:
+        if final is not None and final.code != runners.MEMORY_LIMIT:
             return final
         if self._killed:
             return Outcome("cancelled")
         if self._timed_out:
             message = f"the work took longer than its limit of {self._item.seconds:g} s"
-            return Outcome("error", code=TIME_LIMIT, message=message)
+            return Outcome("error", code=runners.TIME_LIMIT, message=message)
         errors.seek(max(0, errors.seek(0, os.SEEK_END) - LOG_BYTES))
         text = errors.read().decode(errors="replace")
         limit = self._item.memory_limit
         near_limit = limit is not None and self._peak_data >= NEAR_LIMIT * limit and status != -signal.SIGKILL
         if final is not None or near_limit or OUT_OF_MEMORY.search(text):
             of = "" if limit is None else f" than its limit of {limit / 1e9:.2g} GB"
-            return Outcome("error", code=MEMORY_LIMIT, message=f"the work needs more memory{of}", log=text)
+            return Outcome("error", code=runners.MEMORY_LIMIT, message=f"the work needs more memory{of}", log=text)
         if status < 0:
             name = signal.Signals(-status).name
-            return Outcome("crashed", code=CRASHED, message=f"the process was ended by {name}", log=text)
+            return Outcome("crashed", code=runners.CRASHED, message=f"the process was ended by {name}", log=text)
         message = "the work failed because of an error in kissgs; please report it"
-        return Outcome("error", code=INTERNAL, message=message, log=text)
+        return Outcome("error", code=runners.INTERNAL, message=message, log=text)
 
 
 def json_lines(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
@@ -246,21 +234,16 @@ def child_environment(secret: tuple[str, ...] = ("KISSGS_", "AWS_")) -> dict[str
 # ``LocalRunner``: work items as processes on this machine, which start at once: the caller limits their number.
 
 
-class LocalRunner:
-    """Runner on this machine, see :class:`kissgs.runners.Runner`."""
+class LocalRunner(Runner):
+    """Runner on this machine."""
 
     def __init__(self) -> None:
         self._items: dict[str, tuple[ItemProcess, Future[Outcome]]] = {}
         self._closed = False
         self._lock = threading.Lock()
 
-    @property
-    def nodes(self) -> tuple[Resources, ...]:
-        """See :class:`kissgs.runners.Runner`."""
-        return ()
-
     def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
-        """See :class:`kissgs.runners.Runner`."""
+        """See :class:`Runner`."""
         item_id, process, outcome = secrets.token_hex(8), ItemProcess(item), Future[Outcome]()
         with self._lock:
             if self._closed:
@@ -268,7 +251,18 @@ class LocalRunner:
             self._items[item_id] = process, outcome
 
         def run() -> None:
-            outcome.set_result(_run(process, progress))
+            result = Outcome("cancelled")
+            try:
+                for event in process.events():
+                    if isinstance(event, Outcome):
+                        result = event
+                    else:
+                        report(progress, *event)
+            except Exception as error:  # noqa: BLE001  a bug, of which whoever waits must hear
+                log.exception("an item could not be followed", exc_info=error)
+                message = "the work could not be followed; please report it"
+                result = Outcome("error", code=runners.INTERNAL, message=message)
+            outcome.set_result(result)
             with self._lock:
                 del self._items[item_id]
 
@@ -276,39 +270,20 @@ class LocalRunner:
         return RunHandle(item_id, outcome)
 
     def cancel(self, item_id: str) -> None:
-        """See :class:`kissgs.runners.Runner`."""
+        """See :class:`Runner`."""
         with self._lock:
             if item_id in self._items:
                 self._items[item_id][0].kill()
 
-    def refusal(self, resources: Resources) -> str | None:
-        """See :class:`kissgs.runners.Runner`."""
-        return None
-
     def health_problem(self) -> str | None:
-        """See :class:`kissgs.runners.Runner`."""
+        """See :class:`Runner`."""
         return "the runner is closed" if self._closed else None
 
     def close(self) -> None:
-        """See :class:`kissgs.runners.Runner`."""
+        """See :class:`Runner`."""
         with self._lock:
             self._closed = True
             items = list(self._items.values())
         for process, _ in items:
             process.kill()
         wait([outcome for _, outcome in items])
-
-
-def _run(process: ItemProcess, progress: Progress) -> Outcome:
-    """Report the events of a process and return its outcome."""
-    outcome = Outcome("cancelled")
-    try:
-        for event in process.events():
-            if isinstance(event, Outcome):
-                outcome = event
-            else:
-                report(progress, *event)
-    except Exception as error:  # noqa: BLE001  a bug, of which whoever waits must hear
-        log.exception("an item could not be followed", exc_info=error)
-        return Outcome("error", code=INTERNAL, message="the work could not be followed; please report it")
-    return outcome

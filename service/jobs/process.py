@@ -12,6 +12,8 @@ from typing import Any
 import kissgs
 from kissgs import runners
 from kissgs.runners import Outcome, Resources, RunHandle, Runner, WorkItem
+from kissgs.runners.process import LocalRunner
+from kissgs.runners.ray_runner import RayRunner
 
 from ..core.settings import ServiceSettings
 from .job_process import without_paths
@@ -49,10 +51,10 @@ class JobRunners:
     @classmethod
     def open(cls, settings: ServiceSettings) -> JobRunners:
         """Open the runner that the settings name."""
-        local = runners.LocalRunner()
+        local = LocalRunner()
         if settings.ray_address is None:
             return cls(settings, local, local)
-        return cls(settings, runners.RayRunner(settings.ray_address), local)
+        return cls(settings, RayRunner(settings.ray_address), local)
 
     def health_problem(self) -> str | None:
         """Return why no job can run at the moment; None if jobs can."""

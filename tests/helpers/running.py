@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-from kissgs.runners.contract import Resources, WorkItem
+from kissgs.runners import Resources, WorkItem
 
 MB = 1_000_000
 ONE_PROCESSOR = Resources()

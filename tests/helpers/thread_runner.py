@@ -9,9 +9,9 @@ from pathlib import Path
 
 import kissgs
 from kissgs.core.context import silent
-from kissgs.runners import INTERNAL, LocalRunner, Outcome, RunHandle
-from kissgs.runners.contract import log, report
+from kissgs.runners import INTERNAL, Outcome, RunHandle, log, report
 from kissgs.runners.item_process import Throttle
+from kissgs.runners.process import LocalRunner
 
 HELD_SEED = 4_000_001
 """Seed of jobs that wait until they are cancelled."""

@@ -14,8 +14,7 @@ from helpers.running import MB, is_alive, item, outcome_of, pid_in, wait_until
 
 import kissgs
 from kissgs.cli.compress_scenes import with_memory
-from kissgs.runners import Resources, WorkItem, error_of
-from kissgs.runners.contract import refusal_of
+from kissgs.runners import Resources, WorkItem, error_of, refusal_of
 from kissgs.runners.process import ItemProcess, json_lines
 
 

@@ -13,13 +13,14 @@ from helpers.ray_cluster import NODE_MEMORY
 from helpers.running import MB, is_alive, item, outcome_of, pid_in, processors, wait_until
 
 from kissgs.core.errors import RunnerError
-from kissgs.runners import RayRunner, Resources
+from kissgs.runners import Resources
 from kissgs.runners import ray_runner as ray_runner_module
+from kissgs.runners.ray_runner import RayRunner
 
 DRIVER = """
 import sys
 from helpers.running import item
-from kissgs.runners import RayRunner
+from kissgs.runners.ray_runner import RayRunner
 runner = RayRunner(sys.argv[1])
 runner.submit(item("write_slowly", starts=sys.argv[2], output=sys.argv[3], text="text")).outcome.result()
 """
