@@ -13,16 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt8
-from kissgs.core.context import Context
-from kissgs.core.resources import blas_workers
+from kissgs.core.context import Context, blas_workers
 from kissgs.core.splats import Splats
+from kissgs.io.containers import zip_bytes
 from kissgs.io.images import compress_images
 from kissgs.planning.planner import EncodingPlan, plan_encoding
 from kissgs.planning.quantize import MEANS_TOP, Quantized, quantize
 from kissgs.planning.rotation_forms import apply_forms, pras_forms
 from kissgs.planning.sh_codebook import PAPER_TOP
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode
 from kissgs.sogxt.encode import render_planes, write_files
 

@@ -16,8 +16,7 @@ import torch
 
 from bench.common import arguments, head, positive, row, run
 from kissgs import CompactSettings, Splats, load, virtual_views
-from kissgs.core.context import Pace, load_kernels
-from kissgs.core.resources import Workers, keep_free_memory
+from kissgs.core.context import Pace, Workers, keep_free_memory, load_kernels
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw

@@ -26,7 +26,7 @@ from kissgs.core.context import Context, JobProgress, Progress, silent
 from kissgs.core.errors import InvalidSceneError, KissgsError, UnsupportedError
 from kissgs.core.positions import WORLD
 from kissgs.formats import CONTAINERS, FORMATS, ending_of
-from kissgs.io.containers import META_NAME, Source, open_source
+from kissgs.io.containers import META_NAME, Source, open_source, zip_bytes
 from kissgs.io.files import reason_of
 from kissgs.io.ply import write_ply
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
@@ -36,7 +36,6 @@ from kissgs.pipeline.scene_files import open_scene, recognise, scene_root
 from kissgs.sog import decode as sog
 from kissgs.sog.metadata import read_layout
 from kissgs.sogxt import decode as sogxt
-from kissgs.sogxt.container import zip_bytes
 
 PAGE_GAUSSIANS = 1_000_000  # largest number in the level that a page of one file gets, so that phones open it
 

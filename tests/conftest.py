@@ -76,7 +76,7 @@ def fewer_and_smaller_images(request, monkeypatch):
     exhaustive = request.node.get_closest_marker("exhaustive")
     thorough = exhaustive or {request.path.stem, request.function.__name__} & AS_USERS_HAVE_IT
     if not exhaustive and folder != "core":  # where no number of threads is given: other tests have the processors
-        monkeypatch.setattr("kissgs.core.resources.processors", lambda: 1)
+        monkeypatch.setattr("kissgs.core.context.processors", lambda: 1)
     smaller = folder in SMALLER_UNLESS_EXHAUSTIVE and not thorough
     if folder in WITH_FEWER_CAMERAS or smaller:
         from helpers.fewer_cameras import evaluate_smaller, try_fewer  # after the hook
@@ -109,7 +109,7 @@ def cuda_is_missing():
 
 def pytest_xdist_auto_num_workers():
     """Return one worker more than there are processors, because a quarter of the time of tests is waiting."""
-    from kissgs.core.resources import processors  # after the hook
+    from kissgs.core.context import processors  # after the hook
 
     return processors() + 1
 

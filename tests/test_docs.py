@@ -15,7 +15,7 @@ import typer.main
 from kissgs import Preset, Settings
 from kissgs.cli.app import app
 from kissgs.settings import PRESETS, TrainingViewSettings
-from kissgs.sogxt.container import FILES
+from kissgs.sogxt import FILES
 from service.core.presets import presets
 
 ROOT = Path(__file__).parents[1]

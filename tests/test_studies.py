@@ -23,7 +23,7 @@ from bench.external import measure_external
 from bench.rendering import resampled
 from kissgs.core.context import Context
 from kissgs.core.splats import ATTRIBUTES, SH_C0
-from kissgs.sogxt.container import zip_bytes
+from kissgs.io.containers import zip_bytes
 from kissgs.sogxt.encode import encode
 
 STUDIES = sorted(path.stem for path in Path(__file__).parents[1].glob("bench/[a-z]*.py"))
@@ -112,6 +112,25 @@ def test_parts_of_the_paper_that_only_save_bytes_change_nothing_else():
     floats = paper_parts.as_floats("scales", "scales")(whole, settings, 1)
     assert np.array_equal(floats.decoded.scales, whole.exact.scales)
     assert np.abs(whole.exact.scales - whole.decoded.scales).max() < 0.1
+
+
+def test_the_logarithm_of_positions_saves_the_near_ones_of_a_scene_that_extends_far():
+    """Published of bicycle: without it 13 % fewer bytes, and 7.55 dB less."""
+    scene, settings = kissgs.sample_scene(900, sh_degree=0), kissgs.Settings.from_preset("paper").encode
+    sky = np.linalg.norm(scene.means, axis=1) > 25
+    near = replace(scene, means=np.where(sky[:, None], np.float32(0.2) * scene.means, scene.means))
+    changes = []
+    for far in (1, 300):
+        means = np.where(sky[:, None], np.float32(far) * near.means, near.means)
+        scales = near.scales + np.where(sky, np.float32(np.log(far)), 0)[:, None].astype(np.float32)
+        whole = paper_parts.encode_parts(replace(near, means=means, scales=scales), settings, 1)
+        found = paper_parts.signed_log(whole, settings, 1)
+        psnr = [kissgs.evaluate(whole.exact, each.decoded).mean.candidate_vs_reference.psnr for each in (whole, found)]
+        changes.append((found.size(settings, 1) / whole.size(settings, 1) - 1, psnr[1] - psnr[0]))
+    (_, beside), (fewer, lost) = changes
+    assert abs(beside) < 0.5
+    assert fewer < -0.05
+    assert lost < -3
 
 
 @pytest.mark.parametrize("count", [1, 70, 200, 450])

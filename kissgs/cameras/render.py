@@ -24,9 +24,8 @@ from kissgs.cameras.virtual.select import (
     weighted_quantiles,
 )
 from kissgs.core.array_types import Bool, Float64, Int, UInt8
-from kissgs.core.context import DEFAULT_CONTEXT, Context, load_kernels
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Workers, load_kernels
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.constants import NEAR

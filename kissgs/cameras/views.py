@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kissgs.cameras.photographs import Window, read_photo, undistort
 from kissgs.core.array_types import Float32, Float64, UInt8
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.positions import WORLD, Origin
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.constants import NEAR
+
+if TYPE_CHECKING:
+    from kissgs.cameras.photographs import Window
 
 # Geometry of cameras that are drawn at random, of the encoder's and of the evaluation's.
 
@@ -145,6 +148,8 @@ class View:
         if self.photo is None:
             remedy = "add the photographs of the capture"
             raise InvalidViewsError(f"view {self.name} has no photograph, only a camera; {remedy}")
+        from kissgs.cameras.photographs import read_photo, undistort
+
         background = black() if self.background is None else self.background
         sampling = self._sampling
         stride, (column, row) = sampling.stride, sampling.first

@@ -25,8 +25,8 @@ from typer import Argument, Option
 
 from kissgs.cli.files import progress_bar, show, write_output
 from kissgs.cli.options import ForceOption, ViewsOption, chosen, open_views, output_option
+from kissgs.core.context import has_torch
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
-from kissgs.core.resources import has_torch
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -177,7 +177,7 @@ def measured(
 
 
 def _measure(scene: Path, settings: Settings, container: ContainerName, views: Views | None) -> Measurement:
-    from kissgs.core.resources import peak_memory
+    from kissgs.core.context import peak_memory
     from kissgs.evaluation.evaluate import evaluate
     from kissgs.pipeline.pipeline import compress
     from kissgs.pipeline.scene_files import decompress, load

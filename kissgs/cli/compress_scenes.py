@@ -28,15 +28,16 @@ from kissgs.cli.tables import report_table, streamed_table
 from kissgs.core.context import Progress, silent, with_seconds_left
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 from kissgs.formats import ContainerName
+from kissgs.io.containers import check_destination
 from kissgs.io.files import move_into_place, open_scene_file, reason_of
 from kissgs.io.scene_format import ReadOptions
+from kissgs.pipeline.encoding import FILES
 from kissgs.pipeline.limited_time import resolved
 from kissgs.pipeline.pipeline import Compressed, compress
 from kissgs.pipeline.scene_files import scene_root
 from kissgs.runners import INTERNAL, Outcome, Resources, RunHandle, Runner, WorkItem, error_of
 from kissgs.runners.ray_runner import RayRunner
 from kissgs.settings import Settings
-from kissgs.sogxt.container import check_destination
 from kissgs.training.checkpoint import delete_checkpoints
 
 if TYPE_CHECKING:
@@ -229,7 +230,7 @@ class ClusterCompression:
         self._bar = silent
         if outcome.kind != "done":
             raise self._error(outcome, target)
-        check_destination(target, overwrite=self.options.force)
+        check_destination(target, overwrite=self.options.force, names=FILES)
         move_into_place(Path(outcome.result["written"]), target)
         return outcome.result["report"], Text.from_ansi(outcome.result["table"].removesuffix("\n"))
 
@@ -244,7 +245,7 @@ class ClusterCompression:
 
     def _submit(self, runner: Runner, name: str, target: Path, requested: Resources) -> RunHandle:
         options = self.options
-        check_destination(target, overwrite=options.force)
+        check_destination(target, overwrite=options.force, names=FILES)
         scene = Path(name).absolute()
         if not scene.is_dir():  # here, because a node would say of a missing file that it does not see it
             with open_scene_file(Path(name)):

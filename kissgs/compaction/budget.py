@@ -12,9 +12,8 @@ from kissgs.cameras.views import Views
 from kissgs.compaction.popspa import Popspa, StepLog
 from kissgs.compaction.result import Compacted, CompactionReport, CountTrial
 from kissgs.compaction.search_evaluation import SearchEvaluation
-from kissgs.core.context import DEFAULT_CONTEXT, Context
+from kissgs.core.context import DEFAULT_CONTEXT, TORCH_MISSING, Context, has_torch
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.resources import TORCH_MISSING, has_torch
 from kissgs.core.root_finding import find_root
 from kissgs.core.splats import Splats
 from kissgs.evaluation.results import ESTIMATED_DROP, drop_of

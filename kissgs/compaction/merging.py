@@ -9,10 +9,9 @@ import numpy as np
 from numba import njit
 
 from kissgs.core.array_types import Bool, Float32, Float64, Int32, Int64
-from kissgs.core.context import DEFAULT_CONTEXT, Context
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Workers
 from kissgs.core.numba_kernels import compiled
-from kissgs.core.resources import Workers
-from kissgs.core.splats import LOG_SCALE_LIMIT, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, Splats
+from kissgs.core.splats import LOG_SCALE_LIMIT, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, Splats, blocks
 from kissgs.rendering.cpu.neighbours import SEARCH_LEAF, leaves_of, nearest_neighbours, unique_pairs
 from kissgs.rendering.cpu.tiles import each_part, even
 
@@ -341,7 +340,6 @@ NEIGHBOURS = 8  # number of nearest neighbours that a Gaussian may merge with
 SPACING_RANK = 3  # neighbour, from 0, whose distance is the spacing of the Gaussians
 BLUR = 0.01  # variance of the blur of compared images, squared spacings: viewers do not stand nearer
 CONTRAST = 0.09  # squared contrast of Gaussians to what is behind them, a sum over RGB in [0, 1]
-BLOCK = 65536  # number of Gaussians whose colours are moved at a time
 LARGEST_STEP = 0.3  # largest share of the Gaussians that disappears before neighbours and errors are computed anew
 
 
@@ -387,9 +385,9 @@ class _Clusters:
         # SH coefficients, those of sh0 first
         self.colors: Float32[np.ndarray, "M F"] = np.empty((count, 3 + 3 * source.shN.shape[1]), np.float32)
         self.colors[:, :3] = source.sh0[self.origin]
-        for a in range(0, count, BLOCK):
-            rows = self.origin[a : a + BLOCK]
-            self.colors[a : a + BLOCK, 3:] = source.shN[rows].reshape(len(rows), -1)
+        for rows in blocks(count):
+            some = self.origin[rows]
+            self.colors[rows, 3:] = source.shN[some].reshape(len(some), -1)
         self.errors: Float64[np.ndarray, " M"] = np.zeros(count)  # that merges have caused, see pair_errors
         self.heaviest: Float64[np.ndarray, " M"] = np.zeros(count)  # weight of the heaviest member
         self.merged: Bool[np.ndarray, " M"] = np.zeros(count, bool)  # whether it stands for several
@@ -449,9 +447,8 @@ class _Clusters:
         for name in ("means", "covariances", "alphas", "errors", "origin", "heaviest", "merged"):
             setattr(self, name, getattr(self, name)[left])
         rows = np.flatnonzero(left)
-        for a in range(0, len(rows), BLOCK):  # in place: the colours are most of the memory
-            some = rows[a : a + BLOCK]
-            self.colors[a : a + len(some)] = self.colors[some]
+        for some in blocks(len(rows)):  # in place: the colours are most of the memory
+            self.colors[some] = self.colors[rows[some]]
         self.colors = self.colors[: len(rows)]
 
     def _each(self, count: int, kernel: Callable[[int, int], None]) -> None:

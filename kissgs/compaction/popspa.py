@@ -24,8 +24,8 @@ from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import ImageMetrics
+from kissgs.io.containers import zip_bytes
 from kissgs.settings import CompactSettings, Preset, Settings
-from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import encode
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.supervision import SupervisionViews, TrainingTargets, training_targets

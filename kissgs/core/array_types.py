@@ -22,15 +22,8 @@ if TYPE_CHECKING or "jaxtyping" in sys.modules:
         UInt64,
     )
 else:
-
-    class _Unchecked:
-        """Placeholder for the array types when nothing is checked."""
-
-        def __class_getitem__(cls, item: object) -> type:
-            return cls
-
-    Bool = Float = Float32 = Float64 = Int = Int32 = Int64 = Integer = Shaped = _Unchecked
-    UInt8 = UInt16 = UInt32 = UInt64 = _Unchecked
+    Bool = Float = Float32 = Float64 = Int = Int32 = Int64 = Integer = Shaped = tuple  # placeholders: tuple[…] is valid
+    UInt8 = UInt16 = UInt32 = UInt64 = tuple
 
 __all__ = ["Bool", "Float", "Float32", "Float64", "Int", "Int32", "Int64", "Integer", "Shaped"]
 __all__ += ["UInt8", "UInt16", "UInt32", "UInt64"]

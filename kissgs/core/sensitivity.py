@@ -8,7 +8,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.errors import InvalidSceneError
-from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
+from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats, blocks
 
 UNSEEN = 1e-3  # smallest colour sensitivity, in units of the prior, which ignores occlusion
 
@@ -22,7 +22,6 @@ HARMONICS_TOLERANCE = 1.001  # factor by which the squares of mean harmonics may
 OPACITY, SCALES, ROTATION = (0,), (4, 5, 6), (7, 8, 9)  # indices of the diagonal entries in shape_hessian
 POSITION = (0, 1, 2)  # indices of the diagonal entries in position_hessian
 RATIO_SAMPLE = 1 << 18  # largest number of Gaussians from which ratios of sensitivities are estimated
-BLOCK = 1 << 16  # Gaussians per step of array arithmetic, so that temporary arrays stay small
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,8 +144,7 @@ class Sensitivity:
         for values, of, unit in self._diagonals(splats, some):
             each = np.maximum(values[some][:, list(of)].mean(axis=1, dtype=np.float64), 0)
             ratios.append(float(np.median(each / (colors * unit))))
-        for first in range(0, len(splats), BLOCK):
-            rows = slice(first, first + BLOCK)
+        for rows in blocks(len(splats)):
             prior = per_close_up * close_up[rows].astype(np.float64)
             measured = self.color_weight[rows].astype(np.float64)
             colors = np.maximum(measured, UNSEEN * prior)

@@ -28,8 +28,13 @@ SH_LIMIT = 1e6  # bounds of absolute values that cleaning leaves unchanged; beyo
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
-BLOCK = 1 << 16  # Gaussians that are checked at a time
+BLOCK = 1 << 14  # rows of a block: its float64 values stay in the processor's cache
 SAMPLED = 1 << 20  # largest number of rows of sampled_rows
+
+
+def blocks(count: int, size: int = BLOCK) -> list[slice]:
+    """Return slices that cover ``count`` rows, so that no temporary array is as large as the scene."""
+    return [slice(first, min(first + size, count)) for first in range(0, count, size)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,7 +183,7 @@ def clean(splats: Splats) -> tuple[Splats, Cleaned]:
         The scene, with its Gaussians in their order, and the number of changes.
     """
     keep, non_finite = np.empty(len(splats), bool), 0
-    for rows in _blocks(len(splats)):
+    for rows in blocks(len(splats)):
         finite = _finite_rows(splats.select(rows))
         with np.errstate(invalid="ignore"):  # NaN
             keep[rows] = finite & (np.abs(splats.means[rows]) <= MEAN_LIMIT).all(axis=1)
@@ -224,7 +229,7 @@ def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndarray, 
     """Return unit quaternions (the given array if nothing changes), and how many were zero and not of unit length."""
     zeros = unnormalised = 0
     changed = False
-    for rows in _blocks(len(quats)):
+    for rows in blocks(len(quats)):
         norm = _lengths(quats[rows])
         zeros += int((norm == 0).sum())
         unnormalised += int(((norm != 0) & (np.abs(norm - 1) > 1e-3)).sum())
@@ -232,7 +237,7 @@ def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndarray, 
     if not changed:
         return quats, 0, 0
     unit = np.empty_like(quats)
-    for rows in _blocks(len(quats)):
+    for rows in blocks(len(quats)):
         norm = _lengths(quats[rows])
         unit[rows] = quats[rows].astype(np.float64) / np.where(norm == 0, 1, norm)[:, None]
         unit[rows][norm == 0] = (1, 0, 0, 0)
@@ -242,11 +247,6 @@ def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndarray, 
 def _lengths(quats: Float32[np.ndarray, "N 4"]) -> Float64[np.ndarray, " N"]:
     wide = quats.astype(np.float64)  # float32 squares underflow at 1e-23 and overflow at 1e19
     return np.sqrt(np.einsum("nc,nc->n", wide, wide))
-
-
-def _blocks(count: int) -> list[slice]:
-    """Return slices that cover ``count`` rows, so that no temporary array is as large as the scene."""
-    return [slice(first, first + BLOCK) for first in range(0, count, BLOCK)]
 
 
 def _clamp(values: np.ndarray, limit: float) -> tuple[np.ndarray, Bool[np.ndarray, " N"]]:

@@ -10,9 +10,8 @@ import numpy as np
 
 from kissgs.cameras.views import Vec3, View, Views, camera_at, log_uniform, random_direction
 from kissgs.core.array_types import Float32, Float64, Int
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, Workers
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.resources import Workers
 from kissgs.core.splats import Splats
 from kissgs.evaluation.scene_parts import (
     GaussianSampler,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from kissgs.core.array_types import Float64, Int
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.core.splats import Splats
 from kissgs.io.conventions import spread_bits
 from kissgs.rendering.camera import Camera

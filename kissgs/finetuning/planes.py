@@ -13,9 +13,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, Int64
-from kissgs.core.context import Device
+from kissgs.core.context import Device, Workers
 from kissgs.core.numba_kernels import compiled
-from kissgs.core.resources import Workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.planning.planner import EncodingPlan
 from kissgs.planning.quantize import MEANS_TOP, SIZE, ByteTables, Quantized, short_values, table_field

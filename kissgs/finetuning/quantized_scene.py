@@ -12,9 +12,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float, Float32, Float64, Int
-from kissgs.core.context import Device, Pace
+from kissgs.core.context import Device, Pace, blas_workers
 from kissgs.core.positions import signed_exp
-from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.finetuning.planes import Ctx, Plane, each_part, level_bits, planes_of, sum_by_label
 from kissgs.planning import rotation_forms

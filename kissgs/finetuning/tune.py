@@ -22,13 +22,13 @@ from kissgs.evaluation.results import Evaluation, squared_error
 from kissgs.finetuning.planes import FIELDS, TABLES
 from kissgs.finetuning.quantized_scene import QuantizedScene, RateLoss, TotalVariationLoss, table_name
 from kissgs.finetuning.result import FinetuneReport
+from kissgs.io.containers import zip_bytes
 from kissgs.io.scene_format import ReadOptions
 from kissgs.planning.planner import Encoded, EncodingPlan, implied_lambda
 from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
 from kissgs.planning.rd_fields import Costs
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import FinetuneSettings
-from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import (

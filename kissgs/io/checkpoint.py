@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kissgs.core.context import Progress, silent
+from kissgs.core.context import TORCH_MISSING, Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.core.resources import TORCH_MISSING
 from kissgs.core.splats import ATTRIBUTES, SH_C0, Splats
 from kissgs.io.files import SceneFile, listed, open_scene_file, refuse_degree, refuse_more_than
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions

@@ -7,11 +7,9 @@ import numpy as np
 from kissgs.core.array_types import Float, Float32, Float64, Int, Int64, Shaped, UInt8
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.spherical_harmonics import sh_basis
-from kissgs.core.splats import OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_C0, Splats
+from kissgs.core.splats import OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_C0, Splats, blocks
 
 # Values and 8-bit codes of other formats -> the stored (pre-activation) parameters of a scene.
-
-ROWS = 1 << 14  # Gaussians per step, so that temporaries stay in the processor's cache
 
 _SLOTS = np.array([[0, 1, 2, 3], [1, 0, 2, 3], [1, 2, 0, 3], [1, 2, 3, 0]])
 """Indices of the four components in (largest, first, second, third of the others), by the index of the largest."""
@@ -40,7 +38,7 @@ def look_up(
     table: Float32[np.ndarray, " levels"], codes: Shaped[np.ndarray, "..."], out: Float32[np.ndarray, "..."]
 ) -> None:
     """Write the value of every code to ``out``; codes must be below the table's length."""
-    for part in steps(len(codes)):
+    for part in blocks(len(codes)):
         np.take(table, codes[part], out=out[part], mode="clip")
 
 
@@ -57,11 +55,6 @@ def byte_quats(codes: UInt8[np.ndarray, "B 4"]) -> Float64[np.ndarray, "B 4"]:
     quats = (codes.astype(np.float64) - 128) / 128
     norms = np.sqrt((quats * quats).sum(axis=1, keepdims=True))
     return quats / np.where(norms == 0, 1, norms)
-
-
-def steps(count: int) -> list[slice]:
-    """Return slices of some thousand rows that cover ``count`` rows."""
-    return [slice(start, min(start + ROWS, count)) for start in range(0, count, ROWS)]
 
 
 # Stored (pre-activation) parameters of a scene -> values and codes of other formats.
@@ -152,7 +145,7 @@ def sh_signs(signs: Signs, coefficients: int) -> Float32[np.ndarray, " K"]:
 @np.errstate(all="ignore")
 def move(splats: Splats, rotation: Float64[np.ndarray, "3 3"], scale: float, shift: Float64[np.ndarray, " 3"]) -> None:
     """Scale a scene about the origin, rotate and then shift it, in place."""
-    for part in steps(len(splats)):
+    for part in blocks(len(splats)):
         splats.means[part] = scale * splats.means[part].astype(np.float64) @ rotation.T + shift
         splats.quats[part] = _product(_quaternion(rotation), splats.quats[part].astype(np.float64))
     np.add(splats.scales, np.float32(np.log(scale)), out=splats.scales)
@@ -166,7 +159,7 @@ def _rotate_sh(splats: Splats, rotation: Float64[np.ndarray, "3 3"]) -> None:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     before, after = (sh_basis(d, splats.sh_degree)[:, 1:] for d in (directions @ rotation, directions))
     turn = np.linalg.lstsq(after, before, rcond=None)[0]
-    for part in steps(len(splats)):
+    for part in blocks(len(splats)):
         splats.shN[part] = np.einsum("kj,njc->nkc", turn, splats.shN[part].astype(np.float64))
 
 

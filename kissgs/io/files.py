@@ -17,8 +17,7 @@ import numpy as np
 
 from kissgs.core.array_types import Shaped
 from kissgs.core.errors import InvalidContainerError, InvalidSceneError, KissgsError, OutputError, UnsupportedError
-from kissgs.core.splats import Splats
-from kissgs.io.conventions import steps
+from kissgs.core.splats import Splats, blocks
 
 # JSON of files from elsewhere.
 
@@ -190,7 +189,7 @@ class SceneFile:
 
     def rows(self, offset: int, dtype: np.dtype, count: int) -> Iterator[tuple[slice, Shaped[np.ndarray, " B"]]]:
         """Yield ``count`` records at ``offset``, some thousand at a time, and which they are; they are overwritten."""
-        parts = steps(count)
+        parts = blocks(count)
         block = np.empty(parts[0].stop if parts else 0, dtype)
         self.file.seek(offset)
         for part in parts:

@@ -20,7 +20,7 @@ from kissgs.core.array_types import Float32, Float64, Shaped, UInt8
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.positions import WORLD, from_world, origin_for
-from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
+from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, blocks, empty_splats
 from kissgs.io import spz as spz_format
 from kissgs.io.containers import is_file_name
 from kissgs.io.conventions import (
@@ -34,7 +34,6 @@ from kissgs.io.conventions import (
     opacity_logits,
     refuse_empty,
     sh_signs,
-    steps,
     to_bytes,
 )
 from kissgs.io.files import (
@@ -435,7 +434,7 @@ def _read_attributes(document: _Document, part: _Part, out: Splats) -> None:
         if scales.size and float(scales.min()) < 0:
             raise document.invalid("it has negative scales, as drafts of the extension had them")
         opacities = column(f"{EXTENSION}:OPACITY", 1)[:, 0]
-        for rows in steps(len(out)):
+        for rows in blocks(len(out)):
             out.scales[rows] = log_scales(scales[rows].astype(np.float64))
             out.opacities[rows] = opacity_logits(opacities[rows].astype(np.float64))
         out.sh0[:] = column(_BANDS[0][0], 3)
@@ -503,7 +502,7 @@ def write_glb(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progre
         start += length
     _write_head(file, splats, columns, ends, views)
     for done, column in enumerate(columns, 1):
-        for rows in steps(len(splats)):
+        for rows in blocks(len(splats)):
             file.write(column.values(rows).astype(column.dtype).tobytes())
         progress("write", done / len(columns))
     return tuple(marks_left_out(splats))

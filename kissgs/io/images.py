@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image, PngImagePlugin, WebPImagePlugin
 
 from kissgs.core.array_types import UInt8
+from kissgs.core.context import Workers
 from kissgs.core.errors import InvalidContainerError
-from kissgs.core.resources import Workers
 
 if TYPE_CHECKING:
     from kissgs.settings import EncodeSettings

@@ -13,7 +13,7 @@ from kissgs.core.array_types import Float, Float32, Float64, Int64, Shaped, UInt
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.positions import WORLD, Origin, from_world, in_world, origin_for, world_positions
-from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats, sampled_rows
+from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, blocks, concatenate, empty_splats, sampled_rows
 from kissgs.io.conventions import (
     clamped,
     colors_of,
@@ -21,7 +21,6 @@ from kissgs.io.conventions import (
     morton_order,
     opacities_of,
     split_largest,
-    steps,
     to_codes,
 )
 from kissgs.io.files import BinaryWriter, listed, refuse_more_than
@@ -166,7 +165,7 @@ def write_compressed(file: BinaryWriter, splats: Splats, raw_axes: bool = False,
     order = morton_order(splats.means)
     chunks = np.empty((-(-n // _CHUNK), 18), "<f4")
     words = np.empty((n, 4), "<u4")
-    for part in steps(n):  # each but the last has whole chunks
+    for part in blocks(n):  # each but the last has whole chunks
         own = slice(part.start // _CHUNK, -(-part.stop // _CHUNK))
         _encode_vertices(splats.select(order[part]), chunks[own], words[part])
         progress("write", part.stop / n / (2 if k else 1))
@@ -178,7 +177,7 @@ def write_compressed(file: BinaryWriter, splats: Splats, raw_axes: bool = False,
     file.write(header_bytes(lines, splats.antialiased))
     file.write(chunks.tobytes())
     file.write(words.data if n else b"")
-    for part in steps(n if k else 0):
+    for part in blocks(n if k else 0):
         # Truncated, not rounded: readers decode to the middle of a step.
         codes = np.floor((splats.shN[order[part]].transpose(0, 2, 1).astype(np.float64) / 8 + 0.5) * 256)
         file.write(np.clip(codes, 0, 255).astype(np.uint8).tobytes())
@@ -309,7 +308,7 @@ def read_ply_blocks(source: Path) -> Iterator[Splats]:
         for block in rows(ply, columns.vertex):
             waiting.append(columns.splats(block, origin))
             done += len(block)
-            if sum(map(len, waiting)) >= BLOCK or done == info.count:
+            if sum(map(len, waiting)) >= 4 * BLOCK or done == info.count:
                 notes = dict.fromkeys([*_notes(ply.header), *(note for each in waiting for note in each.notes)])
                 yield replace(concatenate(waiting), antialiased=info.antialiased, notes=tuple(notes))
                 waiting = []
@@ -329,7 +328,7 @@ def write_ply(
     properties = [f"property {'double' if name in wide else 'float'} {name}" for name in names]
     comments = [comment] * bool(comment)
     file.write(header_bytes([*comments, f"element vertex {n}", *properties], splats.antialiased))
-    for step in steps(n):
+    for step in blocks(n):
         part = splats.select(step)
         rest = part.shN.transpose(0, 2, 1).reshape(len(part), 3 * k)  # all of R, then G, then B
         normals, opacities = np.zeros_like(part.means), part.opacities[:, None]

@@ -10,7 +10,7 @@ import numpy as np
 
 from kissgs.core.array_types import Shaped
 from kissgs.core.context import Progress, silent
-from kissgs.core.splats import Splats, empty_splats
+from kissgs.core.splats import Splats, blocks, empty_splats
 from kissgs.io.conventions import (
     OPACITY_OF_BYTE,
     SH0_OF_BYTE,
@@ -20,7 +20,6 @@ from kissgs.io.conventions import (
     log_scales,
     marks_left_out,
     opacities_of,
-    steps,
     to_bytes,
 )
 from kissgs.io.files import BinaryWriter, SceneFile, open_scene_file, refuse_more_than
@@ -49,7 +48,7 @@ def write_splat(file: BinaryWriter, splats: Splats, raw_axes: bool = False, prog
     logits = splats.opacities.astype(np.float64)
     log_weight = splats.scales.sum(axis=1, dtype=np.float64) - np.logaddexp(0, -logits)
     order = np.argsort(-log_weight, kind="stable")  # by volume times opacity; equal ones keep their order
-    for part in steps(len(splats)):
+    for part in blocks(len(splats)):
         file.write(_encode(splats.select(order[part])).tobytes())
         progress("write", part.stop / len(splats))
     notes = [f"view-dependent colour (SH degree {splats.sh_degree}) is left out"] * (splats.sh_degree > 0)

@@ -14,7 +14,7 @@ import numpy as np
 from kissgs.core.array_types import Float, Float32, UInt8
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
+from kissgs.core.splats import SH_REST_COUNTS, Splats, blocks, empty_splats
 from kissgs.io.conventions import (
     OPACITY_OF_BYTE,
     Signs,
@@ -28,7 +28,6 @@ from kissgs.io.conventions import (
     refuse_empty,
     sh_signs,
     split_largest,
-    steps,
     to_bytes,
     to_codes,
 )
@@ -120,7 +119,7 @@ its photographs.
 
 def decode_positions(codes: UInt8[np.ndarray, "N 9"], fractional_bits: int, out: Float32[np.ndarray, "N 3"]) -> None:
     """Decode positions of versions 2 and later: 24-bit integers, little-endian, of steps of 2^-fractional_bits."""
-    for part in steps(len(codes)):
+    for part in blocks(len(codes)):
         low, middle, high = (codes[part, i::3].astype(np.int32) for i in range(3))
         signed = (low << 8 | middle << 16 | high << 24) >> 8
         out[part] = np.ldexp(signed.astype(np.float64), -fractional_bits)
@@ -128,7 +127,7 @@ def decode_positions(codes: UInt8[np.ndarray, "N 9"], fractional_bits: int, out:
 
 def decode_three_bytes(codes: UInt8[np.ndarray, "N 3"], out: Float32[np.ndarray, "N 4"]) -> None:
     """Decode rotations of versions 1 and 2 to w, x, y, z: x, y, z in a byte each, w the rest of the unit length."""
-    for part in steps(len(codes)):
+    for part in blocks(len(codes)):
         small = codes[part] / 127.5 - 1
         out[part] = insert_largest(small, np.zeros(len(small), np.int64))
 
@@ -137,7 +136,7 @@ def decode_smallest_three(codes: UInt8[np.ndarray, "N 4"], out: Float32[np.ndarr
     """Decode rotations of versions 3 and later to w, x, y, z. Of a word's 32 bits the highest two name the largest of
     x, y, z, w; the others follow, the last in the lowest ten bits: nine of magnitude, one of sign."""
     words = codes.view("<u4")[:, 0]
-    for part in steps(len(codes)):
+    for part in blocks(len(codes)):
         word = words[part]
         fields = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], axis=1)
         magnitude = (fields & 511) / 511 * np.sqrt(0.5)
@@ -393,7 +392,7 @@ def write_spz(file: BinaryWriter, splats: Splats, raw_axes: bool = False, progre
     header = _HEADER.pack(MAGIC, 3, count, splats.sh_degree, bits, _ANTIALIASED * splats.antialiased, 0)
     file.write(packer.compress(header))
     for done, encode in enumerate(encoders, 1):
-        for part in steps(count):
+        for part in blocks(count):
             file.write(packer.compress(encode(part).tobytes()))
         progress("write", done / len(encoders))
     file.write(packer.flush())

@@ -12,10 +12,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from kissgs.core.context import Progress, silent
+from kissgs.core.context import Progress, Workers, silent
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.positions import Origin, read_origin, recorded
-from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.containers import Source, is_file_name, open_source, stored_size
 from kissgs.io.files import marked, parse_json, refuse_more_than, whole_number

@@ -14,25 +14,33 @@ import numpy as np
 from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Device, load_kernels
+from kissgs.core.context import (
+    DEFAULT_CONTEXT,
+    TORCH_MISSING,
+    Context,
+    Device,
+    blas_workers,
+    has_torch,
+    load_kernels,
+    return_free_memory,
+)
 from kissgs.core.errors import OutputError, UnsupportedError
-from kissgs.core.resources import TORCH_MISSING, blas_workers, has_torch, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, NOTHING_CLEANED, Cleaned, Splats
 from kissgs.formats import ContainerName
 from kissgs.io.files import atomic_file, reason_of, refuse_existing
-from kissgs.pipeline.goal import Container
 from kissgs.planning.planner import ColorRefit, Encoded, EncodingPlan, plan_encoding, refine_order
 from kissgs.planning.quantize import EVEN_LEVELS, ContainerModel
 from kissgs.rendering.rasterizer import need_cuda
 from kissgs.settings import EncodeSettings, FinetuneSettings, Settings
-from kissgs.sog import encode as sog
-from kissgs.sog.encode import SOG
+from kissgs.sog import FILES as SOG_FILES
+from kissgs.sogxt import FILES as SOGXT_FILES
 from kissgs.sogxt import encode as sogxt
-from kissgs.sogxt.container import FILES as SOGXT_FILES
 
 if TYPE_CHECKING:
     from kissgs.compaction.popspa import Popspa
+    from kissgs.compaction.result import Compacted
+    from kissgs.finetuning.result import FinetuneReport
     from kissgs.finetuning.tune import Tuner
     from kissgs.pipeline.limited_time import SearchTime
     from kissgs.rendering.sensitivity import WeightedCameras
@@ -40,8 +48,16 @@ if TYPE_CHECKING:
 
 # The containers that ``compress`` writes: what each can hold, and how its files are made.
 
-MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}  # for the planner
-FILES = frozenset({*SOGXT_FILES, *sog.FILES})  # a folder with no others may be replaced by a container
+FILES = frozenset({*SOGXT_FILES, *SOG_FILES})  # a folder with no others may be replaced by a container
+
+
+def model_of(container: ContainerName) -> ContainerModel:
+    """Return what a container can hold, for the planner."""
+    if container == "sogxt":
+        return EVEN_LEVELS
+    from kissgs.sog.encode import SOG
+
+    return SOG
 
 
 def write_files(
@@ -56,6 +72,8 @@ def write_files(
 ) -> Encoded:
     """Make the files of a plan for a container; the counts are for the metadata of SOG-XT."""
     if container == "sog":
+        from kissgs.sog import encode as sog
+
         return sog.write_files(plan, settings, context)
     return sogxt.write_files(
         plan, settings, context, cleaned=cleaned, compacted=compacted, finetune_steps=finetune_steps
@@ -126,6 +144,17 @@ class Measured:
     first_view: Mapping[str, Any] | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Container:
+    """A container in memory: its files with the report of the encoder, and how they were made."""
+
+    encoded: Encoded
+    settings: EncodeSettings
+    finetuning: FinetuneReport | None = None
+    compacted: Compacted | None = None
+    checkpoint: Path | None = None  # with the final state of its fine-tuning
+
+
 def measure(work: Work, splats: Splats, settings: EncodeSettings) -> Measured:
     """Measure the sensitivity of the work's scene, or of one with fewer Gaussians, if the settings need it."""
     load_kernels(work.context.progress)
@@ -161,7 +190,7 @@ def plan(work: Work, scene: Measured, settings: EncodeSettings, context: Context
         context,
         sensitivity=scene.sensitivity,
         recolor=scene.recolor,
-        container=MODELS[work.container],
+        container=model_of(work.container),
         keep_costs=bool(work.settings.finetune.enabled),
     )
     return replace(chosen, scene=replace(chosen.scene, first_view=scene.first_view))
@@ -230,7 +259,7 @@ def make_tuner(work: Work, settings: FinetuneSettings | None = None, compactor: 
     else:
         supervision = supervision_views(work.original, work.views, settings, work.context, scoring_stride=0)
         targets = training_targets(work.original, supervision, work.context)
-    model, decode = MODELS[work.container], decode_sog if work.container == "sog" else decode_sogxt
+    model, decode = model_of(work.container), decode_sog if work.container == "sog" else decode_sogxt
     return Tuner(work.original, settings, supervision, targets, work.context, model, decode)
 
 

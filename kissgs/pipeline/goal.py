@@ -13,23 +13,8 @@ from kissgs.evaluation.results import MAX_VIEW_PSNR, Detail, as_json, drop_of, o
 from kissgs.settings import QUALITIES, EncodeSettings
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from kissgs.compaction.result import Compacted
     from kissgs.evaluation.results import Evaluation
-    from kissgs.finetuning.result import FinetuneReport
-    from kissgs.planning.planner import Encoded
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Container:
-    """A container in memory: its files with the report of the encoder, and how they were made."""
-
-    encoded: Encoded
-    settings: EncodeSettings
-    finetuning: FinetuneReport | None = None
-    compacted: Compacted | None = None
-    checkpoint: Path | None = None  # with the final state of its fine-tuning
+    from kissgs.pipeline.encoding import Container
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kissgs.core.context import Context, Deadline, Step
+from kissgs.core.context import TORCH_MISSING, Context, Deadline, Step, has_torch, processors
 from kissgs.core.errors import OutputError
-from kissgs.core.resources import TORCH_MISSING, has_torch, processors
 from kissgs.io.files import atomic_file, reason_of
 from kissgs.settings import Preset, Settings, TrainingViewSettings
 

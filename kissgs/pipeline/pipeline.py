@@ -9,28 +9,34 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.core.array_types import Int
-from kissgs.core.context import Context, Deadline, Device, JobProgress, Progress, silent
+from kissgs.core.context import (
+    Context,
+    Deadline,
+    Device,
+    JobProgress,
+    Progress,
+    peak_memory,
+    return_free_memory,
+    silent,
+)
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.resources import peak_memory, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Cleaned, Splats, empty_splats
-from kissgs.evaluation.results import Evaluation
 from kissgs.formats import ContainerName, named_container
+from kissgs.io.containers import check_destination, is_packed, stored_sizes, write_container, zip_bytes
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.encoding import FILES, Work, check_finetuning, encode, make_tuner, measure, plan, write
-from kissgs.pipeline.goal import Attempt
+from kissgs.pipeline.encoding import FILES, Container, Work, check_finetuning, encode, make_tuner, measure, plan, write
 from kissgs.pipeline.limited_time import Expected, choose, resolved
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, reading_notes, save_ply
 from kissgs.settings import GOALS, EncodeSettings, Settings
-from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
-from kissgs.training.checkpoint import delete_checkpoints, finetune_checkpoint_path
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
+    from kissgs.compaction.result import Compacted, CompactionReport
+    from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
-    from kissgs.pipeline.goal import Container
+    from kissgs.pipeline.goal import Attempt
 
 
 # ``Report``: sizes, counts, errors, times and settings of one compression.
@@ -193,6 +199,7 @@ def compact(
         KissgsError: one of its subclasses, with a message for the user.
     """
     from kissgs.compaction.budget import compact_scene
+    from kissgs.training.checkpoint import delete_checkpoints
 
     views = _loaded(views, source)
     target = Path(destination) if destination is not None else None
@@ -323,11 +330,15 @@ def compress(
 
     # Evaluate, store, report.
     evaluation = _evaluate(work.original, encoded.files, views, context) if evaluate else None
-    checkpoints = [None if compacted is None else compacted.checkpoint, made.checkpoint]
+    own = [None if compacted is None else compacted.checkpoint, made.checkpoint]
+    checkpoints = tuple(path for path in own if path is not None)
     if target is not None:
         clock("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite, names=FILES)
-        delete_checkpoints(*checkpoints)
+        if checkpoints:
+            from kissgs.training.checkpoint import delete_checkpoints
+
+            delete_checkpoints(*checkpoints)
     clock.stop()
     container_bytes, file_bytes = stored_sizes(encoded.files, packed=work.packed)
     report = Report(
@@ -355,8 +366,7 @@ def compress(
         evaluation=evaluation,
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
-    remaining = () if target is not None else tuple(path for path in checkpoints if path is not None)
-    return Compressed(encoded.files, order, report, remaining, kind)
+    return Compressed(encoded.files, order, report, checkpoints if target is None else (), kind)
 
 
 def _loaded(views: Views | AnyPath | None, source: Splats | AnyPath | bytes) -> Views | None:
@@ -428,10 +438,10 @@ def _search(
 def _encode_once(work: Work, checkpoint: Path | None, *, disposable: bool) -> Container:
     """Plan, fine-tune if the settings say so, and write the files. A disposable scene that is not fine-tuned is
     forgotten once it is planned, so that its memory is free for the files."""
-    from kissgs.pipeline.goal import Container
-
     settings, compacted = work.settings.encode, len(work.original) - len(work.splats)
     if work.settings.finetune.enabled and len(work.splats) > 0:
+        from kissgs.training.checkpoint import finetune_checkpoint_path
+
         file = None if checkpoint is None else finetune_checkpoint_path(checkpoint)
         return encode(work, measure(work, work.splats, settings), settings, make_tuner(work), checkpoint=file)
     chosen = plan(work, measure(work, work.splats, settings), settings, work.context)

@@ -24,13 +24,14 @@ from kissgs.io.containers import (
     ZIP_MAGICS,
     MemorySource,
     Source,
+    is_packed,
     open_source,
     sniff_format,
     zip_names,
 )
 from kissgs.io.files import BinaryWriter, atomic_file, listed, parse_json, reason_of, refuse_existing, refuse_more_than
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Facts, Match, ReadOptions
-from kissgs.sogxt.container import YAML_NAME, is_packed
+from kissgs.sogxt import YAML_NAME
 
 # Recognition of scene formats: by content where a format has a mark, else by the ending of the name.
 

@@ -19,15 +19,15 @@ from kissgs.core.context import Context, JobProgress
 from kissgs.core.errors import InvalidViewsError, StopSearch, UnsupportedError
 from kissgs.core.splats import Splats
 from kissgs.evaluation.results import ESTIMATED_DROP, Evaluation, drop_of
+from kissgs.io.containers import stored_sizes
 from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline import curves
 from kissgs.pipeline.curves import LambdaCurve, NoFurtherError, at_lambda, count_at, last_number
-from kissgs.pipeline.encoding import Measured, Work, encode, make_tuner, measure
-from kissgs.pipeline.goal import Attempt, Container, Goal
+from kissgs.pipeline.encoding import Container, Measured, Work, encode, make_tuner, measure
+from kissgs.pipeline.goal import Attempt, Goal
 from kissgs.pipeline.limited_time import Expected, SearchPlan
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
     from kissgs.finetuning.result import FinetuneReport

@@ -10,7 +10,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, Int32, UInt16
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
+from kissgs.core.splats import blocks
 from kissgs.planning.quantize import clip_outliers, for_each_block
 from kissgs.settings import EncodeSettings
 
@@ -52,12 +53,11 @@ class Vectors:
         """Return the weighted mean, and the weighted root mean square distance to it per dimension."""
         start = self.table[self.rows[0]]
 
-        def moments(first: int) -> Float64[np.ndarray, "2 D"]:
-            block = slice(first, first + BLOCK)
+        def moments(block: slice) -> Float64[np.ndarray, "2 D"]:
             steps, weights = self.table[self.rows[block]].astype(np.float64) - start, self.weights[block]
             return np.stack([weights @ steps, weights @ np.square(steps)])
 
-        first, second = sum(pool.map(moments, range(0, len(self.rows), BLOCK))) / self.weights.sum(dtype=np.float64)
+        first, second = sum(pool.map(moments, blocks(len(self.rows), BLOCK))) / self.weights.sum(dtype=np.float64)
         return (start + first).astype(np.float32), float(np.maximum(second - np.square(first), 0).mean()) ** 0.5
 
 

@@ -10,8 +10,8 @@ from math import isqrt
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Int, Int32, Integer, UInt8, UInt16
+from kissgs.core.context import Workers
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.resources import Workers
 from kissgs.core.splats import MAX_GRID_SIDE
 from kissgs.planning.quantize import for_each_block, quantize_means, selected, sorted_order
 from kissgs.settings import EncodeSettings

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Float64, Int, Int32, UInt8, UInt16
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, Workers, blas_workers, return_free_memory
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.positions import Origin, coarse_note, signed_log
-from kissgs.core.resources import Workers, blas_workers, return_free_memory
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 from kissgs.planning import quantize, rd_fields, sh_codebook

@@ -11,10 +11,9 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, Int32, Integer, Shaped, UInt8, UInt16, UInt64
-from kissgs.core.context import Progress
+from kissgs.core.context import Progress, Workers
 from kissgs.core.positions import signed_log
-from kissgs.core.resources import Workers
-from kissgs.core.splats import Splats
+from kissgs.core.splats import BLOCK, Splats, blocks
 from kissgs.settings import EncodeSettings
 
 # ``ContainerModel``: the values that a container can hold; ``Planning``: inputs that all steps of planning share.
@@ -63,8 +62,6 @@ class Planning:
 
 R = TypeVar("R")
 
-BLOCK = 1 << 14  # number of rows of a block: its float64 values stay in the processor's cache
-
 
 @runtime_checkable
 class Rows(Protocol):
@@ -97,7 +94,7 @@ def for_each_block(
     count: int, work: Callable[[slice], R], pool: Workers | None = None, *, block: int = BLOCK
 ) -> list[R]:
     """Call ``work`` for the slices that cover ``count`` rows; return its results in their order."""
-    slices = [slice(first, min(first + block, count)) for first in range(0, count, block)]
+    slices = blocks(count, block)
     return [work(rows) for rows in slices] if pool is None else pool.map(work, slices)
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, Integer, UInt8, UInt64
+from kissgs.core.context import Workers
 from kissgs.core.positions import signed_exp, signed_log
-from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.planning import quantize, rotation_forms

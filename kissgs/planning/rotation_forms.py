@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Float64, Int, UInt8
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.core.splats import Splats
 from kissgs.planning.layout import box_blur
 from kissgs.planning.quantize import Computed, Planning, for_each_block, selected

@@ -9,9 +9,9 @@ from functools import cache, partial
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, Int32
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import MAX_CODEBOOK_SIDE, SH_REST_COUNTS, Splats
+from kissgs.core.splats import MAX_CODEBOOK_SIDE, SH_REST_COUNTS, Splats, blocks
 from kissgs.planning import kmeans
 from kissgs.planning.kmeans import BLOCK, Clustering
 from kissgs.planning.layout import axes_order, plas, principal_axes
@@ -244,8 +244,7 @@ class ShMetric:
     def errors(self, vectors: Float32[np.ndarray, "n D"], rows: Int[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
         """Return the squared errors of shN under the forms of these Gaussians; ``vectors`` are the differences."""
         found = np.empty(len(vectors))
-        for first in range(0, len(vectors), BLOCK):
-            block = slice(first, first + BLOCK)
+        for block in blocks(len(vectors), BLOCK):
             some = vectors[block].reshape(-1, self.coefficients, 3)
             found[block] = np.einsum("nkc,nkc->n", some, self.quadratic_forms(rows[block]) @ some, dtype=np.float64)
         return found

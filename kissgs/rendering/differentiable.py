@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from kissgs.core.array_types import Float
+from kissgs.core.context import TORCH_MISSING, Workers
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
-from kissgs.core.resources import TORCH_MISSING, Workers
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.constants import DILATION

@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, Shaped
+from kissgs.core.context import Workers
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
-from kissgs.core.resources import Workers
 
 # Images are floats in [0, 1] or uint8. Values outside [0, 1] are not clamped here; clamp renderings first. A NaN in
 # either image makes the result NaN, so that no average hides a failed rendering.

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Device
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Device, Workers
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.resources import Workers
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
 from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, silent
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, Workers, return_free_memory, silent
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.resources import Workers, return_free_memory
-from kissgs.core.sensitivity import BLOCK, LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
-from kissgs.core.splats import SH_C0, Splats
+from kissgs.core.sensitivity import LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
+from kissgs.core.splats import SH_C0, Splats, blocks
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.tiles import each_part, even
 
@@ -63,8 +62,7 @@ class Coverage:
     def close_up(self) -> Float32[np.ndarray, " N"]:
         """``(N,)`` mean squared alpha, 0 to 1, of each Gaussian in an unobstructed image that its surroundings fill."""
         found = np.empty(len(self._scale), np.float32)
-        for first in range(0, len(found), BLOCK):
-            rows = slice(first, first + BLOCK)
+        for rows in blocks(len(found)):
             logs = np.sort(self._splats.scales[rows], axis=1)[:, 1:].astype(np.float64)
             scale = self._scale[rows].astype(np.float64)
             near = np.maximum(np.minimum(scale, ISOLATED * np.exp(logs[:, 0])), scale / MAX_APPROACH)
@@ -186,8 +184,8 @@ def measure_sensitivity(
 
 def _bound(hessians: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> None:
     """Replace Hessians that overflow by their diagonals, at most :data:`LARGEST`."""
-    for first in range(0, len(hessians), BLOCK):
-        block = hessians[first : first + BLOCK]
+    for rows in blocks(len(hessians)):
+        block = hessians[rows]
         overflowing = ~(np.abs(block) <= LARGEST).all(axis=1)
         if overflowing.any():
             kept = np.nan_to_num(block[overflowing][:, diagonal], nan=LARGEST)

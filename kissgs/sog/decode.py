@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt8
-from kissgs.core.context import Progress, silent
+from kissgs.core.context import Progress, Workers, silent
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.positions import recorded, signed_exp
-from kissgs.core.resources import Workers
-from kissgs.core.splats import Splats, empty_splats
+from kissgs.core.splats import Splats, blocks, empty_splats
 from kissgs.formats import LOD_NAME
 from kissgs.io.containers import META_NAME, Source, open_source, stored_size
-from kissgs.io.conventions import insert_largest, look_up, steps
+from kissgs.io.conventions import insert_largest, look_up
 from kissgs.io.files import refuse_more_than
 from kissgs.io.images import decode_plane, decode_png, is_png, probe_png, probe_webp
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions, SceneSource, titled
 from kissgs.io.streamed import Container, StreamedFormat
-from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, MAX_SH_ENTRIES, Rest, SogLayout, read_layout
+from kissgs.sog import ENTRIES_PER_ROW, FIRST_TAG
+from kissgs.sog.metadata import MAX_SH_ENTRIES, Rest, SogLayout, read_layout
 
 _FREE_PIXELS = 1 << 20  # beyond four per Gaussian: encoders may round sides up to powers of two
 
@@ -126,7 +126,7 @@ def _decode_means(images: _Images, out: Splats) -> None:
     for axis in range(3):
         logs = layout.low[axis] + (layout.high[axis] - layout.low[axis]) * position
         table = signed_exp(logs).astype(np.float32)
-        for part in steps(len(out)):
+        for part in blocks(len(out)):
             out.means[part, axis] = table[levels[part, axis]]
 
 
@@ -138,7 +138,7 @@ def _decode_quats(images: _Images, out: Splats) -> None:
             f"{name} has a rotation whose alpha is {pixels[:, 3].min()}; {FIRST_TAG} to 255 are valid: "
             "export the scene again"
         )
-    for part in steps(len(out)):
+    for part in blocks(len(out)):
         small = (pixels[part, :3] / 255 - 0.5) * np.sqrt(2)
         out.quats[part] = insert_largest(small, pixels[part, 3].astype(np.int64) - FIRST_TAG)
 
@@ -160,7 +160,7 @@ def _decode_levels(
 ) -> None:
     for channel in range(3):
         _check_levels(name, levels[:, channel], table[channel])
-        for part in steps(len(out)):
+        for part in blocks(len(out)):
             out[part, channel] = table[channel][levels[part, channel]]
 
 
@@ -173,7 +173,7 @@ def _decode_rest(images: _Images, out: Splats) -> None:
     _check_levels(rest.centroids, codes, rest.table)
     codebook = rest.table[codes].reshape(len(codes), rest.coefficients, 3)
     labels = images.plane(rest.labels, 3)
-    for part in steps(len(shN)):
+    for part in blocks(len(shN)):
         entry = labels[part, 0] | labels[part, 1].astype(np.int64) << 8
         if int(entry.max()) >= len(codebook):
             raise InvalidContainerError(

@@ -10,10 +10,9 @@ import numpy as np
 
 from kissgs._version import __version__
 from kissgs.core.array_types import UInt8
-from kissgs.core.context import DEFAULT_CONTEXT, Context
+from kissgs.core.context import DEFAULT_CONTEXT, Context, blas_workers
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.positions import recorded
-from kissgs.core.resources import blas_workers
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.containers import META_NAME
 from kissgs.io.conventions import OPACITY_OF_BYTE
@@ -22,7 +21,7 @@ from kissgs.planning.planner import Encoded, EncodingPlan
 from kissgs.planning.quantize import ByteTables, ContainerModel, Quantized
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.settings import EncodeSettings
-from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG
+from kissgs.sog import ENTRIES_PER_ROW, FIRST_TAG, MEANS, QUATS, SCALES, SH0, SHN
 
 # Description of SOG 2 for the planner: its tables, and no mask for padding.
 
@@ -32,12 +31,6 @@ LAST_DRAWN = 254  # largest level to use: 255 is an opacity of 1, whose logit no
 _LOGITS = OPACITY_OF_BYTE.astype(np.float64)
 _TABLES = ByteTables(opacity_logits=_LOGITS, first_drawn=FIRST_DRAWN, last_drawn=LAST_DRAWN)
 SOG = ContainerModel(tables=_TABLES, padding_last=True, entry_bits=130)
-
-
-MEANS, QUATS, SCALES, SH0 = ("means_l.webp", "means_u.webp"), "quats.webp", "scales.webp", "sh0.webp"
-SHN = ("shN_centroids.webp", "shN_labels.webp")
-
-FILES = (META_NAME, *MEANS, QUATS, SCALES, SH0, *SHN)  # names of all files that a container may have
 
 
 def write_files(plan: EncodingPlan, settings: EncodeSettings, context: Context = DEFAULT_CONTEXT) -> Encoded:

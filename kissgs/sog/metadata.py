@@ -16,8 +16,6 @@ from kissgs.io.containers import MAX_METADATA_BYTES, META_NAME, Source, is_antia
 from kissgs.io.conventions import OPACITY_OF_BYTE
 from kissgs.io.files import is_number, listed, parse_json, whole_number
 
-ENTRIES_PER_ROW = 64  # entries of the SH codebook in a row of its image
-FIRST_TAG = 252  # alpha of a rotation whose largest component is w; 253 to 255 are x, y, z
 MAX_SH_ENTRIES = 1 << 16  # largest number of entries of the SH codebook: labels have two bytes
 MAX_FLOAT32 = 3e38  # bound of numbers, which float32 must hold
 

@@ -11,20 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, UInt8, UInt16
-from kissgs.core.context import Progress, silent
+from kissgs.core.context import Progress, Workers, silent
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.positions import recorded, signed_exp
-from kissgs.core.resources import Workers
-from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
+from kissgs.core.splats import BLOCK, SH_REST_COUNTS, Splats, blocks, empty_splats
 from kissgs.formats import LEVELS_NAME
 from kissgs.io.containers import Source, ZipSource, open_source, stored_size
-from kissgs.io.conventions import ROWS, steps
 from kissgs.io.files import refuse_more_than
 from kissgs.io.images import decode_plane
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, Codec, Facts, ReadOptions, SceneSource, titled
 from kissgs.io.streamed import Container, StreamedFormat
-from kissgs.sogxt import container
-from kissgs.sogxt.container import FILES, PLANES
+from kissgs.sogxt import FILES, FORMAT_NAME, PLANES
 from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout, read_layout, read_provenance
 
 CHANNELS_OF_PLAIN = {"quaternions": 4, "scales": 3, "f_dc": 3, "opacities": 1}
@@ -188,7 +185,7 @@ class _Planes:
                 entries = _entry(self.labels[source], self.layout.codebook_side)
                 np.take(self.codebook, entries, axis=0, out=shN[rows], mode="clip")
 
-        pool.map(work, steps(count))
+        pool.map(work, blocks(count))
         return splats
 
 
@@ -204,10 +201,10 @@ class _Lookup:
         table = _table(image, low, high).astype(np.float32)
         self._table = table.reshape(-1)
         # One row of offsets per Gaussian of a step: NumPy adds equal shapes faster than it broadcasts short rows.
-        self._offsets = np.tile(np.arange(len(table), dtype=np.uint16) * table.shape[1], (ROWS, 1))
+        self._offsets = np.tile(np.arange(len(table), dtype=np.uint16) * table.shape[1], (BLOCK, 1))
 
     def __call__(self, levels: UInt8[np.ndarray, "N C"], out: Float32[np.ndarray, "N C"]) -> None:
-        for part in steps(len(levels)):
+        for part in blocks(len(levels)):
             some = levels[part]
             np.take(self._table, some + self._offsets[: len(some)], out=out[part], mode="clip")
 
@@ -242,4 +239,4 @@ def _opened(files: Source, name: str) -> Container:
     )
 
 
-STREAMED = StreamedFormat("streamed SOG-XT scene", LEVELS_NAME, container.FORMAT, _opened)
+STREAMED = StreamedFormat("streamed SOG-XT scene", LEVELS_NAME, FORMAT_NAME, _opened)

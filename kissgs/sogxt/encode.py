@@ -8,8 +8,7 @@ import numpy as np
 
 from kissgs._version import __version__
 from kissgs.core.array_types import Float32, UInt8
-from kissgs.core.context import DEFAULT_CONTEXT, Context, load_kernels
-from kissgs.core.resources import blas_workers
+from kissgs.core.context import DEFAULT_CONTEXT, Context, blas_workers, load_kernels
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
 from kissgs.io.images import compress_images, pixels_crc32
@@ -17,7 +16,7 @@ from kissgs.planning.planner import ColorRefit, Encoded, EncodingPlan, plan_enco
 from kissgs.planning.quantize import Quantized, observed_range
 from kissgs.planning.sh_codebook import Codebook
 from kissgs.settings import GOALS, EncodeSettings
-from kissgs.sogxt import container, metadata
+from kissgs.sogxt import JSON_NAME, SCENE_NAME, YAML_NAME, metadata
 
 
 def encode(
@@ -76,8 +75,8 @@ def write_files(
         ),
         crc32={name: pixels_crc32(image) for name, image in images.items()},
     )
-    files = {container.JSON_NAME: layout.to_meta_json(), **files}
-    files = {container.YAML_NAME: layout.to_yaml(), container.SCENE_NAME: metadata.scene_json(files), **files}
+    files = {JSON_NAME: layout.to_meta_json(), **files}
+    files = {YAML_NAME: layout.to_yaml(), SCENE_NAME: metadata.scene_json(files), **files}
     return Encoded.of(plan, files)
 
 

@@ -20,7 +20,7 @@ from kissgs.core.splats import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE, SH_REST_COUNTS
 from kissgs.formats import LEVELS_NAME, LOD_NAME
 from kissgs.io.containers import MAX_METADATA_BYTES, Source, is_antialiased, stated_text
 from kissgs.io.files import parse_json
-from kissgs.sogxt.container import CHECKSUM, FORMAT, JSON_NAME, YAML_NAME
+from kissgs.sogxt import CHECKSUM, FORMAT_NAME, JSON_NAME, YAML_NAME
 
 # The metadata files ``container_meta.yaml``, ``meta.json`` and ``scene.json``.
 #
@@ -154,7 +154,7 @@ class Layout(BaseModel):
         centroids = self._range_entry("f_rest_centroids", "centroidsMins", "centroidsMaxs")
         document = {
             "version": 3,
-            "format": FORMAT,
+            "format": FORMAT_NAME,
             "profile": "SOG-XT",
             "count": self.count,
             "gridSide": self.grid_side,
@@ -452,7 +452,7 @@ def _check_dialect(document: Mapping[str, Any]) -> None:
     """Refuse formats that would decode to wrong values without an error."""
     quats, rest, files = document["quats"], document["shN"], document["mask"]["files"]
     for name, found, known in (
-        ("format", document.get("format", FORMAT), FORMAT),
+        ("format", document.get("format", FORMAT_NAME), FORMAT_NAME),
         ("version", document.get("version", 3), 3),
         ("quats.encoding", quats.get("encoding", "direct"), "direct"),
         ("shN.layout", rest.get("layout", "uv-codebook"), "uv-codebook"),

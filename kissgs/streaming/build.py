@@ -22,13 +22,14 @@ from kissgs.core.positions import STREAMED_REMEDY, WORLD, Cuts, cuts_without_coa
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, clean, concatenate, sampled_rows
 from kissgs.formats import ContainerName
-from kissgs.pipeline.encoding import MODELS, VIEW_UNCERTAINTY, write_files
+from kissgs.io.containers import write_container
+from kissgs.pipeline.encoding import VIEW_UNCERTAINTY, model_of, write_files
 from kissgs.pipeline.scene_files import reading_notes
 from kissgs.planning.planner import plan_encoding, visible_gaussians
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt.container import FORMAT, write_container
+from kissgs.sogxt import FORMAT_NAME
 from kissgs.streaming import work_folder as scratch
 from kissgs.streaming.levels import Environment, chunk_levels, times_to_halve
 from kissgs.streaming.work_folder import ContainerFile, Layout
@@ -252,7 +253,7 @@ def make_file(
             settings,
             context,
             sensitivity=sensitivity,
-            container=MODELS[layout.container],
+            container=model_of(layout.container),
             groups=groups,
             keep_costs=False,
         )
@@ -301,7 +302,7 @@ def make_manifest(work: Path, layout: Layout) -> None:
     has_environment = (work / scratch.OUT / layout.path(scratch.ENVIRONMENT)).exists()
     document = {
         "version": 1,
-        **({"format": FORMAT} if layout.container == "sogxt" else {}),
+        **({"format": FORMAT_NAME} if layout.container == "sogxt" else {}),
         "asset": {"generator": f"kissgs {__version__}"},
         **({"kissgs": facts} if (facts := recorded(layout.origin, view)) else {}),
         "count": totals[0],

@@ -15,7 +15,7 @@ from kissgs._version import __version__
 from kissgs.core.context import Context, JobProgress, Progress, silent
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.positions import middle_of, with_origin, world_positions
-from kissgs.core.splats import BLOCK, Splats
+from kissgs.core.splats import Splats, blocks
 from kissgs.formats import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
 from kissgs.io.files import reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
@@ -246,13 +246,12 @@ def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, i
             if reading.origin == "auto":
                 origin = middle_of(map(world_positions, read_ply_blocks(source)), info.count)
 
-            def blocks() -> Iterator[Splats]:
+            def read() -> Iterator[Splats]:
                 return (with_origin(reading.marked(block), origin) for block in read_ply_blocks(source))
 
-            return blocks, info.count, info.sh_degree
+            return read, info.count, info.sh_degree
     scene = read_scene(source, reading, threads=threads)
-    starts = range(0, len(scene), BLOCK)
-    return lambda: (scene.select(slice(start, start + BLOCK)) for start in starts), len(scene), scene.sh_degree
+    return lambda: (scene.select(rows) for rows in blocks(len(scene))), len(scene), scene.sh_degree
 
 
 def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[str, Any]:

@@ -11,8 +11,7 @@ import numpy as np
 
 from kissgs.compaction.merging import covariances_of, merged_levels
 from kissgs.core.array_types import Bool, Float32, Float64, Int64
-from kissgs.core.context import Progress, silent
-from kissgs.core.resources import Workers
+from kissgs.core.context import Progress, Workers, silent
 from kissgs.core.splats import Splats, concatenate
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.rasterizer import render

@@ -23,7 +23,7 @@ from kissgs.formats import MANIFESTS, ContainerName
 from kissgs.io.containers import META_NAME
 from kissgs.io.files import atomic_file, move_into_place, path_state, reason_of
 from kissgs.io.streamed import MAX_TREE_BYTES
-from kissgs.sog.encode import FILES
+from kissgs.sog import FILES
 
 # ``Layout``: sizes of a streamed scene; and the files of its work folder.
 

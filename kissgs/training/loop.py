@@ -11,9 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Pace
+from kissgs.core.context import DEFAULT_CONTEXT, TORCH_MISSING, Context, Pace, keep_free_memory
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.resources import TORCH_MISSING, keep_free_memory
 from kissgs.rendering.cpu.frame import Gradients
 from kissgs.rendering.differentiable import Parameters, photometric_loss, rasterize
 from kissgs.training.supervision import TrainingTargets

@@ -12,10 +12,9 @@ import numpy as np
 from numba import njit
 
 from kissgs.core.array_types import Float32, Int, Int32
-from kissgs.core.context import Device
+from kissgs.core.context import TORCH_MISSING, Device, Workers
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.numba_kernels import compiled
-from kissgs.core.resources import TORCH_MISSING, Workers
 from kissgs.core.splats import (
     ATTRIBUTES,
     LOG_SCALE_LIMIT,

@@ -15,8 +15,7 @@ from kissgs.compaction import merging
 from kissgs.compaction.budget import chosen_views, compact_scene
 from kissgs.compaction.merging import BLUR, CONTRAST, merge_gaussians
 from kissgs.compaction.scoring import highest_indices
-from kissgs.core.context import Context
-from kissgs.core.resources import Workers
+from kissgs.core.context import Context, Workers
 from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.cpu.neighbours import nearest_neighbours, unique_pairs

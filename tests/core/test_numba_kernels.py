@@ -77,7 +77,7 @@ def test_no_kernel_is_compiled_while_a_scene_is_compressed():
 
 GRADIENT = """
 import hashlib, numpy
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.rendering.metrics import differences_and_ssim
 image, target = numpy.random.default_rng(1).random((2, 2, 72, 96, 3), dtype=numpy.float32)
 gradient = numpy.empty_like(image)

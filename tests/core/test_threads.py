@@ -9,9 +9,8 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from kissgs.core import context as deadline
-from kissgs.core import resources as free_memory
-from kissgs.core.context import Context, Deadline, Pace
-from kissgs.core.resources import Workers, blas_workers, keep_free_memory, return_free_memory
+from kissgs.core import context as free_memory
+from kissgs.core.context import Context, Deadline, Pace, Workers, blas_workers, keep_free_memory, return_free_memory
 
 
 def blas_threads():
@@ -61,7 +60,7 @@ def test_no_thread_stays():
 LARGE_ARRAYS = """
 import resource
 import numpy as np
-from kissgs.core.resources import keep_free_memory
+from kissgs.core.context import keep_free_memory
 
 def page_faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

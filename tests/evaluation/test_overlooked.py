@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import kissgs
-from kissgs.core.context import Context
-from kissgs.core.resources import Workers
+from kissgs.core.context import Context, Workers
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.cameras import COUNT, MAX_ADDED, VISIBLE_PSNR, Parts, evaluation_views
 from kissgs.evaluation.evaluate import compare_images

@@ -6,7 +6,7 @@ from helpers import reference_float64
 from scipy.spatial.transform import Rotation
 
 import kissgs
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.scene_parts import (
     MAX_SIDE,

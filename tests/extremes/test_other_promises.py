@@ -11,7 +11,7 @@ from helpers.training_scenes import cloud
 import kissgs
 from kissgs import Settings
 from kissgs.cameras.views import black
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.core.sensitivity import LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import look_at

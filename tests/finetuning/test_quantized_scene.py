@@ -15,7 +15,7 @@ from kissgs.core.context import Context
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.finetuning.planes import TABLES
 from kissgs.finetuning.quantized_scene import QuantizedScene, table_name
-from kissgs.pipeline.encoding import MODELS, write_files
+from kissgs.pipeline.encoding import model_of, write_files
 from kissgs.planning.rd_fields import Costs
 
 IMAGES = {"opacities": 3, "scales": 3, "quaternions": 4, "f_dc": 3}
@@ -25,7 +25,7 @@ both = pytest.mark.parametrize("container", ["sogxt", "sog"])
 
 def scene_of(scene, preset, container, **changes):
     return QuantizedScene(
-        chosen(scene, preset, MODELS[container], **changes), scene.sh_degree, "cpu", MODELS[container]
+        chosen(scene, preset, model_of(container), **changes), scene.sh_degree, "cpu", model_of(container)
     )
 
 
@@ -89,8 +89,8 @@ def test_readers_of_sog_find_exactly_what_was_trained(number):
 )
 def test_an_untrained_plan_is_unchanged(preset, container):
     """Except for a few levels of SOG-XT that are no multiples of their stride; these move by less than one step."""
-    plan = chosen(cloud(400, 2), preset, MODELS[container])
-    found = QuantizedScene(plan, 2, "cpu", MODELS[container]).plan()
+    plan = chosen(cloud(400, 2), preset, model_of(container))
+    found = QuantizedScene(plan, 2, "cpu", model_of(container)).plan()
     if container == "sog":
         assert files_of(found, container) == files_of(plan, container)
         assert found.errors == plan.errors

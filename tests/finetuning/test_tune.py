@@ -20,12 +20,13 @@ from kissgs.core.splats import ATTRIBUTES
 from kissgs.evaluation.evaluate import evaluate
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.tune import Tuner, _Result
-from kissgs.pipeline.encoding import MODELS, write_files
+from kissgs.io.containers import zip_bytes
+from kissgs.pipeline.encoding import model_of, write_files
 from kissgs.pipeline.scene_files import describe
 from kissgs.planning import rotation_forms
 from kissgs.rendering.sensitivity import measure_sensitivity
 from kissgs.sog.decode import decode as decode_sog
-from kissgs.sogxt.container import YAML_NAME, zip_bytes
+from kissgs.sogxt import YAML_NAME
 from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import train
@@ -43,7 +44,7 @@ both = pytest.mark.parametrize("container", ["sogxt", "sog"])
 def tuner(scene, container="sogxt", size=40, **changes):
     capture = Views(around(12, size), around(7, size)[1:3], black(), "circle")
     settings = FinetuneSettings(**{**SHORT, "synthetic_view_share": 0.0, **changes})
-    made_for = {"container": MODELS[container], "decode": decode_sog if container == "sog" else decode_sogxt}
+    made_for = {"container": model_of(container), "decode": decode_sog if container == "sog" else decode_sogxt}
     supervision = supervision_views(scene, capture, settings, Context(1), scoring_stride=0)
     targets = training_targets(scene, supervision, Context(1))
     return Tuner(scene, settings, supervision, targets, Context(1), **made_for)
@@ -63,7 +64,7 @@ def tuned(
     if progress is not None:
         work = replace(work, context=replace(work.context, progress=progress))
     settings = Settings.research(preset, **encode).encode
-    plan = chosen(scene, preset, MODELS[container], **encode)
+    plan = chosen(scene, preset, model_of(container), **encode)
     return work(plan, plan, scene, written(settings, container), checkpoint)
 
 
@@ -143,7 +144,7 @@ def test_a_worse_container_is_not_kept(container):
     assert "did not help" in report.note
     assert report.psnr_after < report.psnr_before
     settings = Settings.research("fast", **COARSE).encode
-    plan = chosen(scene, "fast", MODELS[container], **COARSE)
+    plan = chosen(scene, "fast", model_of(container), **COARSE)
     assert encoded.files == written(settings, container)(plan, 0, Context(1)).files
 
 
@@ -229,7 +230,7 @@ def test_a_checkpoint_belongs_to_one_sog_container_and_its_tables(tmp_path, monk
     scene, path = cloud(60), tmp_path / "c.npz"
     with pytest.raises(Interrupted):
         tuned(scene, "sog", checkpoint=path, progress=stopping_after(3, "finetune"))
-    plan, model = chosen(scene, "fast", MODELS["sog"], **COARSE), MODELS["sog"]
+    plan, model = chosen(scene, "fast", model_of("sog"), **COARSE), model_of("sog")
     scales = plan.fields["scales"]
     other = replace(plan, fields={**plan.fields, "scales": replace(scales, table=scales.table + 0.01)})
     work, files = tuner(scene, "sog"), written(Settings.research("fast", **COARSE).encode, "sog")

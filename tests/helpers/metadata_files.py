@@ -9,7 +9,7 @@ import yaml
 from helpers.codec_scenes import random_scene
 from kissgs import InvalidContainerError, Settings, compress, decompress
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.sogxt.container import CHECKSUM
+from kissgs.sogxt import CHECKSUM
 
 FILES = compress(random_scene(70, 2, seed=4), settings=Settings.from_preset("fast")).files
 

@@ -5,9 +5,8 @@ import http.client
 import json
 import threading
 
-from kissgs.io.containers import open_source
+from kissgs.io.containers import open_source, zip_bytes
 from kissgs.preview import PageServer
-from kissgs.sogxt.container import zip_bytes
 
 
 def with_view(container, view):

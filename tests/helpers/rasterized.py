@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.rendering.cpu.frame import draw, removal_scores
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.rasterizer import tensors_of

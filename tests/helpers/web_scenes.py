@@ -12,7 +12,7 @@ import kissgs
 from helpers.codec_scenes import random_scene
 from helpers.reference_sog import zip_of
 from helpers.web_tools import pillow, run_node
-from kissgs.sogxt.container import CHECKSUM
+from kissgs.sogxt import CHECKSUM
 from kissgs.sogxt.decode import decode as decode_in_python
 
 IMAGES = (

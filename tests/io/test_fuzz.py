@@ -38,7 +38,7 @@ from kissgs.io.ply import read_ply, read_ply_info, write_ply
 from kissgs.io.scene_format import ReadOptions
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.sog.decode import decode as decode_sog
-from kissgs.sogxt.container import CHECKSUM
+from kissgs.sogxt import CHECKSUM
 
 DEFAULT_MUTATIONS, THOROUGH_MUTATIONS = 15, 1000
 

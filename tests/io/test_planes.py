@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from kissgs.core.context import blas_workers
 from kissgs.core.errors import InvalidContainerError
-from kissgs.core.resources import blas_workers
 from kissgs.io.images import compress_images, decode_plane, effort_of, encode_plane, probe_webp
 from kissgs.settings import EncodeSettings
 

@@ -8,8 +8,8 @@ from helpers.format_scenes import made_scene
 from helpers.reference_splat import SH_C0, ksplat_bytes, splat_bytes
 
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.core.splats import Splats, clean
-from kissgs.io import conventions, splat
+from kissgs.core.splats import Splats, blocks, clean
+from kissgs.io import splat
 from kissgs.io.ksplat import FORMAT, read_ksplat
 from kissgs.io.scene_format import Match
 from kissgs.io.splat import read_splat
@@ -40,7 +40,7 @@ def test_opacities_0_and_1_and_scales_of_0():
 
 @pytest.mark.parametrize("count", [0, 1, 65, 600])
 def test_splat_within_half_a_step(count, monkeypatch):
-    monkeypatch.setattr(conventions, "ROWS", 100)
+    monkeypatch.setattr(blocks, "__defaults__", (100,))
     scene = made_scene(count, 0)
     found = read_splat(splat_bytes(scene))
     assert splat.FORMAT.info(splat_bytes(scene), 0).count == len(found) == count

@@ -17,9 +17,9 @@ from helpers.reference_spz import streams
 
 from kissgs.core.context import silent
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.splats import ATTRIBUTES, Splats, clean
+from kissgs.core.splats import ATTRIBUTES, Splats, blocks, clean
 from kissgs.formats import ENDINGS, FORMATS, MANIFESTS, SCENE_ENDINGS, WRITTEN, named_container
-from kissgs.io import conventions, gltf
+from kissgs.io import gltf
 from kissgs.io.conventions import morton_order
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS
 from kissgs.io.splat import ROW
@@ -146,7 +146,7 @@ def test_notes_of_compressed_ply():
 @pytest.mark.parametrize(("count", "degree"), [(1, 0), (65, 1), (600, 3)])
 def test_rows_of_splat_are_those_of_the_reference(count, degree, monkeypatch):
     """Compared as a set: floats differ in their last bit, bytes where a half is rounded."""
-    monkeypatch.setattr(conventions, "ROWS", 100)
+    monkeypatch.setattr(blocks, "__defaults__", (100,))
     scene = clean(made_scene(count, degree))[0]
     found = np.frombuffer(written(scene, ".splat")[0], ROW)
     wanted = np.frombuffer(splat_bytes(scene), ROW)

@@ -16,7 +16,7 @@ from kissgs.cameras.views import Similarity, View, Views, black
 from kissgs.core.positions import coarse_share
 from kissgs.evaluation.evaluate import in_scene_frame
 from kissgs.rendering.camera import look_at
-from kissgs.sogxt.container import JSON_NAME, YAML_NAME
+from kissgs.sogxt import JSON_NAME, YAML_NAME
 
 SIZE = 0.03
 """Standard deviation of every Gaussian."""

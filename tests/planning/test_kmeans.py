@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs import Settings, sample_scene
-from kissgs.core.resources import Workers, blas_workers
+from kissgs.core.context import Workers, blas_workers
 from kissgs.planning import kmeans_kernels as kernels
 from kissgs.planning.kmeans import allocate, assign, fit, near_centroids, sorted_by_label
 from kissgs.planning.sh_codebook import codebook_side, nearest_square

@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import kissgs
+from kissgs.core.context import blas_workers
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.resources import blas_workers
 from kissgs.core.splats import MAX_GRID_SIDE
+from kissgs.io.containers import zip_bytes
 from kissgs.planning import planner
 from kissgs.planning.layout import axes_order, grid_side, hilbert_order, layout_grid, principal_axes
 from kissgs.planning.planner import plan_encoding
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.sog.encode import SOG, write_files
-from kissgs.sogxt.container import zip_bytes
 
 
 def walk(levels):

@@ -6,7 +6,7 @@ from helpers.random_sensitivity import random_sensitivity
 
 import kissgs
 from kissgs import Settings
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.planning import kernels, layout
 from kissgs.planning.layout import hilbert_order, refined_order
 from kissgs.sogxt.encode import encode

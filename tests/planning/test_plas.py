@@ -8,7 +8,7 @@ from helpers.examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.core.resources import blas_workers
+from kissgs.core.context import blas_workers
 from kissgs.planning import kernels
 from kissgs.planning.layout import box_blur, plas
 

@@ -7,7 +7,7 @@ from helpers.codec_scenes import random_scene
 from helpers.random_sensitivity import encode_rd, packed_hessian, random_sensitivity
 
 import kissgs
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.planning.quantize import quantize
 from kissgs.planning.rd_fields import (
     CAPTURED,

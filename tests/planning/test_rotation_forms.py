@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from kissgs.core.resources import blas_workers
+from kissgs.core.context import blas_workers
 from kissgs.planning import kernels, rotation_forms
 from kissgs.planning.layout import box_blur
 from kissgs.planning.rotation_forms import (

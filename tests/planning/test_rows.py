@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from helpers.codec_scenes import random_scene
 
-from kissgs.core.context import silent
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers, silent
 from kissgs.planning.quantize import (
     BLOCK,
     EVEN_LEVELS,

@@ -9,7 +9,7 @@ from helpers.memory import takes_less_than
 from helpers.reference_harmonics import real_harmonics
 
 import kissgs
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.planning import kmeans

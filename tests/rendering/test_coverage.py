@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs import Splats, sample_scene
-from kissgs.core.resources import Workers
+from kissgs.core.context import Workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import concatenate
 from kissgs.rendering.camera import Camera, look_at

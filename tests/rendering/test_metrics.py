@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.signal import convolve2d
 
+from kissgs.core.context import Workers
 from kissgs.core.errors import InvalidViewsError
-from kissgs.core.resources import Workers
 from kissgs.rendering.metrics import differences_and_ssim, ms_ssim, patch_edges, psnr, ssim, ssim_with_patches
 
 

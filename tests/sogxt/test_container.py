@@ -18,10 +18,19 @@ from helpers.reference_sog import zip_of
 import kissgs
 from kissgs.core.errors import InvalidContainerError, OutputError, UnsupportedError
 from kissgs.io import containers
-from kissgs.io.containers import MAX_ZIP_ENTRIES, DirectorySource, is_below, open_source, zip_names
+from kissgs.io.containers import (
+    MAX_ZIP_ENTRIES,
+    DirectorySource,
+    check_destination,
+    is_below,
+    open_source,
+    write_container,
+    zip_bytes,
+    zip_names,
+)
 from kissgs.io.images import encode_plane
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt.container import PLANES, check_destination, write_container, zip_bytes
+from kissgs.sogxt import PLANES
 from kissgs.sogxt.encode import encode
 
 FILES = {"container_meta.yaml": b"meta", "meta.json": b"{}", "a.webp": bytes(range(256)) * 4, "empty.webp": b""}

@@ -11,7 +11,7 @@ from PIL import Image
 
 from kissgs import Cancelled, InvalidContainerError, Settings, compress, decompress
 from kissgs.core.splats import ATTRIBUTES
-from kissgs.sogxt.container import CHECKSUM
+from kissgs.sogxt import CHECKSUM
 
 FILES = compress(random_scene(100, 3, seed=1), settings=Settings.from_preset("paper")).files
 

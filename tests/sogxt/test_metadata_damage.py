@@ -12,7 +12,7 @@ from helpers.metadata_files import FILES, document
 
 from kissgs import InvalidContainerError, Settings, UnsupportedError, compress, decompress
 from kissgs.io.containers import MemorySource
-from kissgs.sogxt.container import CHECKSUM, JSON_NAME, YAML_NAME
+from kissgs.sogxt import CHECKSUM, JSON_NAME, YAML_NAME
 from kissgs.sogxt.metadata import CHANNELS, read_layout
 
 STEP = 11

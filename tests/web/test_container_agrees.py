@@ -10,7 +10,7 @@ from helpers.reference_sog import zip_of
 from helpers.web_scenes import array_of, container, in_node, job, ulps
 
 from kissgs import KissgsError, Settings, compress, decompress
-from kissgs.sogxt.container import zip_bytes
+from kissgs.io.containers import zip_bytes
 
 FILES = container("fast", 1, 20)
 YAML, JSON = "container_meta.yaml", "meta.json"

@@ -8,7 +8,7 @@ from helpers.web_scenes import assert_scene, container, in_node, job
 from helpers.web_tools import put_value, run_node
 
 from kissgs import KissgsError, decompress
-from kissgs.sogxt.container import CHECKSUM
+from kissgs.sogxt import CHECKSUM
 
 FILES = container("fast", 3, 65)
 IMAGES = {name: data for name, data in FILES.items() if name.endswith(".webp")}

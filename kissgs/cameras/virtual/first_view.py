@@ -23,8 +23,7 @@ from kissgs.cameras.virtual.select import (
     weighted_quantiles,
 )
 from kissgs.core.array_types import Float64
-from kissgs.core.context import DEFAULT_CONTEXT, Context, load_kernels
-from kissgs.core.resources import Workers
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Workers, load_kernels
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw

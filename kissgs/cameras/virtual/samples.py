@@ -25,10 +25,9 @@ from kissgs.cameras.virtual.select import (
     with_size,
 )
 from kissgs.core.array_types import Bool, Float32, Int
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress
-from kissgs.core.resources import Workers
-from kissgs.core.sensitivity import BLOCK, Sensitivity
-from kissgs.core.splats import Splats, concatenate
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, Workers
+from kissgs.core.sensitivity import Sensitivity
+from kissgs.core.splats import Splats, blocks, concatenate
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.cpu.frame import add_sensitivities, draw, drawn_opacities
 from kissgs.rendering.sensitivity import Coverage, WeightedCameras, local_scale
@@ -130,9 +129,9 @@ def _further_region(splats: Splats, bounds: SceneBounds, like: Camera, pool: Wor
 
 def _within(means: Float32[np.ndarray, "N 3"], centre: Vec3, radius: float) -> Bool[np.ndarray, " N"]:
     found = np.empty(len(means), bool)
-    for first in range(0, len(means), BLOCK):
-        offsets = means[first : first + BLOCK] - centre
-        found[first : first + BLOCK] = np.einsum("nc,nc->n", offsets, offsets) <= radius**2
+    for rows in blocks(len(means)):
+        offsets = means[rows] - centre
+        found[rows] = np.einsum("nc,nc->n", offsets, offsets) <= radius**2
     return found
 
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from kissgs.cameras.views import UP, Vec3, View, Views, black, check_images, rotation_matrices
 from kissgs.core.array_types import Float64, Int
-from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, silent
-from kissgs.core.resources import Workers
+from kissgs.core.context import DEFAULT_CONTEXT, Context, Progress, Workers, silent
 from kissgs.core.splats import SH_C0, Splats
 from kissgs.rendering.camera import Camera, look_at, pinhole
 from kissgs.rendering.constants import NEAR

@@ -9,8 +9,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int32, Shaped
+from kissgs.core.context import Workers
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
-from kissgs.core.resources import Workers
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering import constants

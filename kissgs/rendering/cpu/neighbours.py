@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit
 
 from kissgs.core.array_types import Float64, Int32, Int64, Shaped
+from kissgs.core.context import Workers
 from kissgs.core.numba_kernels import compiled
-from kissgs.core.resources import Workers
 from kissgs.rendering.cpu.tiles import each_part, even
 
 SEARCH_LEAF = 16  # largest number of points in a leaf in which nearest neighbours are searched

@@ -10,9 +10,9 @@ import numpy as np
 from numba import float32, int32, int64, njit, uint32, void
 
 from kissgs.core.array_types import Int64
+from kissgs.core.context import Workers
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.numba_kernels import compiled
-from kissgs.core.resources import Workers
 from kissgs.rendering import constants
 from kissgs.rendering.cpu.projection import project, shade
 from kissgs.rendering.cpu.records import (

@@ -13,8 +13,7 @@ from kissgs.cameras.views import black
 from kissgs.cameras.virtual.first_view import first_view, first_view_of
 from kissgs.cameras.virtual.samples import sensitivity_cameras
 from kissgs.cameras.virtual.select import score_candidates
-from kissgs.core.context import Context, silent
-from kissgs.core.resources import Workers
+from kissgs.core.context import Context, Workers, silent
 from kissgs.core.splats import concatenate
 from kissgs.rendering.camera import look_at
 
