@@ -56,7 +56,12 @@ class Remote:
             import httpx
         except ModuleNotFoundError as error:
             raise UnsupportedError("a kissgs service needs httpx, which is missing: pip install httpx") from error
-        if not _is_address(server):
+        try:
+            parts = urlsplit(server)
+            named = bool(parts.hostname) and parts.port != 0
+        except ValueError:
+            named = False
+        if not named or parts.scheme not in ("http", "https") or parts.path not in ("", "/"):
             raise UnsupportedError(
                 f"{server!r} is not the address of a service; write it as http://localhost:8000, without a path"
             )
@@ -156,12 +161,17 @@ class Remote:
         overloaded, without a second job. Arguments and errors are those of :meth:`compress`."""
         path, key, progress = Path(source), uuid.uuid4().hex, Share(progress)
         options = {**_given(settings or Settings()), "format": container, "evaluate": evaluate, "origin": origin}
-        named = None if capture is None else f"sha256:{_sha256(Path(capture))}"
-        options |= {"capture": named, "force_views": force_views}
+        options |= {"capture": None, "force_views": force_views}
+        if capture is not None:
+            with open_scene_file(Path(capture), "; name an archive", InvalidViewsError) as opened:
+                options["capture"] = f"sha256:{hashlib.file_digest(opened.file, 'sha256').hexdigest()}"
         params = {"options": json.dumps(options), "name": path.name}
 
         def send(kind: str, parts: Sequence[bytes | Path]) -> dict[str, Any]:
-            size = sum(map(_size, parts))
+            size = 0
+            for part in parts:
+                with open_scene_file(part) as opened:
+                    size += opened.size
             headers = {"Content-Type": kind, "Content-Length": str(size), "Idempotency-Key": key}
             body = _blocks(parts, size, progress)
             timeout = (10.0, ANSWER_SECONDS, 60.0, 60.0)
@@ -305,16 +315,6 @@ class Share:
         self._receive(stage, self._latest, note, seconds_left)
 
 
-def _is_address(server: str) -> bool:
-    try:
-        parts = urlsplit(server)
-        return (
-            parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0 and parts.path in ("", "/")
-        )
-    except ValueError:
-        return False
-
-
 def _given(settings: Settings) -> dict[str, Any]:
     """Return the settings as JSON without what belongs to the preset, which the server's version decides."""
     values = settings.model_dump(mode="json", exclude_unset=True)
@@ -324,11 +324,6 @@ def _given(settings: Settings) -> dict[str, Any]:
     return values
 
 
-def _sha256(capture: Path) -> str:
-    with open_scene_file(capture, "; name an archive", InvalidViewsError) as opened:
-        return hashlib.file_digest(opened.file, "sha256").hexdigest()
-
-
 def _form(boundary: str, **files: Path) -> list[bytes | Path]:
     """Return the parts of a form with these files, in order."""
     parts: list[bytes | Path] = []
@@ -336,11 +331,6 @@ def _form(boundary: str, **files: Path) -> list[bytes | Path]:
         head = f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n'
         parts += [head.encode(), path, b"\r\n"]
     return [*parts, f"--{boundary}--\r\n".encode()]
-
-
-def _size(part: bytes | Path) -> int:
-    with open_scene_file(part) as opened:
-        return opened.size
 
 
 def _blocks(parts: Sequence[bytes | Path], size: int, progress: Progress) -> Iterator[bytes]:

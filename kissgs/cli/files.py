@@ -173,6 +173,7 @@ def for_each_input(
     about to write into it. The context of ``during``, which gets all inputs with their outputs, encloses the work. A
     slash at the end of ``output`` names a folder."""
     from kissgs.io.checkpoint import one_per_step
+    from kissgs.io.files import reason_of
 
     inputs = one_per_step(expand(names))
     if writes and output is None:
@@ -181,7 +182,10 @@ def for_each_input(
         raise OutputError("--json and -o - both write to standard output; choose one")
     targets = _targets(inputs, output, suffix) if writes else [Path("-")] * len(inputs)
     if writes and output is not None and Path(output) not in targets:
-        _make_folder(Path(output))
+        try:
+            Path(output).mkdir(parents=True, exist_ok=True)
+        except (OSError, ValueError) as error:
+            raise OutputError(f"cannot make the folder {Path(output)!s:.100}: {reason_of(error)}") from error
     pairs = list(zip(inputs, targets, strict=True))
     reports, failed = [], False
     with contextlib.nullcontext() if during is None else during(pairs):
@@ -312,16 +316,6 @@ def _stem(name: str) -> str:
 def is_folder(path: Path) -> bool:
     """Whether the path is a folder; False also for invalid names, about which opening them gives an error."""
     return os.path.isdir(path)  # noqa: PTH112  Path.is_dir raises where a name is too long
-
-
-def _make_folder(folder: Path) -> None:
-    """Make a folder and its parents, if they do not exist."""
-    from kissgs.io.files import reason_of
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise OutputError(f"cannot make the folder {folder!s:.100}: {reason_of(error)}") from error
 
 
 def expand(names: list[str]) -> list[str]:

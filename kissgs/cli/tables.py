@@ -20,7 +20,6 @@ from kissgs.settings import Preset, Settings
 if TYPE_CHECKING:
     from kissgs.compaction.result import CompactionReport
     from kissgs.evaluation.html import ReportScene
-    from kissgs.finetuning.result import FinetuneReport
     from kissgs.pipeline.pipeline import Report
     from kissgs.pipeline.scene_files import Info
     from kissgs.streaming.compress import StreamedReport
@@ -79,8 +78,14 @@ def report_table(report: Report, target: str) -> RenderableType:
         details += _compaction(report.compaction, search=not report.trials)
     if report.trials:
         details.append(_search_table(report))
-    if report.finetuning is not None:
-        details += _finetuning(report.finetuning)
+    if (tuned := report.finetuning) is not None:
+        first_size = "" if tuned.bytes_before is None else f"{size(tuned.bytes_before)} -> "
+        first_psnr = "" if tuned.psnr_before is None else f"{format_metric(tuned.psnr_before, 2)} -> "
+        line = (
+            f"fine-tuned on {TARGETS[tuned.target_source]}: {first_size}{size(tuned.bytes_after)}, held-out PSNR "
+            f"{first_psnr}{format_metric(tuned.psnr_after, 2)} dB, {tuned.seconds:.0f} s"
+        )
+        details += [Text(line), *_noted(tuned.note)]
     details += _noted(report.note)
     if report.evaluation is not None:
         details.append(_evaluation(report.evaluation))
@@ -171,17 +176,6 @@ def _compaction(report: CompactionReport, *, search: bool = True) -> list[Render
     return [*lines, table_of(heads, rows)]
 
 
-def _finetuning(report: FinetuneReport) -> list[Text]:
-    """Format the result of fine-tuning in one line, and its note."""
-    first_size = "" if report.bytes_before is None else f"{size(report.bytes_before)} -> "
-    first_psnr = "" if report.psnr_before is None else f"{format_metric(report.psnr_before, 2)} -> "
-    line = (
-        f"fine-tuned on {TARGETS[report.target_source]}: {first_size}{size(report.bytes_after)}, held-out PSNR "
-        f"{first_psnr}{format_metric(report.psnr_after, 2)} dB, {report.seconds:.0f} s"
-    )
-    return [Text(line), *_noted(report.note)]
-
-
 def _search_table(report: Report) -> Table:
     """Format what a search tried: scenes with fewer Gaussians before encoding, and containers, the kept one marked."""
     scenes = () if report.compaction is None else report.compaction.trials
@@ -213,16 +207,6 @@ def _beyond(surroundings: Evaluation) -> str:
     return f"beyond the capture: {mean}; {surroundings.extremes}"
 
 
-def parts_table(parts: Mapping[str, int], count: int, whole: str = "total") -> Table:
-    """Return a table of bytes per file or attribute: absolute, share of the whole, and bits per Gaussian."""
-    total = sum(parts.values())
-    heads = ("part", "bytes", "share", "bits/Gaussian")
-    cells = ((name, f"{n:,}", f"{n / max(total, 1):.1%}", f"{8 * n / max(count, 1):.2f}") for name, n in parts.items())
-    table = table_of(heads, cells)
-    table.add_row(whole, f"{total:,}", "", f"{8 * total / max(count, 1):.2f}", style="bold")
-    return table
-
-
 def info_table(info: Info) -> RenderableType:
     """Format the output of ``kissgs info``."""
     streamed = FORMATS[info.kind].manifest is not None
@@ -230,8 +214,12 @@ def info_table(info: Info) -> RenderableType:
     body = f"{gaussians(info.count)}, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits per Gaussian"
     blocks: list[RenderableType] = [head, Text(body)]
     if info.parts:
+        total, count = sum(info.parts.values()), max(info.count, 1)
+        parts = [(name, f"{n:,}", f"{n / max(total, 1):.1%}", f"{8 * n / count:.2f}") for name, n in info.parts.items()]
+        table = table_of(("part", "bytes", "share", "bits/Gaussian"), parts)
         whole = f"total of level {info.details['level']}" if streamed else "total"
-        blocks.append(parts_table(info.parts, info.count, whole))
+        table.add_row(whole, f"{total:,}", "", f"{8 * total / count:.2f}", style="bold")
+        blocks.append(table)
     # Channels of a container share a step, so few reach the highest level.
     of = "value of {} level" if FORMATS[info.kind].is_container else "{} value"
     ranges = [(name, f"{low:.5g}", f"{high:.5g}") for name, (low, high) in info.ranges.items()]
@@ -246,8 +234,7 @@ def settings_table() -> RenderableType:
     settings = Settings.from_preset(Preset.BALANCED)
     table = table_of(("setting", "balanced", "meaning"), [])
     table.columns[1].justify = table.columns[2].justify = "left"
-    for group in (settings.encode, settings.compact, settings.finetune):
-        prefix = "" if group is settings.encode else f"{'compact' if group is settings.compact else 'finetune'}."
+    for prefix, group in (("", settings.encode), ("compact.", settings.compact), ("finetune.", settings.finetune)):
         for name in group.public():
             value = getattr(group, name)
             meaning = type(group).model_fields[name].description or ""

@@ -39,7 +39,10 @@ def main() -> None:
     task = json.loads(line)
     for number in (signal.SIGINT, signal.SIGTERM):  # sent to the parent, which ends this process if needed
         signal.signal(number, signal.SIG_IGN)
-    _die_with(task["parent"])
+    if sys.platform == "linux":  # which kills it when its parent dies: a long call into a library would delay the exit
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+        if os.getppid() != task["parent"]:  # it has died before
+            os._exit(1)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     send = _sender()
     _limit_resources(task["memory_limit"])
@@ -128,14 +131,6 @@ def _load_numba() -> None:
 
     cpu_target.typing_context.refresh()
     cpu_target.target_context.refresh()
-
-
-def _die_with(parent: int) -> None:
-    """Let Linux kill this process when its parent dies: a long call into a library would delay the exit."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
-        if os.getppid() != parent:  # it has died before
-            os._exit(1)
 
 
 def _exit_with_parent() -> None:

@@ -112,14 +112,21 @@ class ItemProcess:
                 folder = self._item.folder or stack.enter_context(temporary_folder())
                 process = self._start(errors, folder)
             except OSError as error:
-                outcome = self._not_started(error)
+                reason, machine = (error.strerror or str(error)).lower(), socket.gethostname()
+                message = f"the machine {machine} could not start a process: {reason}"
+                outcome = Outcome("lost", code=runners.NOT_STARTED, message=message)
+                of_folder = isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError)
+                if self._item.folder is not None and of_folder:
+                    message = f"the machine {machine} cannot use the folder of the work: {reason}"
+                    outcome = Outcome("error", code=runners.NODE_UNUSABLE, message=message, log=self._item.folder)
             else:
                 status, final = yield from self._follow(process)
                 outcome = self._explain(final, status, errors)
         yield outcome  # now that no file is left
 
     def _follow(self, process: subprocess.Popen[bytes]) -> Generator[ProgressEvent, None, tuple[int, Outcome | None]]:
-        """Yield the progress of the process; return its status and its own outcome, None if it has sent none."""
+        """Yield the progress of the process; return its status and its own outcome, None if it has sent none: it is
+        killed then."""
         threading.Thread(target=self._watch, args=(process.pid,), daemon=True).start()
         final: Outcome | None = None
         try:
@@ -130,17 +137,19 @@ class ItemProcess:
                 else:
                     yield event["stage"], event["fraction"], event["note"], event["seconds_left"]
         finally:  # also if the caller asks for no more events
-            status = self._finish(process, wait=final is not None)
+            if final is None:
+                with self._lock:
+                    self._kill()
+            if hasattr(os, "waitid"):  # not on macOS
+                os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+            with self._lock:  # from here on, its id may be another process's
+                self._ended.set()
+                status = process.wait()
+            for pipe in (process.stdin, process.stdout):
+                assert pipe is not None  # noqa: S101
+                with contextlib.suppress(BrokenPipeError):  # a task that the process has not read
+                    pipe.close()
         return status, final
-
-    def _not_started(self, error: OSError) -> Outcome:
-        reason, machine = (error.strerror or str(error)).lower(), socket.gethostname()
-        of_folder = isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError)
-        if self._item.folder is not None and of_folder:
-            message = f"the machine {machine} cannot use the folder of the work: {reason}"
-            return Outcome("error", code=runners.NODE_UNUSABLE, message=message, log=str(self._item.folder))
-        message = f"the machine {machine} could not start a process: {reason}"
-        return Outcome("lost", code=runners.NOT_STARTED, message=message)
 
     def _start(self, errors: IO[bytes], folder: Path | str) -> subprocess.Popen[bytes]:
         process = subprocess.Popen(
@@ -162,22 +171,6 @@ class ItemProcess:
             process.stdin.write(json.dumps({"parent": os.getpid(), **own}).encode() + b"\n")
             process.stdin.flush()
         return process
-
-    def _finish(self, process: subprocess.Popen[bytes], *, wait: bool) -> int:
-        """Wait for the end of the process, which is killed unless its final event has come, and return its status."""
-        if not wait:
-            with self._lock:
-                self._kill()
-        if hasattr(os, "waitid"):  # not on macOS
-            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        with self._lock:  # from here on, its id may be another process's
-            self._ended.set()
-            status = process.wait()
-        for pipe in (process.stdin, process.stdout):
-            assert pipe is not None  # noqa: S101
-            with contextlib.suppress(BrokenPipeError):  # a task that the process has not read
-                pipe.close()
-        return status
 
     def _watch(self, pid: int) -> None:
         """Kill the process at its time limit, and track the peak of the memory that the limit counts (``VmData``)."""

@@ -117,7 +117,14 @@ def compress_streamed(
     if manifest.parent.name in ("", ".."):
         manifest = manifest.parent.resolve() / manifest.name
     container, work = MANIFESTS[manifest.name], scratch.work_folder(manifest)
-    _check_settings(settings)
+    limited = settings.encode.has_goal or settings.time_limit is not None
+    if settings.compact.enabled or settings.finetune.enabled or limited:
+        raise UnsupportedError(
+            "levels of detail are made without goals, time limits, compaction and fine-tuning; leave these out, or "
+            "write a .sog"
+        )
+    if settings.encode.order == "plas":
+        raise UnsupportedError("levels of detail need order=hilbert or order=refined, not plas")
     if scratch.read_json(work / REPORT) is None:
         scratch.check_destination(manifest, source, overwrite=overwrite)
     with scratch.claimed(work, {"container": container, **_identity(source, settings, reading)}):
@@ -221,18 +228,6 @@ def _run_all(runner: Runner, items: list[dict[str, Any]], layout: Layout, report
             runner.cancel(handle.id)
         wait([handle.outcome for handle in handles])
         raise
-
-
-def _check_settings(settings: Settings) -> None:
-    """Refuse settings that do not fit, before any work."""
-    limited = settings.encode.has_goal or settings.time_limit is not None
-    if settings.compact.enabled or settings.finetune.enabled or limited:
-        raise UnsupportedError(
-            "levels of detail are made without goals, time limits, compaction and fine-tuning; leave these out, or "
-            "write a .sog"
-        )
-    if settings.encode.order == "plas":
-        raise UnsupportedError("levels of detail need order=hilbert or order=refined, not plas")
 
 
 def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, int, int]:

@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -276,8 +276,12 @@ def claimed(work: Path, mine: dict[str, Any]) -> Iterator[None]:
     except OSError as error:
         raise OutputError(f"cannot make {work}: {reason_of(error)}") from error
     with lock:
-        if not _locked(lock):
-            raise OutputError(f"another process works in {work}; wait for it, or choose another name")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OutputError(f"another process works in {work}; wait for it, or choose another name") from error
+        except OSError:  # a network file system without locks
+            pass
         if (work / WORK).exists() and read_json(work / WORK) != mine:
             raise OutputError(f"{work} belongs to other or older work; delete it, or choose another name")
         for left in (*work.glob(f"{TEMPORARY}*"), *(work / OUT).glob(f"{TEMPORARY}*"), _discarded(work)):
@@ -290,17 +294,6 @@ def claimed(work: Path, mine: dict[str, Any]) -> Iterator[None]:
             if not any(os.strerror(number).lower() in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
                 raise
             raise OutputError(f"{error}; once there is room, {continuation(work)}") from error
-
-
-def _locked(lock: BinaryIO) -> bool:
-    """Lock a file until it is closed, or the process ends; return False if another process has locked it."""
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a network file system without locks
-        return True
-    return True
 
 
 def finish(work: Path, manifest: Path, source: Path, *, overwrite: bool) -> None:
