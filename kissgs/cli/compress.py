@@ -126,8 +126,8 @@ def compact(
             )
         if piped:
             say_notes(scene, (result.report.note, *result.report.cleaned.notes), quiet)
-            with files.stdout():
-                write_ply(sys.stdout.buffer, result.splats)
+            with files.stdout() as file:
+                write_ply(file, result.splats)
             delete_checkpoints(result.checkpoint)
         return result.report.as_dict(), compaction_table(result.report, str(target))
 

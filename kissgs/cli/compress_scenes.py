@@ -12,14 +12,16 @@ import socket
 import sys
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 from rich.text import Text
 
+from kissgs.cameras.views import Views
 from kissgs.cli import files
 from kissgs.cli.files import CHECKPOINT, Result, progress_bar, say_notes, sibling, source, stoppable, write_stdout
 from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
@@ -35,13 +37,10 @@ from kissgs.pipeline.encoding import FILES
 from kissgs.pipeline.limited_time import resolved
 from kissgs.pipeline.pipeline import Compressed, compress
 from kissgs.pipeline.scene_files import scene_root
-from kissgs.runners import INTERNAL, Outcome, Resources, RunHandle, Runner, WorkItem, error_of
+from kissgs.runners import INTERNAL, PROCESS_BYTES, Outcome, Resources, Runner, WorkItem, error_of
 from kissgs.runners.ray_runner import RayRunner
 from kissgs.settings import Settings
 from kissgs.training.checkpoint import delete_checkpoints
-
-if TYPE_CHECKING:
-    from kissgs.cameras.views import Views
 
 
 class SceneCompression(BaseModel):
@@ -148,8 +147,6 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
 
 # ``kissgs compress --ray``: scenes as work items on the nodes of a Ray cluster.
 
-PROCESS_BYTES = 500_000_000  # memory that a scene of any size needs, bytes: mostly the libraries
-
 MEMORY_RATIO, TRAINING_RATIO, PACKED_RATIO = 4, 12, 10
 """Memory that a scene needs for each byte of its ``.ply``: without and with training; and by how much the files of
 compressed formats are smaller than that. Measured: docs/benchmarks.md, "Time and memory by the number of Gaussians"."""
@@ -193,7 +190,7 @@ class ClusterCompression:
 
     address: str
     options: SceneCompression
-    _handles: dict[Path, RunHandle | KissgsError] = field(default_factory=dict)
+    _outcomes: dict[Path, Future[Outcome]] = field(default_factory=dict)
     _work: dict[Path, Path] = field(default_factory=dict)
     _bar: Progress = silent
 
@@ -209,9 +206,12 @@ class ClusterCompression:
             requested = self._request(runner, len(inputs))
             for name, target in inputs:
                 try:
-                    self._handles[target] = self._submit(runner, name, target, requested)
+                    self._outcomes[target] = self._submit(runner, name, target, requested)
                 except (KissgsError, OSError) as error:  # the command itself reports inputs that cannot be read
-                    self._handles[target] = error if isinstance(error, KissgsError) else OutputError(str(error))
+                    self._outcomes[target] = Future()
+                    self._outcomes[target].set_exception(
+                        error if isinstance(error, KissgsError) else OutputError(str(error))
+                    )
             yield
         finally:
             try:
@@ -222,11 +222,8 @@ class ClusterCompression:
 
     def result(self, name: str, target: Path) -> Result:
         """Wait for the result of one scene, and move it to its place."""
-        handle = self._handles[target]
-        if isinstance(handle, KissgsError):
-            raise handle
         with progress_bar(self.options.quiet) as self._bar:
-            outcome = handle.outcome.result()
+            outcome = self._outcomes[target].result()
         self._bar = silent
         if outcome.kind != "done":
             raise self._error(outcome, target)
@@ -243,7 +240,7 @@ class ClusterCompression:
             raise UnsupportedError(f"{refusal}; choose another number with --threads, or --device cpu")
         return requested
 
-    def _submit(self, runner: Runner, name: str, target: Path, requested: Resources) -> RunHandle:
+    def _submit(self, runner: Runner, name: str, target: Path, requested: Resources) -> Future[Outcome]:
         options = self.options
         check_destination(target, overwrite=options.force, names=FILES)
         scene = Path(name).absolute()
@@ -270,9 +267,9 @@ class ClusterCompression:
         }
 
         def progress(stage: str, fraction: float, note: str = "") -> None:
-            ended = sum(isinstance(each, KissgsError) or each.outcome.done() for each in list(self._handles.values()))
-            details = f"{ended} of {len(self._handles)} scenes; {Path(name).name}: {stage}{note and f'; {note}'}"
-            self._bar("scenes", ended / max(len(self._handles), 1), details)
+            ended = sum(each.done() for each in list(self._outcomes.values()))
+            details = f"{ended} of {len(self._outcomes)} scenes; {Path(name).name}: {stage}{note and f'; {note}'}"
+            self._bar("scenes", ended / max(len(self._outcomes), 1), details)
 
         return runner.submit(WorkItem("kissgs.cli.compress_scenes:compress_scene", arguments, resources), progress)
 

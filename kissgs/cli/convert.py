@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -83,8 +82,8 @@ def decompress(
         if piped:
             from kissgs.io.ply import write_ply
 
-            with stdout():
-                write_ply(sys.stdout.buffer, splats)
+            with stdout() as file:
+                write_ply(file, splats)
             return {}, ""
         report = {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": target.stat().st_size}
         line = f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}"
@@ -135,8 +134,7 @@ def convert(
             splats, cleaned = clean(read_scene(source(scene), reading, threads=common.threads, progress=progress))
             splats = splats if origin else in_world(splats)
             with stdout() if piped else atomic_file(target, overwrite=force) as file:
-                stream = sys.stdout.buffer if file is None else file
-                losses = write_scene(stream, splats, kind, raw_axes=common.raw_axes, progress=progress)
+                losses = write_scene(file, splats, kind, raw_axes=common.raw_axes, progress=progress)
         notes = [*splats.notes, *cleaned.notes, *losses]
         say_notes(str(target), notes, quiet)
         if piped:

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager
 from datetime import timedelta
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, BinaryIO
 
 import typer
 from rich.console import Console, RenderableType
@@ -333,12 +333,12 @@ def expand(names: list[str]) -> list[str]:
 
 
 @contextlib.contextmanager
-def stdout() -> Iterator[None]:
-    """Write to standard output inside this context: errors of a full or closed one become an OutputError."""
+def stdout() -> Iterator[BinaryIO]:
+    """Open standard output: errors of a full or closed one become an OutputError."""
     if sys.stdout is None:
         raise OutputError("standard output is closed; there is nowhere to write to")
     try:
-        yield
+        yield sys.stdout.buffer
         sys.stdout.flush()
     except BrokenPipeError:
         os._exit(128 + signal.SIGPIPE)  # the reader has closed the pipe
@@ -356,18 +356,15 @@ def discard_stdout() -> None:
 
 def write_stdout(data: bytes) -> None:
     """Write bytes to standard output."""
-    with stdout():
-        sys.stdout.buffer.write(data)
+    with stdout() as file:
+        file.write(data)
 
 
 def write_output(target: Path, data: bytes, *, force: bool) -> None:
     """Write a file atomically, or to standard output for "-"."""
-    if str(target) == "-":
-        write_stdout(data)
-        return
     from kissgs.io.files import atomic_file
 
-    with atomic_file(target, overwrite=force) as file:
+    with stdout() if str(target) == "-" else atomic_file(target, overwrite=force) as file:
         file.write(data)
 
 

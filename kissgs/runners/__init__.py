@@ -3,8 +3,12 @@ name with JSON arguments, and its request. Out: progress and an :class:`Outcome`
 
 from __future__ import annotations
 
+import contextlib
+import json
 import logging
-from collections.abc import Iterable
+import os
+import threading
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, Self
@@ -13,6 +17,7 @@ from kissgs.core.context import Progress, silent, with_seconds_left
 from kissgs.core.errors import KissgsError, RunnerError
 
 log = logging.getLogger("kissgs.runners")
+Send = Callable[[dict[str, Any]], None]  # sends an event from one process to another
 
 MEMORY_LIMIT, TIME_LIMIT, INTERNAL, CRASHED = "memory-limit", "time-limit", "internal", "crashed"
 LOST, UNREACHABLE, NOT_STARTED = "node-lost", "cluster-unreachable", "not-started"
@@ -20,6 +25,9 @@ NODE_UNUSABLE = "node-unusable"
 """Codes of outcomes beside those of :class:`kissgs.KissgsError`. UNREACHABLE and NOT_STARTED are of "lost" items that
 have not caused it: the cluster was lost, or a machine had no resources for one more process. NODE_UNUSABLE is of an
 "error" that only another node may not meet: this one cannot use the item's folder, or this version of kissgs."""
+
+
+PROCESS_BYTES = 500_000_000  # memory that any work needs, bytes: mostly the libraries
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,15 +93,6 @@ class Outcome:
     node: str = ""  # address of the node that ran the item; empty if that is this machine or none
 
 
-@dataclass(frozen=True, slots=True)
-class RunHandle:
-    """An item that was submitted. The outcome is set once the item's process has ended. It never has an exception, and
-    only the runner cancels it."""
-
-    id: str
-    outcome: Future[Outcome]
-
-
 class Runner(Protocol):
     """Engine that runs work items, each in a process of its own. It keeps nothing on disk: whoever submits items and is
     ended submits them again. All methods may be called from any thread. Items that no node can run wait until there is
@@ -104,11 +103,12 @@ class Runner(Protocol):
         """Resources of the nodes that can run items; none for a runner whose caller limits the number of items."""
         return ()
 
-    def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
-        """Queue an item. ``progress`` receives its events in order, in a thread of the runner, and none after the
-        outcome is set; an item that is started again begins again."""
+    def submit(self, item: WorkItem, progress: Progress = silent) -> Future[Outcome]:
+        """Queue an item; return its outcome, which is set once its process has ended and never is an exception.
+        ``progress`` receives its events in order, in a thread of the runner, and none after that; an item that is
+        started again begins again."""
 
-    def cancel(self, item_id: str) -> None:
+    def cancel(self, outcome: Future[Outcome]) -> None:
         """End an item, whether it waits or runs; do nothing if it has ended. Its outcome is then "cancelled"."""
 
     def refusal(self, resources: Resources) -> str | None:
@@ -128,6 +128,18 @@ def report(progress: Progress, stage: str, fraction: float, note: str, seconds_l
         with_seconds_left(progress)(stage, fraction, note, seconds_left)
     except Exception:
         log.exception("a receiver of progress events failed")
+
+
+def event_sender(descriptor: int) -> Send:
+    """Return a function that writes events to a file descriptor as lines of JSON, from any thread."""
+    out, lock = os.fdopen(descriptor, "w", encoding="utf-8"), threading.Lock()
+
+    def send(event: dict[str, Any]) -> None:
+        with lock, contextlib.suppress(BrokenPipeError):  # nobody listens any more, and standard input has closed, too
+            out.write(json.dumps(event) + "\n")
+            out.flush()
+
+    return send
 
 
 def refusal_of(resources: Resources, nodes: Iterable[Resources]) -> str | None:

@@ -13,13 +13,12 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from kissgs.core.context import Progress
 from kissgs.core.errors import KissgsError
-from kissgs.runners import MEMORY_LIMIT
+from kissgs.runners import MEMORY_LIMIT, Send, event_sender
 
 EVENT_SECONDS = 0.25  # minimum seconds between progress events of a stage
 
@@ -27,8 +26,6 @@ WITHOUT_MEMORY = ("can't start new thread", "error return without exception set"
 """Parts of messages of Python and of its loader of libraries when there is no memory."""
 
 PR_SET_PDEATHSIG = 1  # of Linux' prctl: the signal that a process gets when its parent dies
-
-Send = Callable[[dict[str, Any]], None]
 
 
 def main() -> None:
@@ -44,7 +41,8 @@ def main() -> None:
         if os.getppid() != task["parent"]:  # it has died before
             os._exit(1)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    send = _sender()
+    send = event_sender(os.dup(1))
+    os.dup2(2, 1)  # for what libraries print
     _limit_resources(task["memory_limit"])
     send({"outcome": _outcome(task, Throttle(send))})
     os._exit(0)  # without waiting for threads of libraries
@@ -94,20 +92,6 @@ class Throttle:
         self._last, self._next = event, now + EVENT_SECONDS
         left = None if seconds_left is None else round(seconds_left, 2)
         self._send({"stage": stage, "fraction": event[1], "note": note, "seconds_left": left})
-
-
-def _sender() -> Send:
-    """Return a function that sends events on standard output, and redirect output of libraries to standard error."""
-    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-    lock = threading.Lock()
-
-    def send(event: dict[str, Any]) -> None:
-        with lock:
-            out.write(json.dumps(event) + "\n")
-            out.flush()
-
-    return send
 
 
 def _limit_resources(memory: int | None) -> None:

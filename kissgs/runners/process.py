@@ -8,7 +8,6 @@ import json
 import math
 import os
 import re
-import secrets
 import shutil
 import signal
 import socket
@@ -24,7 +23,7 @@ from typing import IO, Any
 
 from kissgs import runners
 from kissgs.core.context import Progress, silent
-from kissgs.runners import Outcome, RunHandle, Runner, WorkItem, log, report
+from kissgs.runners import Outcome, Runner, WorkItem, log, report
 
 PREFIX = "kissgs-item-"  # beginning of the names of temporary folders of items
 
@@ -231,17 +230,17 @@ class LocalRunner(Runner):
     """Runner on this machine."""
 
     def __init__(self) -> None:
-        self._items: dict[str, tuple[ItemProcess, Future[Outcome]]] = {}
+        self._items: dict[Future[Outcome], ItemProcess] = {}
         self._closed = False
         self._lock = threading.Lock()
 
-    def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
+    def submit(self, item: WorkItem, progress: Progress = silent) -> Future[Outcome]:
         """See :class:`Runner`."""
-        item_id, process, outcome = secrets.token_hex(8), ItemProcess(item), Future[Outcome]()
+        process, outcome = ItemProcess(item), Future[Outcome]()
         with self._lock:
             if self._closed:
                 raise RuntimeError("the runner is closed")
-            self._items[item_id] = process, outcome
+            self._items[outcome] = process
 
         def run() -> None:
             result = Outcome("cancelled")
@@ -257,16 +256,16 @@ class LocalRunner(Runner):
                 result = Outcome("error", code=runners.INTERNAL, message=message)
             outcome.set_result(result)
             with self._lock:
-                del self._items[item_id]
+                del self._items[outcome]
 
         threading.Thread(target=run, daemon=True).start()
-        return RunHandle(item_id, outcome)
+        return outcome
 
-    def cancel(self, item_id: str) -> None:
+    def cancel(self, outcome: Future[Outcome]) -> None:
         """See :class:`Runner`."""
         with self._lock:
-            if item_id in self._items:
-                self._items[item_id][0].kill()
+            if outcome in self._items:
+                self._items[outcome].kill()
 
     def health_problem(self) -> str | None:
         """See :class:`Runner`."""
@@ -276,7 +275,7 @@ class LocalRunner(Runner):
         """See :class:`Runner`."""
         with self._lock:
             self._closed = True
-            items = list(self._items.values())
-        for process, _ in items:
+            items = dict(self._items)
+        for process in items.values():
             process.kill()
-        wait([outcome for _, outcome in items])
+        wait(items)

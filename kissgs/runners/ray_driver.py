@@ -5,7 +5,6 @@ When standard input closes, it ends all items and exits."""
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import math
 import os
@@ -16,7 +15,6 @@ import socket
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,7 +24,7 @@ from ray.exceptions import RayError, RayTaskError, TaskCancelledError
 
 from kissgs._version import __version__
 from kissgs.core.errors import OutputError, RunnerError
-from kissgs.runners import INTERNAL, LOST, NODE_UNUSABLE, Outcome, WorkItem, ray_node
+from kissgs.runners import INTERNAL, LOST, NODE_UNUSABLE, Outcome, Send, WorkItem, event_sender, ray_node
 
 CONNECT_SECONDS = 5.0  # maximum seconds for a connection to the head's port
 OBJECT_STORE_BYTES = 80 << 20  # of a cluster that is started here: nearly the smallest; nothing is kept there
@@ -36,20 +34,13 @@ FORCE_SECONDS = 5.0  # seconds after which a cancelled task that has not ended i
 EVENTS_AHEAD = 4  # events of a start that have not been read, beyond which its task waits: they may be blocks of files
 LOCAL = "local"  # argument instead of an address: start a cluster on this machine
 
-Send = Callable[[dict[str, Any]], None]
-
 
 def main() -> None:
     """Connect, run items until standard input closes, and disconnect."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    out = os.dup(1)
+    send = event_sender(out)
     os.dup2(2, 1)  # for what Ray prints
-
-    def send(event: dict[str, Any]) -> None:
-        with contextlib.suppress(BrokenPipeError):  # nobody listens any more, and standard input has closed, too
-            out.write(json.dumps(event) + "\n")
-            out.flush()
-
     address = sys.argv[1]
     folder = tempfile.mkdtemp(prefix="kissgs-ray-") if address == LOCAL else None
     try:
@@ -59,7 +50,7 @@ def main() -> None:
             # Replace this process by one that starts a cluster on this machine, with a token of its own: without one,
             # Ray would let everyone in who reaches its ports, or write one to the home folder. It reads its environment
             # when it is imported, so that this process cannot set one.
-            os.dup2(out.fileno(), 1)
+            os.dup2(out, 1)
             protected = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
             os.execve(sys.executable, [sys.executable, "-P", "-m", f"{__package__}.ray_driver", LOCAL], protected)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # standard input closes when items shall end; Ray sets a handler

@@ -20,7 +20,7 @@ from typing import IO, Any
 
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import RunnerError
-from kissgs.runners import UNREACHABLE, Outcome, Resources, RunHandle, Runner, WorkItem, log, refusal_of, report
+from kissgs.runners import UNREACHABLE, Outcome, Resources, Runner, WorkItem, log, refusal_of, report
 from kissgs.runners.process import child_environment, json_lines
 
 CONNECT_SECONDS = 60.0  # maximum seconds for the connection to a cluster, or the start of one on this machine
@@ -56,7 +56,7 @@ class RayRunner(Runner):
         """See :class:`Runner`."""
         return self._nodes
 
-    def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
+    def submit(self, item: WorkItem, progress: Progress = silent) -> Future[Outcome]:
         """See :class:`Runner`."""
         item_id, outcome = secrets.token_hex(8), Future[Outcome]()
         with self._lock:
@@ -68,13 +68,14 @@ class RayRunner(Runner):
                 self._send({"submit": item_id, "item": asdict(item)})
         if problem is not None:
             outcome.set_result(Outcome("lost", code=UNREACHABLE, message=problem))
-        return RunHandle(item_id, outcome)
+        return outcome
 
-    def cancel(self, item_id: str) -> None:
+    def cancel(self, outcome: Future[Outcome]) -> None:
         """See :class:`Runner`."""
         with self._lock:
-            if item_id in self._items:
-                self._send({"cancel": item_id})
+            for item_id, (_, waiting) in self._items.items():
+                if waiting is outcome:
+                    self._send({"cancel": item_id})
 
     def refusal(self, resources: Resources) -> str | None:
         """See :class:`Runner`."""

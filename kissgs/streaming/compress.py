@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from kissgs._version import __version__
 from kissgs.core.context import Context, JobProgress, Progress, silent
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
@@ -22,7 +24,7 @@ from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.limited_time import speed
 from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_level, scene_root, stored_bytes
-from kissgs.runners import Resources, Runner, WorkItem, error_of
+from kissgs.runners import PROCESS_BYTES, Resources, Runner, WorkItem, error_of
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.streaming import build
 from kissgs.streaming import work_folder as scratch
@@ -135,7 +137,7 @@ def compress_streamed(
             scratch.write_json(work / REPORT, found)
         scratch.finish(work, manifest, source, overwrite=overwrite)
     job.stop()
-    return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
+    return TypeAdapter(StreamedReport).validate_python(found)
 
 
 def _make(
@@ -174,7 +176,6 @@ def _make(
 # Work items: the levels of a chunk ("chunk"), or a container of the result ("file"). Those of a step do not depend on
 # each other. One that is run twice, because its node was given up, writes the same bytes again.
 
-PROCESS_BYTES = 500_000_000  # memory of an item for libraries, bytes
 MEMORY_RATIO = 5  # memory of an item for each byte of the Gaussians of its file as float32
 POLL_SECONDS = 0.5  # seconds between reports of progress, which may also stop the work
 
@@ -214,8 +215,8 @@ def _run_all(runner: Runner, items: list[dict[str, Any]], layout: Layout, report
     requested = Resources(cpus=items[0]["threads"], memory=memory)
     if refusal := runner.refusal(requested):
         raise UnsupportedError(f"{refusal}; choose another number with --threads")
-    handles = [runner.submit(WorkItem(f"{__name__}:run_item", item, requested)) for item in items]
-    waiting = {handle.outcome for handle in handles}
+    outcomes = [runner.submit(WorkItem(f"{__name__}:run_item", item, requested)) for item in items]
+    waiting = set(outcomes)
     try:
         while waiting:
             report(1 - len(waiting) / len(items))
@@ -224,9 +225,9 @@ def _run_all(runner: Runner, items: list[dict[str, Any]], layout: Layout, report
                 if each.result().kind != "done":
                     raise error_of(each.result())
     except BaseException:
-        for handle in handles:
-            runner.cancel(handle.id)
-        wait([handle.outcome for handle in handles])
+        for outcome in outcomes:
+            runner.cancel(outcome)
+        wait(outcomes)
         raise
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import OutputError
@@ -112,8 +113,7 @@ def continuation(work: Path) -> str:
 
 def read_layout(work: Path) -> Layout:
     """Return the layout of a scene that is partitioned."""
-    found = json.loads((work / PARTITION).read_bytes())
-    return Layout(**{**found, **{name: tuple(found[name]) for name in ("counts", "notes", "origin")}})
+    return TypeAdapter(Layout).validate_json((work / PARTITION).read_bytes())
 
 
 def read_leaves(work: Path, chunk: int) -> dict[str, Any]:

@@ -6,12 +6,13 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import kissgs
 from kissgs import runners
-from kissgs.runners import Outcome, Resources, RunHandle, Runner, WorkItem
+from kissgs.runners import Outcome, Resources, Runner, WorkItem
 from kissgs.runners.process import LocalRunner
 from kissgs.runners.ray_runner import RayRunner
 
@@ -100,7 +101,7 @@ class JobProcess:
 
     def __init__(self, job_runners: JobRunners) -> None:
         self._runner = job_runners
-        self._handle: RunHandle | None = None
+        self._end: Callable[[], None] = lambda: None  # ends the process, once there is one
         self._used = job_runners.local
         self.killed = False
         self.work: Path | None = None
@@ -110,10 +111,6 @@ class JobProcess:
         """Kill the process now, or as soon as it has started."""
         self.killed = True
         self._end()
-
-    def _end(self) -> None:
-        if self._handle is not None:
-            self._used.cancel(self._handle.id)
 
     async def run(self, task: dict[str, Any], on_progress: OnProgress | None = None) -> Outcome:
         """Run a task (see :mod:`service.jobs.job_process`); if the caller is cancelled, the process is killed."""
@@ -127,8 +124,9 @@ class JobProcess:
         def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
             loop.call_soon_threadsafe(events.put_nowait, (stage, fraction, note, seconds_left))
 
-        self._handle = self._used.submit(item, receive)
-        outcome = asyncio.wrap_future(self._handle.outcome)
+        running = self._used.submit(item, receive)
+        self._end = partial(self._used.cancel, running)
+        outcome = asyncio.wrap_future(running)
         outcome.add_done_callback(lambda _: events.put_nowait(None))
         try:
             while (event := await events.get()) is not None:

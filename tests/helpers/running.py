@@ -17,7 +17,7 @@ def item(function, resources=ONE_PROCESSOR, **values):
 
 
 def outcome_of(runner, work):
-    return runner.submit(work).outcome.result(120)
+    return runner.submit(work).result(120)
 
 
 def processors(runner):

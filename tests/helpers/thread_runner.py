@@ -2,14 +2,13 @@
 
 import importlib
 import json
-import secrets
 import threading
 from concurrent.futures import Future
 from pathlib import Path
 
 import kissgs
 from kissgs.core.context import silent
-from kissgs.runners import INTERNAL, Outcome, RunHandle, log, report
+from kissgs.runners import INTERNAL, Outcome, log, report
 from kissgs.runners.item_process import Throttle
 from kissgs.runners.process import LocalRunner
 
@@ -21,17 +20,17 @@ class ThreadRunner(LocalRunner):
     """``LocalRunner`` without processes and their limits, for jobs of a service."""
 
     def submit(self, item, progress=silent):
-        item_id, running, outcome = secrets.token_hex(8), _ItemThread(item), Future()
+        running, outcome = _ItemThread(item), Future()
         with self._lock:
-            self._items[item_id] = running, outcome
+            self._items[outcome] = running
 
         def run():
             outcome.set_result(running.outcome(progress))
             with self._lock:
-                del self._items[item_id]
+                del self._items[outcome]
 
         threading.Thread(target=run, daemon=True).start()
-        return RunHandle(item_id, outcome)
+        return outcome
 
 
 class _ItemThread:
