@@ -44,7 +44,7 @@ def main() -> None:
     send = event_sender(os.dup(1))
     os.dup2(2, 1)  # for what libraries print
     _limit_resources(task["memory_limit"])
-    send({"outcome": _outcome(task, Throttle(send))})
+    send({"outcome": _outcome(task, throttled(send))})
     os._exit(0)  # without waiting for threads of libraries
 
 
@@ -76,22 +76,20 @@ def _lacks_memory(error: Exception, limit: int | None) -> bool:
     return used > limit / 2
 
 
-class Throttle:
-    """Progress callback that sends the start and end of each stage, and between them one event per interval."""
+def throttled(send: Send) -> Progress:
+    """Return a receiver that sends the start of each stage, and then at most one event per interval."""
+    last, due = ("", -1.0, ""), 0.0
 
-    def __init__(self, send: Send) -> None:
-        self._send = send
-        self._last, self._next = ("", -1.0, ""), 0.0
-
-    def __call__(self, stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
-        """See :class:`kissgs.Progress`."""
-        now = time.monotonic()
-        event = stage, round(min(1.0, max(0.0, fraction)), 4), note
-        if event == self._last or (stage == self._last[0] and now < self._next):
+    def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
+        nonlocal last, due
+        now, event = time.monotonic(), (stage, round(min(1.0, max(0.0, fraction)), 4), note)
+        if event == last or (stage == last[0] and now < due):
             return
-        self._last, self._next = event, now + EVENT_SECONDS
+        last, due = event, now + EVENT_SECONDS
         left = None if seconds_left is None else round(seconds_left, 2)
-        self._send({"stage": stage, "fraction": event[1], "note": note, "seconds_left": left})
+        send({"stage": stage, "fraction": event[1], "note": note, "seconds_left": left})
+
+    return receive
 
 
 def _limit_resources(memory: int | None) -> None:

@@ -189,14 +189,14 @@ def run_item(item: dict[str, Any], progress: Progress) -> dict[str, Any]:
     """Run an item, here or on a node, unless it is made. A node that was given up may still be at work: what it
     completes meanwhile, it takes the input of."""
     work, threads = Path(item["work"]), item["threads"]
-    if scratch.read_json(work / scratch.PARTITION) is None:
+    if (layout := scratch.read_layout(work)) is None:
         raise UnsupportedError(
             f"the machine {socket.gethostname()} does not see {work}; "
             "--ray needs storage that all machines see at the same path"
         )
-    layout, settings = scratch.read_layout(work), EncodeSettings.model_validate(item["settings"])
     if _is_made(item):
         return {}
+    settings = EncodeSettings.model_validate(item["settings"])
     try:
         if "chunk" in item:
             build.make_levels(work, layout, item["chunk"], threads, progress)
@@ -277,8 +277,7 @@ def _partition(
     job: JobProgress,
 ) -> Layout:
     """Partition the scene, unless that has been done, and set the steps of the job."""
-    if scratch.read_json(work / scratch.PARTITION) is not None:
-        layout = scratch.read_layout(work)
+    if (layout := scratch.read_layout(work)) is not None:
         _announce(job, work, layout.source_count, layout.sh_degree, settings, threads)
         return layout
     before = _identity(source, settings, reading)

@@ -111,9 +111,10 @@ def continuation(work: Path) -> str:
     return f"the same command {'goes on where it was' if (work / PARTITION).exists() else 'begins anew'}"
 
 
-def read_layout(work: Path) -> Layout:
-    """Return the layout of a scene that is partitioned."""
-    return TypeAdapter(Layout).validate_json((work / PARTITION).read_bytes())
+def read_layout(work: Path) -> Layout | None:
+    """Return the layout of a scene; None if it is not partitioned yet."""
+    found = read_json(work / PARTITION)
+    return None if found is None else TypeAdapter(Layout).validate_python(found)
 
 
 def read_leaves(work: Path, chunk: int) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import kissgs
 from kissgs.core.context import silent
 from kissgs.runners import INTERNAL, Outcome, log, report
-from kissgs.runners.item_process import Throttle
+from kissgs.runners.item_process import throttled
 from kissgs.runners.process import LocalRunner
 
 HELD_SEED = 4_000_001
@@ -42,7 +42,7 @@ class _ItemThread:
         self._killed.set()
 
     def outcome(self, progress):
-        send = Throttle(lambda event: report(progress, *event.values()))
+        send = throttled(lambda event: report(progress, *event.values()))
 
         def watched(stage, fraction, note="", seconds_left=None):
             if self._killed.is_set():
