@@ -104,6 +104,15 @@ def scene_root(path: Path) -> Path:
     return next((scene for scene in reversed(in_order) if scene.is_file()), path)
 
 
+def folder_with_cameras(scene: Path) -> Path | None:
+    """Return the folder of INRIA's trainer that a scene is in, or is, if its cameras are there."""
+    with suppress(OSError, ValueError):
+        for folder in (scene, *scene.absolute().parents[2:3]):
+            if (folder / "cameras.json").is_file() and scene_root(folder) != folder:
+                return folder
+    return None
+
+
 def _has_metadata(folder: Path) -> bool:
     with suppress(OSError, ValueError):
         return any((folder / name).is_file() for name in (YAML_NAME, META_NAME, *_STREAMED))
