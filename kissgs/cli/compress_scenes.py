@@ -27,7 +27,7 @@ from kissgs.cli.files import CHECKPOINT, Result, progress_bar, say_notes, siblin
 from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
 from kissgs.cli.options import open_views
 from kissgs.cli.tables import report_table, streamed_table
-from kissgs.core.context import Progress, silent, with_seconds_left
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 from kissgs.formats import ContainerName
 from kissgs.io.containers import check_destination
@@ -117,7 +117,6 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
 
         work = work_folder(target)
         say_when_interrupted(lambda: continuation(work) if work.exists() else NOTHING_LEFT)
-        forward = with_seconds_left(bar)
         bar("kernels", 0.0)
         from kissgs.streaming.compress import compress_streamed as run
 
@@ -127,11 +126,6 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
             runner = RayRunner(ray)
             ending.callback(runner.close)
 
-        def progress(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
-            if stage == "scratch" and not options.quiet:
-                sys.stderr.write(f"kissgs: {note}\n")
-            forward(stage, fraction, note, seconds_left)
-
         report = run(
             scene,
             target,
@@ -140,7 +134,7 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
             overwrite=options.force,
             runner=runner,
             threads=options.threads,
-            progress=progress,
+            progress=files.announcing(bar, "scratch", options.quiet),
         )
     return asdict(report), streamed_table(report, str(target))
 

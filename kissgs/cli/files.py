@@ -113,6 +113,20 @@ def progress_bar(quiet: bool, steps: Sequence[Step] = ()) -> Iterator[Receiver]:
         job.stop()
 
 
+def announcing(progress: Receiver, announced: str, quiet: bool, about: str = "") -> Receiver:
+    """Return a receiver that prints the first note of a stage as a line on standard error, after ``about``."""
+    said, forward = quiet, with_seconds_left(progress)
+
+    def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
+        nonlocal said
+        if stage == announced and not said:
+            sys.stderr.write(f"kissgs: {about}{note}\n")
+            said = True
+        forward(stage, fraction, "" if stage == announced else note, seconds_left)
+
+    return receive
+
+
 STOPPING = (
     "\nkissgs: stopping: completing the best result so far, if any, which may take minutes; Ctrl-C again aborts\n"
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from kissgs.cli.files import Result, for_each_input, is_folder, print_json, progress_bar, show
+from kissgs.cli.files import Result, announcing, for_each_input, is_folder, print_json, progress_bar, show
 from kissgs.cli.options import (
     EncodingOptions,
     FilesArgument,
@@ -21,13 +20,11 @@ from kissgs.cli.options import (
     output_option,
     with_option_groups,
 )
-from kissgs.core.context import with_seconds_left
 from kissgs.core.errors import OutputError, RemoteError, UnsupportedError
 from kissgs.formats import OUTPUT_FORMATS, ending_of, named_container
 
 if TYPE_CHECKING:
     from kissgs.client import Remote
-    from kissgs.core.context import Progress
 
 ServerOption = Annotated[str, Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="URL of the service.")]
 ServiceJsonOption = Annotated[bool, Option("--json", help="Print the response of the service as JSON.")]
@@ -59,6 +56,7 @@ def compress(
     """Compress scenes on a server. Ctrl-C cancels the job."""
     from kissgs.cameras.captures.load import capture_of, pack_capture
     from kissgs.cli.tables import status_table
+    from kissgs.client import WAIT
     from kissgs.io.files import open_scene_file, refuse_existing
     from kissgs.pipeline.scene_files import scene_root
 
@@ -94,7 +92,7 @@ def compress(
                     origin=encoding.origin,
                     capture=capture,
                     overwrite=force,
-                    progress=_announcing(progress, server, quiet),
+                    progress=announcing(progress, WAIT, quiet, f"{server}: "),
                 )
             return status, status_table(status, str(target))
 
@@ -125,11 +123,11 @@ def get(
 ) -> None:
     """Wait for a job to finish, and download its container."""
     from kissgs.cli.tables import status_table
-    from kissgs.client import Share
+    from kissgs.client import WAIT, Share
     from kissgs.io.files import refuse_existing
 
     with _service(server) as remote, progress_bar(False) as bar:
-        progress = _announcing(bar, server, False)
+        progress = announcing(bar, WAIT, False, f"{server}: ")
         known = remote.status(job)
         kind = known["options"]["format"]
         ending = f".{kind}" if kind in OUTPUT_FORMATS else ending_of(kind)
@@ -153,19 +151,3 @@ def _service(server: str) -> Remote:
     from kissgs.client import Remote
 
     return Remote(server, key=os.environ.get("KISSGS_KEY"))
-
-
-def _announcing(progress: Progress, server: str, quiet: bool) -> Progress:
-    """Return a receiver that prints a line when the service refuses a request for the first time."""
-    from kissgs.client import WAIT
-
-    said, forward = quiet, with_seconds_left(progress)
-
-    def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
-        nonlocal said
-        if stage == WAIT and not said:
-            sys.stderr.write(f"kissgs: {server}: {note}\n")
-            said = True
-        forward(stage, fraction, "" if stage == WAIT else note, seconds_left)
-
-    return receive
