@@ -13,17 +13,18 @@ import argparse
 import shlex
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from bench.common import at_quality_offset, capture, head, parser_of, row, run, signed, write
+from bench.common import head, parser_with_views, row, run, signed, write
 from bench.curves import bytes_at
-from bench.external import FORMATS, External, measure_external
-from kissgs import Evaluation, KissgsError, Preset, Settings, sample_scene, save
-from kissgs.cli.bench import Measurement, measured
+from bench.external import FORMATS, Measured, measure_external
+from kissgs import KissgsError, Preset, Settings, Views, sample_scene, save
+from kissgs.cli.bench import measured
 from kissgs.cli.options import chosen
-from kissgs.formats import ContainerName
 
 HEAD = "codec", "bytes", "per Gaussian", "wall s", "CPU s", "decode CPU s", "peak MB"
 IMAGES = "PSNR to photographs", "change, dB", "SSIM", "PSNR to the original", "SSIM", "worst view"
@@ -31,16 +32,14 @@ IMAGES = "PSNR to photographs", "change, dB", "SSIM", "PSNR to the original", "S
 
 def main() -> None:
     """Print a table for each scene, and the bytes at equal PSNR; samples are on disk only while they are measured."""
-    parser = parser_of(__doc__)
+    parser = parser_with_views(__doc__)
     parser.add_argument("scenes", nargs="+", metavar="SCENE", help="file, or number of Gaussians of a sample scene")
     parser.add_argument("--degree", type=int, default=3, choices=range(4), help="of sample scenes")
-    parser.add_argument("--views", type=capture, metavar="DATA", help="capture with cameras and photographs")
     parser.add_argument("-p", "--presets", nargs="+", default=list(Preset))
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="change a setting of all presets"
     )
     parser.add_argument("--each", nargs="+", default=[], metavar="NAME=VALUE", help="also make each of these changes")
-    parser.add_argument("--containers", nargs="+", default=["sogxt"], choices=["sogxt", "sog"])
     parser.add_argument("--offsets", nargs="+", type=float, default=[], metavar="DB")
     parser.add_argument("--external", nargs="+", default=[], choices=FORMATS)
     parser.add_argument("--splat-transform", default="splat-transform", help="command that starts it")
@@ -55,100 +54,86 @@ def main() -> None:
             if scene.isdecimal():
                 path = Path(folder, "scene.ply")
                 save(sample_scene(int(scene), sh_degree=given.degree), path)
-            failed |= measure(path, codecs, given)
+            failed |= measure(path, codecs)
     if failed:
         raise SystemExit(2)
 
 
 class Codec(NamedTuple):
-    """A preset with a container and perhaps another quality, whose points are on one curve; or with a change."""
+    """A codec, and the name of the curve that it is a point of; empty for one that is compared with all curves."""
 
-    curve: str
     name: str
-    container: ContainerName
-    settings: Settings
-    changed: bool
+    curve: str
+    measure: Callable[[Path], Measured]
 
 
 def codecs_of(given: argparse.Namespace) -> list[Codec]:
     """Return all codecs that are wanted."""
     found = list[Codec]()
+    with_settings = partial(measure_preset, views=given.views)
     for preset in dict.fromkeys(given.presets):
-        for change in dict.fromkeys([None, *given.each]):
-            settings = chosen(preset, [*given.set, *filter(None, [change])])
-            offsets = given.offsets if settings.encode.rate_distortion and not change else []
-            for container in given.containers:
-                curve = " ".join([preset, *([] if container == "sogxt" else [".sog"]), *filter(None, [change])])
-                found.append(Codec(curve, curve, container, settings, bool(change)))
-                for offset in offsets:
-                    tuned = at_quality_offset(settings, offset)
-                    found.append(Codec(curve, f"{curve} at {offset:g}", container, tuned, False))
+        settings = chosen(preset, given.set)
+        found.append(Codec(preset, preset, partial(with_settings, settings=settings)))
+        for offset in given.offsets if settings.encode.rate_distortion else ():
+            tuned = chosen(preset, [*given.set, f"quality_offset_db={offset}"])
+            found.append(Codec(f"{preset} at {offset:g}", preset, partial(with_settings, settings=tuned)))
+        for change in dict.fromkeys(given.each):
+            changed = chosen(preset, [*given.set, change])
+            found.append(Codec(f"{preset} {change}", "", partial(with_settings, settings=changed)))
+    by_tool = partial(measure_external, command=shlex.split(given.splat_transform), views=given.views)
+    for ending in given.external:
+        found.append(Codec(f".{ending}", "", partial(by_tool, ending=ending, sh_iterations=given.sog_iterations)))
     return found
 
 
-def measure(scene: Path, codecs: Sequence[Codec], given: argparse.Namespace) -> bool:
+def measure_preset(scene: Path, *, settings: Settings, views: Views | None) -> Measured:
+    """Compress, decompress and evaluate a scene."""
+    found = measured(scene, settings, views=views)
+    return Measured(
+        bytes=found.report.container_bytes,
+        encode_seconds=sum(found.report.seconds.values()),
+        encode_cpu_seconds=found.report.cpu_seconds,
+        decode_cpu_seconds=found.decode_cpu_seconds,
+        peak_memory=found.peak_memory,
+        evaluation=found.evaluation,
+    )
+
+
+def measure(scene: Path, codecs: Sequence[Codec]) -> bool:
     """Print the table of a scene; what fails is said, and the others are measured. Returns whether something failed."""
-    points: dict[str, list[tuple[float, float]]] = {}
-    others: dict[str, tuple[float, float]] = {}
+    curves = defaultdict[str, dict[str, tuple[float, float]]](dict)
     failed = False
     head(*HEAD, *IMAGES)
     for codec in codecs:
         try:
-            found = measured(scene, codec.settings, container=codec.container, views=given.views)
+            found = codec.measure(scene)
         except KissgsError as error:
             sys.stderr.write(f"{codec.name}: {error}\n")
             failed = True
             continue
-        point = print_measurement(codec.name, found), float(found.report.container_bytes)
-        if codec.changed:
-            others[codec.name] = point
-        else:
-            points.setdefault(codec.curve, []).append(point)
-    for ending in given.external:
-        command, iterations = shlex.split(given.splat_transform), given.sog_iterations
-        try:
-            external = measure_external(scene, ending, command, sh_iterations=iterations, views=given.views)
-        except KissgsError as error:
-            sys.stderr.write(f"{error}\n")
-            failed = True
-            continue
-        others[f".{ending}"] = print_external(f".{ending}", external), float(external.bytes)
+        row(codec.name, *cells(found))
+        psnr = found.evaluation.mean.candidate_vs_reference.psnr
+        curves[codec.curve][codec.name] = psnr, float(found.bytes)
     write("")
-    for name, (psnr, size) in others.items():
-        for curve, curve_points in points.items():
-            equal = bytes_at(curve_points, psnr)
+    for name, (psnr, size) in curves.pop("", {}).items():
+        for curve, points in curves.items():
+            equal = bytes_at(list(points.values()), psnr)
             if equal is not None:
                 at = f"at the PSNR of {name} to the original, {psnr:.2f} dB"
                 write(f"{at}: {curve} {equal:,.0f} bytes, {equal / size:.3f} of its")
     return failed
 
 
-def print_measurement(name: str, found: Measurement) -> float:
-    """Print a row; return the PSNR to renderings of the original."""
-    report = found.report
-    wall, memory = f"{sum(report.seconds.values()):.1f}", f"{found.peak_memory / 1e6:.0f}"
-    times = wall, f"{report.cpu_seconds:.1f}", f"{found.decode_cpu_seconds:.2f}", memory
-    row(name, report.container_bytes, f"{report.bytes_per_gaussian:.2f}", *times, *images(found.evaluation))
-    return found.evaluation.mean.candidate_vs_reference.psnr
-
-
-def print_external(name: str, found: External) -> float:
-    """Print a row; return the PSNR to renderings of the original."""
-    times = f"{found.encode_seconds:.1f}", f"{found.encode_cpu_seconds:.1f}", f"{found.decode_cpu_seconds:.2f}"
-    per_gaussian = f"{found.bytes / max(found.evaluation.reference_count, 1):.2f}"
-    row(name, found.bytes, per_gaussian, *times, f"{found.peak_memory / 1e6:.0f}", *images(found.evaluation))
-    return found.evaluation.mean.candidate_vs_reference.psnr
-
-
-def images(evaluation: Evaluation) -> list[Any]:
-    """Return the cells of :data:`IMAGES`; those of photographs are empty without any."""
-    mean = evaluation.mean
-    other = mean.candidate_vs_reference
-    photos = ["", "", ""]
+def cells(found: Measured) -> list[object]:
+    """Return the cells of a row; those of photographs are empty without any."""
+    mean, count = found.evaluation.mean, max(found.evaluation.reference_count, 1)
+    other, photos = mean.candidate_vs_reference, ["", "", ""]
     if mean.reference is not None:
         photos = [f"{mean.candidate.psnr:.2f}", signed(mean.change), f"{mean.candidate.ssim:.4f}"]
-    worst = evaluation.worst.comparison.candidate_vs_reference.psnr
-    return [*photos, f"{other.psnr:.2f}", f"{other.ssim:.4f}", f"{worst:.2f}"]
+    worst = found.evaluation.worst.comparison.candidate_vs_reference.psnr
+    seconds = f"{found.encode_seconds:.1f}", f"{found.encode_cpu_seconds:.1f}", f"{found.decode_cpu_seconds:.2f}"
+    costs = found.bytes, f"{found.bytes / count:.2f}", *seconds, f"{found.peak_memory / 1e6:.0f}"
+    return [*costs, *photos, f"{other.psnr:.2f}", f"{other.ssim:.4f}", f"{worst:.2f}"]
 
 
 if __name__ == "__main__":

@@ -9,10 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
-from pydantic import ValidationError
-
-from kissgs import EncodeSettings, KissgsError, Settings, Views, load_views
-from kissgs.settings import GOALS
+from kissgs import KissgsError, load_views
 
 
 def parser_of(about: str | None) -> argparse.ArgumentParser:
@@ -20,20 +17,11 @@ def parser_of(about: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
-def arguments(about: str | None) -> argparse.ArgumentParser:
-    """Return a parser with a scene and a capture, which most studies need."""
+def parser_with_views(about: str | None) -> argparse.ArgumentParser:
+    """Return a parser with a capture, which most studies take."""
     parser = parser_of(about)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("--views", type=capture, metavar="DATA", help="capture with cameras and photographs")
+    parser.add_argument("--views", type=lambda folder: load_views(Path(folder)), metavar="DATA", help="capture")
     return parser
-
-
-def capture(path: str) -> Views:
-    """Return the capture in a folder."""
-    try:
-        return load_views(Path(path))
-    except KissgsError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 views_of = cache(load_views)
@@ -77,16 +65,6 @@ def run(study: Callable[[], None]) -> None:
     except (KissgsError, OSError) as error:
         sys.stderr.write(f"{Path(sys.argv[0]).name}: {error}\n")
         raise SystemExit(2) from error
-
-
-def at_quality_offset(settings: Settings, decibels: float) -> Settings:
-    """Return settings with rate-distortion planning at another quality offset, without a lambda or a goal."""
-    changes = {"quality_offset_db": decibels, "rd_lambda": None, **dict.fromkeys(GOALS)}
-    try:
-        encode = EncodeSettings(**{**settings.encode.model_dump(), **changes})
-    except ValidationError as error:
-        raise KissgsError(f"a quality offset of {decibels:g}: {error.errors()[0]['msg'].lower()}") from error
-    return settings.model_copy(update={"encode": encode})
 
 
 def write(*lines: str) -> None:

@@ -2,25 +2,25 @@
 
     python bench/decoder.py scene.zip
 
-Without a container, it makes one of 256,000 Gaussians. Needs a Chromium on the PATH.
+Without a container, it makes one of 256,000 Gaussians. Needs Chromium, and what scripts/setup dev installs.
 """
 
 from __future__ import annotations
 
-import functools
-import http.server
-import shutil
 import statistics
-import tempfile
-import threading
+import sys
 from pathlib import Path
 
-from playwright.sync_api import Browser, sync_playwright
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from helpers.viewers import NO_GPU, chromium
+from helpers.web_tools import DECODER, Site
 
 import kissgs
 from bench.common import head, parser_of, row, run, write
 
-DECODER = Path(__file__).resolve().parents[1] / "web_decoder"
 GAUSSIANS = 256_000
 PAGES = 5
 """Number of fresh pages for each figure; the medians are reported."""
@@ -34,27 +34,7 @@ WAYS = {
     "webp.js": "the images alone, webp.js",
     "libwebp": "the images alone, libwebp in WebAssembly",
 }
-
-
-class Files(http.server.SimpleHTTPRequestHandler):
-    """The decoder's folder, and the container as ``scene.zip``."""
-
-    def __init__(self, *args: object, scene: Path, **kwargs: object) -> None:
-        self.scene = scene
-        self.extensions_map = {
-            ".js": "text/javascript",
-            ".wasm": "application/wasm",
-            ".html": "text/html",
-            "": "text/plain",
-        }
-        super().__init__(*args, directory=str(DECODER), **kwargs)  # type: ignore[arg-type]
-
-    def translate_path(self, path: str) -> str:
-        """Return the path of a file, or that of the container."""
-        return str(self.scene) if path == "/scene.zip" else super().translate_path(path)
-
-    def log_message(self, *_: object) -> None:
-        """Keep quiet."""
+PAGE, LIBWEBP = "web_decoder/bench/bench.html", "web_decoder/node_modules/@jsquash/webp/codec/dec/webp_dec.wasm"
 
 
 def main() -> None:
@@ -62,46 +42,30 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("container", nargs="?", type=Path)
     given = parser.parse_args().container
-    with tempfile.TemporaryDirectory() as folder:
-        scene = given or make_scene(Path(folder) / "scene.zip")
-        count = len(kissgs.decompress(scene))
-        size = scene.stat().st_size
-        write(f"{scene.name}: {count:,} Gaussians, {size:,} bytes; milliseconds, medians of {PAGES} pages")
-        head("", "at first", "then")
-        server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Files, scene=scene))
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        with sync_playwright() as driver:
-            chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-            browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-            runs: dict[str, tuple[list[float], list[float]]] = {way: ([], []) for way in WAYS}
+    container = given.read_bytes() if given else kissgs.compress(kissgs.sample_scene(GAUSSIANS)).to_zip()
+    count = len(kissgs.decompress(container))
+    write(f"{count:,} Gaussians, {len(container):,} bytes; milliseconds, medians of {PAGES} pages")
+    runs: dict[str, list[list[float]]] = {way: [] for way in WAYS}
+    site = Site()
+    site.files = {f"/{name}": (DECODER.parent / name).read_bytes() for name in (PAGE, LIBWEBP)}
+    site.files["/scene.zip"] = container
+    try:
+        with chromium(NO_GPU) as browser:
             for _ in range(PAGES):
-                for way, (first, later) in runs.items():
-                    times = measure(browser, server.server_port, way)
-                    first.append(times[0])
-                    later.append(statistics.median(times[len(times) // 2 :]))
-            for way, name in WAYS.items():
-                first, later = runs[way]
-                row(name, f"{statistics.median(first):.0f}", f"{statistics.median(later):.0f}")
-            browser.close()
-        server.shutdown()
-
-
-def measure(browser: Browser, port: int, way: str) -> list[float]:
-    """Times in a process of its own."""
-    context = browser.new_context()
-    page = context.new_page()
-    page.goto(f"http://127.0.0.1:{port}/bench/bench.html")
-    page.wait_for_function("window.measure !== undefined")
-    times = page.evaluate("([way, n]) => measure(way, '/scene.zip', n)", [way, REPETITIONS])
-    context.close()
-    return list(times)
-
-
-def make_scene(path: Path) -> Path:
-    """A container of that many Gaussians."""
-    splats = kissgs.sample_scene(GAUSSIANS)
-    kissgs.compress(splats).save(path)
-    return path
+                for way, times in runs.items():
+                    context = browser.new_context()  # a process of its own
+                    page = context.new_page()
+                    page.goto(f"{site.url}/{PAGE}")
+                    page.wait_for_function("window.measure !== undefined")
+                    times.append(page.evaluate("([way, n]) => measure(way, '/scene.zip', n)", [way, REPETITIONS]))
+                    context.close()
+    except pytest.skip.Exception as error:
+        raise kissgs.KissgsError(str(error)) from error
+    head("", "at first", "then")
+    for way, name in WAYS.items():
+        first = statistics.median(times[0] for times in runs[way])
+        then = statistics.median(statistics.median(times[REPETITIONS // 2 :]) for times in runs[way])
+        row(name, f"{first:.0f}", f"{then:.0f}")
 
 
 if __name__ == "__main__":

@@ -18,8 +18,8 @@ FORMATS = ("sog", "spz")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class External:
-    """A scene that the tool encoded and decoded; seconds are of its processes, with start-up, memory is in bytes."""
+class Measured:
+    """A scene that a codec encoded and decoded, in processes of their own; memory is in bytes."""
 
     bytes: int
     encode_seconds: float
@@ -30,18 +30,16 @@ class External:
 
 
 def measure_external(
-    scene: Path, ending: str, command: Sequence[str], *, sh_iterations: int | None = None, views: Views | None = None
-) -> External:
-    """Encode a ``.ply`` in one of :data:`FORMATS`, decode it with the same tool, and compare the two.
-
-    Without a GPU, ``.sog`` of a scene of degree 3 takes minutes for each of ``sh_iterations``.
-    """
+    scene: Path, *, ending: str, command: Sequence[str], sh_iterations: int | None = None, views: Views | None = None
+) -> Measured:
+    """Encode a ``.ply`` in one of :data:`FORMATS`, decode it with the same tool, and compare the two. Seconds have the
+    start-up of the tool. Without a GPU, ``.sog`` of a scene of degree 3 takes minutes for each of ``sh_iterations``."""
     iterations = [] if sh_iterations is None or ending != "sog" else ["-i", str(sh_iterations)]
     with tempfile.TemporaryDirectory() as folder:
         encoded, decoded = Path(folder, f"scene.{ending}"), Path(folder, "decoded.ply")
         wall, encode_cpu, memory = convert(command, scene.resolve(), encoded, iterations)
         _, decode_cpu, other_memory = convert(command, encoded, decoded, [])
-        return External(
+        return Measured(
             bytes=encoded.stat().st_size,
             encode_seconds=wall,
             encode_cpu_seconds=encode_cpu,

@@ -58,8 +58,8 @@ from kissgs.evaluation.evaluate import compare_images
 
 def check_request(manifest: Manifest, given: argparse.Namespace) -> None:
     """Check, before any work, that the manifest has the scenes and tiers, and that its settings allow the studies."""
-    scenes = {name for each in manifest.datasets.values() for name in each}
-    tiers = {tier for each in manifest.datasets.values() for scene in each.values() for tier in scene.tiers}
+    scenes = {name for _, name, _, _ in manifest.checkpoints()}
+    tiers = {tier for _, _, tier, _ in manifest.checkpoints()}
     for option, words, known in (("--scenes", given.scenes, scenes), ("--tiers", given.tiers, tiers)):
         for word in words or []:
             if word not in known:
@@ -77,21 +77,15 @@ def check_request(manifest: Manifest, given: argparse.Namespace) -> None:
             manifest.with_changes(encode=changes.get("encode", {}), finetune=changes.get("finetune", {}))
 
 
-def works(manifest: Manifest, given: argparse.Namespace) -> Iterator[Work]:
-    """Return the works of a manifest that are wanted."""
-    for dataset, scenes in manifest.datasets.items():
-        for name, scene in scenes.items():
-            for tier, checkpoint in scene.tiers.items():
-                if name in (given.scenes or [name]) and tier in (REFERENCE, *(given.tiers or [tier])):
-                    yield Work(dataset, name, tier, scene, checkpoint, manifest, given)
-
-
 def points_of(manifest: Manifest, given: argparse.Namespace, failed: list[str]) -> list[Point]:
     """Return all wanted points, those that are missing made now. What fails is said and added to ``failed``, and the
     others are made; but where the table of points cannot be written, the run ends."""
     table, found = given.output / "points.csv", list[Point]()
     known = {point.place: point for point in resumed_points(table)}
-    for work in works(manifest, given):
+    for dataset, name, tier, checkpoint in manifest.checkpoints():
+        if name not in (given.scenes or [name]) or tier not in (REFERENCE, *(given.tiers or [tier])):
+            continue
+        work = Work(dataset, name, tier, manifest.datasets[dataset][name], checkpoint, manifest, given)
         jobs = list[Job]()
         with said(str(work), failed):
             work.check()

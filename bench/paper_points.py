@@ -94,27 +94,28 @@ class Manifest(Part):
         finetune = {**self.settings.get("finetune", {}), **changes.get("finetune", {})}
         return Settings.research(self.preset, compact=compact, finetune=finetune, **encode)
 
+    def checkpoints(self) -> Iterator[tuple[str, str, str, Checkpoint]]:
+        """Yield data set, scene, tier and checkpoint of all."""
+        for dataset, scenes in self.datasets.items():
+            for name, scene in scenes.items():
+                for tier, checkpoint in scene.tiers.items():
+                    yield dataset, name, tier, checkpoint
+
     def check(self) -> None:
         """Raise UnsupportedError if settings are wrong, or scenes whose bytes count are no ``.ply``."""
         self.with_changes(finetune={"enabled": True})
         if any(name in self.settings.get("compact", {}) for name in BUDGETS):
             raise UnsupportedError("settings.compact has a budget; give count or ratio to checkpoints instead")
-        for dataset, scenes in self.datasets.items():
-            for name, scene in scenes.items():
-                if REFERENCE in scene.checkpoints:
-                    raise UnsupportedError(f"{dataset}/{name}: {REFERENCE!r} is the tier of the reference; rename it")
-                for tier, checkpoint in scene.tiers.items():
-                    try:
-                        self.check_checkpoint(checkpoint)
-                    except UnsupportedError as error:
-                        raise UnsupportedError(f"{dataset}/{name} {tier}: {error}") from error
-
-    def check_checkpoint(self, checkpoint: Checkpoint) -> None:
-        """Raise UnsupportedError if a checkpoint is wrong."""
-        path = checkpoint.scene
-        if not checkpoint.budget and (path.suffix != ".ply" or path.name.endswith(".compressed.ply")):
-            raise UnsupportedError(f"{path} is no plain .ply, whose bytes are to be compared; save it as one")
-        self.with_changes(compact=checkpoint.budget)
+        for dataset, name, tier, checkpoint in self.checkpoints():
+            try:
+                if REFERENCE in self.datasets[dataset][name].checkpoints:
+                    raise UnsupportedError(f"{REFERENCE!r} is the tier of the reference; rename it")
+                path = checkpoint.scene
+                if not checkpoint.budget and (path.suffix != ".ply" or path.name.endswith(".compressed.ply")):
+                    raise UnsupportedError(f"{path} is no plain .ply, whose bytes are to be compared; save it as one")
+                self.with_changes(compact=checkpoint.budget)
+            except UnsupportedError as error:
+                raise UnsupportedError(f"{dataset}/{name} {tier}: {error}") from error
 
 
 class _UniqueKeys(yaml.SafeLoader):
@@ -164,10 +165,12 @@ Make = Callable[[Path, Path], Mapping[str, float] | None]
 
 
 class Made(NamedTuple):
-    """A scene that a decoder gets, and values of its :class:`Point`: the bytes that it needs, times of making them."""
+    """A scene that a decoder gets, values of its :class:`Point`, the bytes that it needs and the times of making them,
+    and its file, if there is one."""
 
     splats: Splats
     values: Mapping[str, Any]
+    path: Path = Path()
 
 
 class Job(NamedTuple):
@@ -190,6 +193,7 @@ class Work:
     manifest: Manifest
     given: argparse.Namespace
     images: dict[int, Any] = field(default_factory=dict)  # renderings of the original that evaluations have made
+    failures: list[str] = field(default_factory=list)  # of the compaction, at most one
 
     def __str__(self) -> str:
         return f"{self.dataset}/{self.name} {self.tier}"
@@ -230,63 +234,60 @@ class Work:
         inputs = [kissgs.__version__, self.given.device, digest_of(self.checkpoint.scene), *captures, *texts]
         return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:16]
 
-    def path(self, key: str, ending: str) -> Path:
-        """Return the file of a job: files of equal keys are equal, whatever their series."""
-        return Path(self.given.output, self.dataset, self.name, self.tier, f"{key}{ending}")
-
     def file(self, series: str, ending: str, make: Make, *parts: BaseModel | str, small: bool = True) -> Job:
-        """Return a job for a file that depends on the parts, made of the compacted scene or of the one before. What is
-        loaded before is not in its times."""
+        """Return a job for a file that depends on the parts, made of the compacted scene or of the one before, unless
+        it is there with its record of bytes and times, which exclude what is loaded before. Files of equal keys are
+        equal, whatever their series."""
         key = self.key(*([self.compaction.key] if small else []), *parts)
+        path = Path(self.given.output, self.dataset, self.name, self.tier, f"{key}{ending}")
+        record = path.with_name(f"{path.name}.json")
 
-        def source() -> Path:
-            _ = self.original, self.training_views
-            return self.compacted() if small else self.checkpoint.scene
+        def made() -> Made:
+            found = _record_of(path, record)
+            if found is None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                source = self.compacted().path if small else self.checkpoint.scene
+                _ = self.original, self.training_views
+                wall, cpu = time.perf_counter(), sum(os.times()[:4])
+                stages = make(source, path) or {}
+                wall, cpu = time.perf_counter() - wall, sum(os.times()[:4]) - cpu
+                text = " ".join(f"{name}={seconds:.2f}" for name, seconds in stages.items())
+                found = {"bytes": path.stat().st_size, "seconds": wall, "cpu_seconds": cpu, "stages": text}
+                with atomic_file(record, overwrite=True) as file:
+                    file.write(json.dumps(found).encode())
+            return Made(kissgs.load(path, raw_axes=True), found, path)
 
-        return Job(series, key, lambda: stored(self.path(key, ending), make, source))
+        return Job(series, key, made)
 
     @cached_property
     def compaction(self) -> Job:
-        """The job of the ``.ply`` that is encoded; where it has failed, it fails again at once."""
-        job = compaction(self)
-        return Job(job.series, job.key, failing_once(job.make))
+        """The job of the ``.ply`` that is encoded."""
+        source = self.checkpoint.scene
+        if not self.checkpoint.budget:
+            series = BASE if self.tier == REFERENCE else "popspa-ply"
+            return Job(series, self.key(), lambda: Made(self.original, {"bytes": source.stat().st_size}, source))
+        settings = self.manifest.with_changes(compact=self.checkpoint.budget)
 
-    def compacted(self) -> Path:
-        """Return the compacted scene, which is made now unless it exists."""
-        self.compaction.make()
-        return self.path(self.compaction.key, ".ply") if self.checkpoint.budget else self.checkpoint.scene
+        def make(source: Path, path: Path) -> Mapping[str, float]:
+            views, checkpoint, device = self.training_views, path.with_suffix(".checkpoint"), self.given.device
+            report = kissgs.compact(
+                source, path, settings=settings, views=views, checkpoint=checkpoint, overwrite=True, device=device
+            ).report
+            stages = defaultdict[str, float](float)
+            for step in report.steps:
+                stages[step.name] += step.seconds
+            return stages
 
+        return self.file("popspa-ply", ".ply", make, settings.compact, small=False)
 
-def failing_once(make: Callable[[], Made]) -> Callable[[], Made]:
-    """Return a function that after its first failure repeats only the message."""
-    failures = list[str]()
-
-    def attempt() -> Made:
+    def compacted(self) -> Made:
+        """Return the scene that is encoded, compacted now unless that is done; what has failed fails again at once."""
         try:
-            if not failures:
-                return make()
+            if not self.failures:
+                return self.compaction.make()
         except (KissgsError, OSError) as error:
-            failures.append(str(error))
-        raise KissgsError(failures[0])
-
-    return attempt
-
-
-def stored(path: Path, make: Make, source: Callable[[], Path]) -> Made:
-    """Return what is in a file, which ``make`` writes unless it is there with its record, of bytes and times."""
-    record = path.with_name(f"{path.name}.json")
-    found = _record_of(path, record)
-    if found is None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scene = source()
-        wall, cpu = time.perf_counter(), sum(os.times()[:4])
-        stages = make(scene, path) or {}
-        wall, cpu = time.perf_counter() - wall, sum(os.times()[:4]) - cpu
-        text = " ".join(f"{name}={seconds:.2f}" for name, seconds in stages.items())
-        found = {"bytes": path.stat().st_size, "seconds": wall, "cpu_seconds": cpu, "stages": text}
-        with atomic_file(record, overwrite=True) as file:
-            file.write(json.dumps(found).encode())
-    return Made(kissgs.load(path, raw_axes=True), found)
+            self.failures.append(str(error))
+        raise KissgsError(self.failures[0])
 
 
 def _record_of(path: Path, record: Path) -> dict[str, Any] | None:
@@ -303,7 +304,7 @@ def _record_of(path: Path, record: Path) -> dict[str, Any] | None:
 
 def rate_distortion(work: Work) -> Iterator[Job]:
     """Return the points of one tier; of the reference as it is and encoded."""
-    yield work.compaction
+    yield work.compaction._replace(make=work.compacted)
     if work.tier == REFERENCE:
         yield encoding(work, "inria-sogxt")
         return
@@ -311,27 +312,6 @@ def rate_distortion(work: Work) -> Iterator[Job]:
     yield encoding(work, "popspa-sogxt-ft", finetune={"enabled": True})
     yield converted(work, "sog") if work.given.splat_transform else encoding(work, "popspa-sog-kissgs", ".sog")
     yield converted(work, "spz")
-
-
-def compaction(work: Work) -> Job:
-    """Return the job of the ``.ply`` that is encoded."""
-    source = work.checkpoint.scene
-    if not work.checkpoint.budget:
-        series = BASE if work.tier == REFERENCE else "popspa-ply"
-        return Job(series, work.key(), lambda: Made(work.original, {"bytes": source.stat().st_size}))
-    settings = work.manifest.with_changes(compact=work.checkpoint.budget)
-
-    def make(source: Path, path: Path) -> Mapping[str, float]:
-        views, checkpoint, device = work.training_views, path.with_suffix(".checkpoint"), work.given.device
-        report = kissgs.compact(
-            source, path, settings=settings, views=views, checkpoint=checkpoint, overwrite=True, device=device
-        ).report
-        stages = defaultdict[str, float](float)
-        for step in report.steps:
-            stages[step.name] += step.seconds
-        return stages
-
-    return work.file("popspa-ply", ".ply", make, settings.compact, small=False)
 
 
 def encoding(work: Work, series: str, ending: str = ".zip", **changes: Mapping[str, object]) -> Job:
@@ -368,11 +348,11 @@ def converted(work: Work, ending: str) -> Job:
 def ablation(work: Work) -> Iterator[Job]:
     """Return the containers of preset ``paper`` with one part left out, which no decoder reads."""
     settings, before = work.manifest.with_changes().encode, work.compaction.key
-    whole = cache(lambda: encode_parts(kissgs.load(work.compacted()), settings, 0))
+    whole = cache(lambda: encode_parts(work.compacted().splats, settings))
 
-    def make(leave_out: LeaveOut | None) -> Made:
-        parts = whole() if leave_out is None else leave_out(whole(), settings, 0)
-        return Made(parts.decoded, {"bytes": parts.size(settings, 0)})
+    def make(leave_out: LeaveOut) -> Made:
+        parts = leave_out(whole())
+        return Made(parts.decoded, {"bytes": parts.size()})
 
     for name, (leave_out, _, _) in PARTS.items():
         if work.original.sh_degree or name not in OF_CODEBOOK:

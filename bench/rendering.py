@@ -10,11 +10,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from bench.common import arguments, head, positive, row, run
+from bench.common import head, parser_with_views, positive, row, run
 from kissgs import CompactSettings, Splats, load, virtual_views
 from kissgs.core.context import Pace, Workers, keep_free_memory, load_kernels
 from kissgs.core.splats import ATTRIBUTES
@@ -35,7 +36,8 @@ NAMES = "forward", "forward + backward", "forward + scores", "training step"
 
 def main() -> None:
     """Print a row for each number of Gaussians."""
-    parser = arguments(__doc__)
+    parser = parser_with_views(__doc__)
+    parser.add_argument("scene", type=Path)
     parser.add_argument("--size", type=positive, help="longer side of the images, pixels")
     parser.add_argument("--gaussians", nargs="+", type=positive, help="resample the scene to these numbers")
     given = parser.parse_args()

@@ -19,13 +19,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image, ImageDraw
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from helpers.viewers import chromium, opened
 
-from bench.common import arguments, head, positive, row, run
+from bench.common import head, parser_with_views, positive, row, run
 from kissgs import Camera, KissgsError, Splats, Views, clean, load
 from kissgs.core.context import Context
 from kissgs.core.positions import with_origin
@@ -35,6 +34,7 @@ from kissgs.evaluation.html import heat_map, rms_difference
 from kissgs.evaluation.results import MAX_VIEW_PSNR
 from kissgs.io.files import atomic_file
 from kissgs.io.ply import write_ply
+from kissgs.rendering.images import Label, contact_sheet, png
 from kissgs.rendering.metrics import psnr, ssim
 
 READ = {"spark": ("compressed.ply", "ply", "sog", "spz", "splat"), "playcanvas": ("compressed.ply", "ply", "sog")}
@@ -59,7 +59,8 @@ class Drawn:
 
 def main() -> None:
     """Print the table; write it, and the contact sheet beside it."""
-    parser = arguments(__doc__)
+    parser = parser_with_views(__doc__)
+    parser.add_argument("scene", type=Path)
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--size", nargs=2, type=positive, default=(480, 360), metavar=("W", "H"), help="of images")
     parser.add_argument("--cameras", type=positive, default=6, help="largest number of cameras")
@@ -79,10 +80,10 @@ def main() -> None:
     for cells in table[1:]:
         row(*cells)
     if given.output:
-        text, image = io.StringIO(), io.BytesIO()
+        text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(table)
-        contact_sheet(files).save(image, "PNG")
-        for path, data in ((given.output, text.getvalue().encode()), (sheet_of(given.output), image.getvalue())):
+        sheet = given.output.with_suffix(".png")
+        for path, data in ((given.output, text.getvalue().encode()), (sheet, sheet_of(files))):
             with atomic_file(path, overwrite=True) as file:
                 file.write(data)
 
@@ -92,11 +93,6 @@ def as_ply(splats: Splats) -> bytes:
     file = io.BytesIO()
     write_ply(file, splats)
     return file.getvalue()
-
-
-def sheet_of(table: Path) -> Path:
-    """Return the path of the contact sheet beside a table."""
-    return table.with_suffix(".png")
 
 
 def chosen_cameras(scene: Splats, views: Views | None, count: int, size: Sequence[int]) -> list[Camera]:
@@ -152,25 +148,24 @@ def quality(images: Images, wanted: Images) -> list[str]:
     return [f"{np.mean(psnrs):.2f}", f"{np.mean([ssim(one, other) for one, other in pairs]):.4f}", f"{min(psnrs):.2f}"]
 
 
-def contact_sheet(files: Sequence[Drawn]) -> Image.Image:
-    """Return a row for each camera and renderer: the scene, then each file and its error against the scene."""
-    lines = []
+def sheet_of(files: Sequence[Drawn]) -> bytes:
+    """Return a PNG, of half the size, with a row for each camera and renderer: the scene, each file, and its error."""
+    images, labels = list[np.ndarray](), list[Label]()
     for camera in range(len(files[0].images["kissgs"])):
         for name, own in files[0].images.items():
-            wanted, tiles = own[camera], [tile(own[camera], f"{name}: scene")]
+            images.append(as_bytes(own[camera]))
+            labels.append(Label(f"{name}: scene"))
             for drawn in files[2:]:
-                image = drawn.images[name][camera] if name in drawn.images else np.zeros_like(wanted)
-                error = heat_map(rms_difference(image.astype(np.float32), wanted.astype(np.float32)), FULL_ERROR) / 255
-                tiles += [tile(image, f"{name}: {drawn.name}"), tile(error, f"error, 0 to {FULL_ERROR}")]
-            lines.append(np.concatenate(tiles, axis=1))
-    return Image.fromarray(np.concatenate(lines, axis=0))
+                image = drawn.images[name][camera] if name in drawn.images else np.zeros_like(own[camera])
+                difference = rms_difference(image.astype(np.float32), own[camera].astype(np.float32))
+                images += [as_bytes(image), heat_map(difference, FULL_ERROR)]
+                labels += [Label(f"{name}: {drawn.name}"), Label(f"error, 0 to {FULL_ERROR}")]
+    return png(contact_sheet([each[::2, ::2] for each in images], labels, columns=1 + 2 * len(files[2:])))
 
 
-def tile(image: np.ndarray, label: str) -> np.ndarray:
-    """Return a labelled image of half the size, as bytes."""
-    small = Image.fromarray(np.rint(255 * image).astype(np.uint8)).reduce(2)
-    ImageDraw.Draw(small).text((3, 2), label, fill="white", stroke_width=1, stroke_fill="black")
-    return np.asarray(small)
+def as_bytes(image: np.ndarray) -> np.ndarray:
+    """Return an image of 0 to 1 as 8-bit levels."""
+    return np.rint(255 * image).astype(np.uint8)
 
 
 if __name__ == "__main__":

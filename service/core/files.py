@@ -1,7 +1,8 @@
-"""Names of uploads and containers, bounds for their sizes, and paths of files that belong to no Python package."""
+"""Names of uploads and containers, bounds for their sizes, and files that belong to no Python package."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -70,3 +71,12 @@ ROOT = _PACKAGE if (_PACKAGE / "web_decoder").is_dir() else _PACKAGE.parent
 
 WEB_DECODER = ROOT / "web_decoder"
 VENDOR_SCRIPT = ROOT / "scripts" / "vendor"
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's entries to the disk, so that a power failure cannot undo a rename."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 
 import kissgs
@@ -48,14 +48,8 @@ def presets() -> Presets:
         measured_on=MEASURED_ON,
         measured_by=MEASURED_BY,
         presets=[
-            PresetFacts(
-                name=name,
-                settings=kissgs.Settings(preset=name).model_dump(mode="json"),
-                title=facts.title,
-                description=facts.description,
-                bytes_per_gaussian=facts.bytes_per_gaussian,
-                psnr_change=facts.psnr_change,
-                cpu_seconds_per_million=facts.cpu_seconds_per_million,
+            PresetFacts.model_validate(
+                {"name": name, "settings": kissgs.Settings(preset=name).model_dump(mode="json"), **asdict(facts)}
             )
             for name, facts in _FACTS.items()
         ],

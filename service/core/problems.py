@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -109,17 +109,10 @@ class ProblemError(Exception):
 
 
 def problem(code: str, detail: str, *, errors: list[dict[str, Any]] | None = None) -> Problem:
-    """Build the document of one problem."""
-    kind = PROBLEM_TYPES[code]
-    return Problem(
-        type=f"/v1/problems/{code}",
-        title=kind.title,
-        status=kind.status,
-        detail=detail,
-        code=code,
-        retryable=kind.retryable,
-        errors=errors,
-    )
+    """Build the document of one problem; a code that is not in :data:`PROBLEM_TYPES` becomes ``internal``."""
+    code = code if code in PROBLEM_TYPES else "internal"
+    kind = asdict(PROBLEM_TYPES[code])
+    return Problem(type=f"/v1/problems/{code}", detail=detail, code=code, errors=errors, **kind)
 
 
 def invalid(detail: str) -> ProblemError:

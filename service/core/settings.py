@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import BaseModel, BeforeValidator, ByteSize, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BeforeValidator, ByteSize, Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 PREFIX = "KISSGS_"
@@ -31,15 +31,6 @@ class SettingsError(Exception):
     """Invalid settings; the message names every problem, one per line."""
 
 
-class ApiKey(BaseModel):
-    """Name of a key's owner and SHA-256 of the key, which only its owner has."""
-
-    model_config = ConfigDict(frozen=True)
-
-    owner: str
-    sha256: str
-
-
 class ServiceSettings(BaseSettings):
     """All settings of the service. Sizes may be written as ``2GB`` or ``512MiB``, lists with spaces or commas."""
 
@@ -50,7 +41,7 @@ class ServiceSettings(BaseSettings):
     data_dir: Path = Field(
         Path("kissgs-data"), description="Folder of jobs, results and their database; created if missing."
     )
-    keys: Annotated[tuple[ApiKey, ...], NoDecode] = Field(
+    keys: Annotated[tuple[tuple[str, str], ...], NoDecode] = Field(
         (),
         description="Keys as owner:sha256 (created by `kissgs-serve key`); without keys, everyone may use the service.",
     )
@@ -136,7 +127,7 @@ class ServiceSettings(BaseSettings):
             found = re.fullmatch(rf"({OWNER}):([0-9a-f]{{64}})", entry)
             if not found:
                 raise ValueError(f"entry {number} is not owner:sha256; `kissgs-serve key OWNER` makes one")
-            keys.append({"owner": found[1], "sha256": found[2]})
+            keys.append((found[1], found[2]))
         return keys
 
     @field_validator("cors_origins")

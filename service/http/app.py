@@ -1,10 +1,14 @@
-"""The ASGI application: construction, errors as problem documents, start and stop, and its OpenAPI document."""
+"""The ASGI application: construction, errors as problem documents, start and stop, its OpenAPI document; and middleware
+for every request: host and origin checks, request ids, security headers, metrics and access log."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import logging
+import re
+import time
+import uuid
 from collections.abc import AsyncIterator
 from http import HTTPStatus
 from typing import Any
@@ -15,28 +19,19 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
 from sqlalchemy.exc import SQLAlchemyError
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import kissgs
 
-from ..core.clock import Clock
 from ..core.metrics import Metrics
-from ..core.notifier import JobNotifier
 from ..core.problems import Problem, ProblemError, answer, disk_full, field_errors, unusable_database
 from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings, SettingsError
-from ..jobs.admission import Admission
 from ..jobs.container import ServiceContainer
-from ..jobs.decoding import Decoder
-from ..jobs.process import JobRunners
-from ..jobs.status import EventStream, QueueEstimator
-from ..jobs.upkeep import ExpiryTask, recover
-from ..jobs.worker import JobCompletion, Worker
 from ..storage.database import error_text, is_full
-from ..storage.job_files import JobStorage
-from ..storage.job_records import open_store
-from .middleware import RequestMiddleware
 from .routes import facts, jobs, page, results
 
 DESCRIPTION = """\
@@ -55,12 +50,12 @@ _JOB_OPERATIONS = ("status", "events", "cancel", "delete", "result", "file", "th
 
 ROUTERS = (jobs.router, results.router, facts.router, page.router)
 
-log = logging.getLogger("kissgs.service")
+log, access_log = logging.getLogger("kissgs.service"), logging.getLogger("kissgs.access")
 
 
 def create_app(settings: ServiceSettings) -> FastAPI:
     """Create the service as an ASGI application. Opens its data folder and database and recovers unfinished jobs."""
-    context = _build_and_recover(settings)
+    context = _opened(settings)
     app = FastAPI(
         title="kissgs",
         version=facts.API_VERSION,
@@ -76,7 +71,6 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         app.include_router(router)
     app.mount("/static", page.RevalidatedFiles(directory=page.STATIC), name="static")
     _describe(app, keys_required=bool(settings.keys))
-    app.openapi()  # generated at the start, not during a request
     _answer_errors(app)
     if settings.cors_origins:
         app.add_middleware(
@@ -96,54 +90,22 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     return app
 
 
-def _build_and_recover(settings: ServiceSettings) -> ServiceContainer:
+def _opened(settings: ServiceSettings) -> ServiceContainer:
     try:
-        context = build(settings)
-        try:
-            recover(context)
-        except BaseException:
-            context.close()
-            raise
+        return ServiceContainer(settings)
     except kissgs.RunnerError as error:
         raise SettingsError(f"KISSGS_RUNNER: jobs cannot run on a Ray cluster: {error}") from error
     except OSError as error:
         raise SettingsError(f"KISSGS_DATA_DIR: cannot use {settings.data_dir}: {str(error).lower()}") from error
     except SQLAlchemyError as error:
         raise SettingsError(f"KISSGS_DATA_DIR: the job database cannot be used: {error_text(error)}") from error
-    return context
-
-
-def build(settings: ServiceSettings) -> ServiceContainer:
-    """Create all parts of a service without starting them."""
-    with contextlib.ExitStack() as opened:
-        storage, clock = JobStorage(settings.data_dir), Clock()
-        opened.callback(storage.close)
-        store = open_store(storage, clock)
-        opened.callback(store.close)
-        runners = JobRunners.open(settings)
-        opened.pop_all()  # the service closes them
-    storage.remove_unfinished(store.ids())
-    clock.start_after(store.meta_value("time") or 0.0)
-    storage.keep_reserve()
-    notifier, metrics = JobNotifier(), Metrics()
-    metrics.queue_limit.set(settings.max_queue)
-    completion = JobCompletion(settings, store, storage, metrics, clock)
-    worker = Worker(settings, store, storage, notifier, metrics, completion, runners)
-    queue = QueueEstimator(store, settings.workers)
-    admission = Admission(settings, store, storage, queue)
-    decoder = Decoder(settings, store, storage, admission, runners)
-    event_stream = EventStream(store, notifier, queue)
-    return ServiceContainer(
-        settings, store, storage, notifier, metrics, clock, worker, queue, admission, decoder, event_stream
-    )
 
 
 @contextlib.asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     context: ServiceContainer = app.state.context
     context.worker.start()
-    expiry = ExpiryTask(context, context.clock())
-    tasks = [asyncio.create_task(task) for task in (expiry.run(), expiry.heartbeat())]
+    tasks = [asyncio.create_task(task) for task in (context.keep_sweeping(), context.keep_time())]
     try:
         yield
     finally:
@@ -198,25 +160,18 @@ def _describe(app: FastAPI, *, keys_required: bool) -> None:
     """Complete the OpenAPI document: schemas of errors and of form fields, links to the operations on a new job, and
     authorization, which is optional unless keys are required."""
     app.description = DESCRIPTION
-    made = app.openapi
-
-    def completed() -> dict[str, Any]:
-        if app.openapi_schema is None:
-            document = made()
-            schemas = document["components"]["schemas"]
-            for model in (Problem, JobOptions):
-                schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
-                schemas.update(schema.pop("$defs", {}))
-                schemas[model.__name__] = schema
-            for unused in ("HTTPValidationError", "ValidationError"):
-                schemas.pop(unused, None)
-            for path in document["paths"].values():
-                for operation in path.values():
-                    _complete(operation, keys_required)
-            app.openapi_schema = document
-        return app.openapi_schema
-
-    app.openapi = completed  # type: ignore[method-assign]
+    document = app.openapi()
+    schemas = document["components"]["schemas"]
+    for model in (Problem, JobOptions):
+        schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas.update(schema.pop("$defs", {}))
+        schemas[model.__name__] = schema
+    for unused in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(unused, None)
+    for path in document["paths"].values():
+        for operation in path.values():
+            _complete(operation, keys_required)
+    app.openapi_schema = document  # which requests get
 
 
 def _complete(operation: dict[str, Any], keys_required: bool) -> None:
@@ -230,3 +185,85 @@ def _complete(operation: dict[str, Any], keys_required: bool) -> None:
         for name in _JOB_OPERATIONS:
             parameters = {"id": "$response.body#/id", **({"name": "meta.json"} if name == "file" else {})}
             made.setdefault("links", {})[name] = {"operationId": name, "parameters": parameters}
+
+
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
+)
+"""Content-Security-Policy of the pages: no external resources, no embedding in frames."""
+
+SECURITY_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""Headers of every answer. The last keeps pages of other sites from embedding images and files of jobs; it does not
+concern the requests of scripts, which CORS permits or not."""
+
+METHODS = ("GET", "HEAD", "POST", "DELETE", "OPTIONS", "PUT", "PATCH")
+
+
+class RequestMiddleware:
+    """ASGI middleware around the application; metrics have the template of a route as a label, never client input."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics, settings: ServiceSettings) -> None:
+        self._app, self._metrics, self._settings = app, metrics, settings
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        given = headers.get("x-request-id", "")
+        request_id = given if re.fullmatch(r"[A-Za-z0-9._-]{1,64}", given) else uuid.uuid4().hex[:16]
+        scope.setdefault("state", {})["request_id"] = request_id
+        begun, status = time.perf_counter(), 0
+
+        async def sending(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                self._metrics.latency.labels(_route(scope)).observe(time.perf_counter() - begun)
+                answered = MutableHeaders(scope=message)
+                answered["X-Request-ID"] = request_id
+                answered.update(SECURITY_HEADERS)
+                answered.setdefault("Content-Security-Policy", PAGE_POLICY)  # the preview page has its own
+            await send(message)
+
+        try:
+            refusal = self._refusal(scope["method"], headers)
+            await (self._app if refusal is None else answer(refusal))(scope, receive, sending)
+        except Exception:
+            log.exception("request %s failed", request_id)
+            if status == 0:
+                text = f"an internal error of the service; report it with the request id {request_id}"
+                await answer(ProblemError("internal", text))(scope, receive, sending)
+        finally:
+            method = scope["method"] if scope["method"] in METHODS else "other"
+            self._metrics.requests.labels(method, _route(scope), status).inc()
+            target = scope.get("raw_path", b"").decode("ascii", "replace")
+            spent = 1e3 * (time.perf_counter() - begun)
+            access_log.info("%s %s %d %.0f ms %s", method, target[:500], status, spent, request_id)
+
+    def _refusal(self, method: str, headers: Headers) -> ProblemError | None:
+        """Return the error for a foreign host name (DNS rebinding) or a foreign origin (CSRF); None to allow. Requests
+        without an ``Origin`` header do not come from a page of another site."""
+        host = headers.get("host", "")
+        name = host.rpartition(":")[0] if re.search(r":[0-9]*$", host) else host
+        if not self._settings.answers_to(name.strip("[]").lower()):
+            text = f"the host name {host[:100]!r} is not accepted; the operator can add it to KISSGS_NAMES"
+            return ProblemError("foreign", text)
+        origin = headers.get("origin")
+        if method in ("GET", "HEAD", "OPTIONS") or origin is None or origin.lower() in self._settings.cors_origins:
+            return None
+        if "*" in self._settings.cors_origins or origin.lower().partition(":")[2] == f"//{host.lower()}":
+            return None
+        text = f"pages of {origin[:100]!r} may not use this service; the operator can add it to KISSGS_CORS_ORIGINS"
+        return ProblemError("foreign", text)
+
+
+def _route(scope: Scope) -> str:
+    route = scope.get("route")
+    return str(getattr(route, "path", "none"))

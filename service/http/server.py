@@ -19,7 +19,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from ..core.problems import MEDIA_TYPE, problem
 from ..core.settings import ServiceSettings, SettingsError
 from ..jobs.container import ServiceContainer
-from .middleware import SECURITY_HEADERS
+from .app import SECURITY_HEADERS
 from .submission import address_of
 
 log = logging.getLogger("kissgs.service")

@@ -1,4 +1,4 @@
-"""Conversion of a request with a scene to a queued job."""
+"""Conversion of a request with a scene, and perhaps a capture, to a queued job."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import json
 import logging
 import uuid
 from collections.abc import AsyncIterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from anyio.to_thread import run_sync
 from pydantic import ValidationError
@@ -16,6 +18,7 @@ from starlette.requests import Request
 
 import kissgs
 from kissgs.formats import CONTAINERS, UPLOADS, alternatives
+from kissgs.runners import MEMORY_LIMIT, TIME_LIMIT
 
 from ..core.files import checkpoint_bytes
 from ..core.models import Job
@@ -24,10 +27,10 @@ from ..core.problems import ProblemError, disk_full, field_errors, invalid, unus
 from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings
 from ..jobs.container import ServiceContainer
+from ..jobs.process import UNPACK, JobProcess
 from ..jobs.worker import QUEUE
 from ..storage.job_records import LimitExceeded
-from .captures import CaptureUpload
-from .uploads import PartBegin, Received, Spool, parts, scene_name, timed
+from .uploads import PartBegin, SceneUpload, Spool, parts, scene_name, timed
 
 RAW_TYPES = ("", "application/octet-stream", "application/ply", "application/x-ply", "model/ply")
 FORM_TYPE, FIELDS = "multipart/form-data", ("file", "capture", "options")
@@ -39,98 +42,166 @@ MAX_OPTIONS_BYTES = 64 << 10
 MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)  # maximum bytes of a form in addition to the scene
 
 
-def _fingerprint(received: Received, options: JobOptions) -> str:
-    """Return a hash of the scene and the options, with the capture; equal for equivalent requests."""
-    asked = json.dumps([received.sha256, options.model_dump(mode="json")], sort_keys=True)
-    return hashlib.sha256(asked.encode()).hexdigest()
+@dataclass
+class Submission:
+    """A request with a scene, of an owner, on its way to a job: options and name are those in the URL."""
 
+    context: ServiceContainer
+    request: Request
+    owner: str
+    options: str | bytes | None
+    name: str | None
+    key: str | None  # Idempotency-Key
 
-async def submit(
-    context: ServiceContainer, request: Request, owner: str, *, options: str | None, name: str | None, key: str | None
-) -> Job:
-    """Receive a scene and queue a job for it; a repeated key with an identical scene and options gives its job."""
-    if context.worker.draining:
-        raise ProblemError("stopping", "the service is stopping; try again in a minute", retry_after=60)
-    if health_problem := await run_sync(context.store.monitor.health_problem):
-        log.error("a submission was refused: the job database cannot be used: %s", health_problem)
-        raise unusable_database()
-    known = await run_sync(context.store.by_idempotency_key, owner, key) if key is not None else None
-    if known is None:
-        await run_sync(context.admission.check, owner)
-    parsed = parse_options(options) if options is not None else JobOptions()
-    with context.admission.slot(owner or address_of(request.client)):
-        path = context.storage.new_upload()
-        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-        _check_headers(request, kind)
-        at_most = _scene_bytes(request, kind, context.settings)
-        async with (
-            CaptureUpload(context, owner) as capture,
-            Spool(context.settings, context.admission, path, at_most) as spool,
-        ):
-            text: str | bytes = options or "{}"
-            spool.name = name or ""
-            if kind == FORM_TYPE:
-                text, name = await _receive_form(context, request, spool, capture, options, name)
-            else:
-                if known is None:
-                    await capture.check(parsed.capture)  # before the body
-                async for chunk in _body(context, request):
-                    await spool.write(chunk)
-            try:
-                job, new = await _checked(context, spool, capture, owner, text, scene_name(name), key)
-            finally:
-                await run_sync(context.storage.discard, path)  # already moved to the job, or not needed
-    if new:
-        context.metrics.submitted.labels(job.preset).inc()
-        context.metrics.bytes_in.inc(job.upload_bytes)
-        context.notifier.notify(QUEUE)
-        asked = request.state.request_id
-        log.info("job %s submitted by %s: %d bytes (request %s)", job.id, owner or "anyone", job.upload_bytes, asked)
-    return job
+    async def job(self) -> Job:
+        """Receive the scene and queue a job; a repeated key with an identical scene and options gives its job."""
+        context, request = self.context, self.request
+        if context.worker.draining:
+            raise ProblemError("stopping", "the service is stopping; try again in a minute", retry_after=60)
+        if health_problem := await run_sync(context.store.monitor.health_problem):
+            log.error("a submission was refused: the job database cannot be used: %s", health_problem)
+            raise unusable_database()
+        known = None if self.key is None else await run_sync(context.store.by_idempotency_key, self.owner, self.key)
+        if known is None:
+            await run_sync(context.admission.check, self.owner)
+        parsed = parse_options(self.options) if self.options is not None else JobOptions()
+        with context.admission.slot(self.owner or address_of(request.client)):
+            kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+            _check_headers(request, kind)
+            at_most = _scene_bytes(request, kind, context.settings)
+            async with (
+                CaptureUpload(context, self.owner) as capture,
+                SceneUpload(context.settings, context.admission, context.storage.new_upload(), at_most) as scene,
+            ):
+                if kind == FORM_TYPE:
+                    await self._receive_form(scene, capture)
+                else:
+                    scene.name = self.name or ""
+                    if known is None:
+                        await capture.check(parsed.capture)  # before the body
+                    async for chunk in self._body():
+                        await scene.write(chunk)
+                job, new = await self._checked(scene, capture)
+        if new:
+            context.metrics.submitted.labels(job.preset).inc()
+            context.metrics.bytes_in.inc(job.upload_bytes)
+            context.notifier.notify(QUEUE)
+            by, asked = self.owner or "anyone", request.state.request_id
+            log.info("job %s submitted by %s: %d bytes (request %s)", job.id, by, job.upload_bytes, asked)
+        return job
 
+    def _body(self) -> AsyncIterator[bytes]:
+        return timed(self.request, self.context.settings, self.context.notifier.subscribe(STOPPING))
 
-async def _checked(
-    context: ServiceContainer,
-    spool: Spool,
-    capture: CaptureUpload,
-    owner: str,
-    text: str | bytes,
-    name: str,
-    key: str | None,
-) -> tuple[Job, bool]:
-    """Check the options, the complete scene and the capture, and queue a job. A repeated request gives its job even if
-    its capture has been removed meanwhile. Return the job, and whether it is new."""
-    options = parse_options(text)
-    received = await spool.finish()
-    reference = {"capture": await capture.close(options.capture)}
-    fingerprint = _fingerprint(received, options.model_copy(update=reference))
-    if (known := await run_sync(_known, context, owner, key, fingerprint)) is not None:
-        return known, False
-    await capture.finish()
-    options = parse_options(text, photographs=capture.photographs).model_copy(update=reference)
-    job = Job(
-        id=uuid.uuid4().hex,
-        owner=owner,
-        name=name,
-        options=options.model_dump(mode="json"),
-        preset=options.kind,
-        evaluate=options.evaluate,
-        gaussians=received.info.count,
-        sh_degree=received.info.sh_degree,
-        upload_bytes=received.size,
-        disk_bytes=received.size + capture.bytes,
-        work_bytes=capture.bytes
-        + checkpoint_bytes(
-            received.info.count,
-            received.info.sh_degree,
+    async def _form_bytes(self, scene: SceneUpload, capture: CaptureUpload) -> AsyncIterator[bytes]:
+        """Yield the body of a form; raise an error if it exceeds the limit for bytes other than scene and capture."""
+        received = 0
+        async for chunk in self._body():
+            yield chunk
+            received += len(chunk)
+            if received - scene.size - capture.size > MAX_FORM_BYTES + len(chunk):
+                beside = f"{MAX_FORM_BYTES} bytes beside the scene and the capture"
+                raise invalid(f"the form has more than {beside}, which is the limit; send less")
+
+    async def _receive_form(self, scene: SceneUpload, capture: CaptureUpload) -> None:
+        """Receive a form with the fields ``file``, ``capture`` and ``options``, in any order, and set the options and
+        the name, which may be those of the URL."""
+        seen: list[str] = []
+        text = bytearray()
+        scene.name = self.name or ""
+        async for event in parts(self.request.headers["content-type"], self._form_bytes(scene, capture)):
+            match event:
+                case PartBegin(field, filename):
+                    if field not in FIELDS:
+                        known = alternatives([repr(name) for name in FIELDS])
+                        raise invalid(f"the form has an unknown field {field[:40]!r}; send {known}")
+                    if field in seen:
+                        raise invalid(f"the form has the field {field!r} twice; send each field once")
+                    seen.append(field)
+                    if field == "file":
+                        scene.name = filename or self.name or ""
+                        self.name = self.name or filename
+                case bytes() if seen[-1] == "file":
+                    await scene.write(event)
+                case bytes() if seen[-1] == "capture":
+                    await capture.write(event)
+                case bytes():
+                    text += event
+                    if len(text) > MAX_OPTIONS_BYTES:
+                        raise invalid(f"the options exceed {MAX_OPTIONS_BYTES} bytes, which is the limit; send less")
+        if "file" not in seen:
+            raise invalid("the form has no field 'file'; send the scene in it")
+        if "options" in seen and self.options is not None:
+            raise invalid("the options are both in the form and in the URL; send them once")
+        if "capture" in seen and not capture.size:
+            raise invalid("the field 'capture' is empty; send the archive in it, or leave it out")
+        if "options" in seen:
+            self.options = bytes(text)
+
+    async def _checked(self, scene: SceneUpload, capture: CaptureUpload) -> tuple[Job, bool]:
+        """Check the options, the complete scene and the capture, and queue a job. A repeated request gives its job even
+        if its capture has been removed meanwhile. Return the job, and whether it is new."""
+        text = "{}" if self.options is None else self.options
+        options = parse_options(text)
+        sha256, info = await scene.finish()
+        reference = {"capture": await capture.finish_archive(options.capture)}
+        asked = options.model_copy(update=reference).model_dump(mode="json")
+        equal = json.dumps([sha256, asked], sort_keys=True)  # of equivalent requests
+        fingerprint = hashlib.sha256(equal.encode()).hexdigest()
+        if (known := await run_sync(self._known, fingerprint)) is not None:
+            return known, False
+        await capture.finish()
+        options = parse_options(text, photographs=capture.photographs).model_copy(update=reference)
+        checkpoints = checkpoint_bytes(
+            info.count,
+            info.sh_degree,
             compact=options.resumable and options.retrains,
             finetune=options.resumable and bool(options.finetune.enabled),
-        ),
-        upload_sha256=received.sha256,
-        fingerprint=fingerprint,
-        idempotency_key=key,
-    )
-    return await run_sync(_queue, context, job, received, capture.folder)
+        )
+        job = Job(
+            id=uuid.uuid4().hex,
+            owner=self.owner,
+            name=scene_name(self.name),
+            options=options.model_dump(mode="json"),
+            preset=options.kind,
+            evaluate=options.evaluate,
+            gaussians=info.count,
+            sh_degree=info.sh_degree,
+            upload_bytes=scene.size,
+            disk_bytes=scene.size + capture.bytes,
+            work_bytes=capture.bytes + checkpoints,
+            upload_sha256=sha256,
+            fingerprint=fingerprint,
+            idempotency_key=self.key,
+        )
+        return await run_sync(self._queue, job, scene.path, UPLOADS[info.format], capture.folder)
+
+    def _queue(self, job: Job, upload: Path, ending: str, capture: Path) -> tuple[Job, bool]:
+        """Queue a job with its upload and the folder of its capture; return it, or that of a request with the same key
+        that was faster, and whether it is new."""
+        context = self.context
+        try:
+            context.storage.adopt(upload, job.id, f"scene{ending}", capture)
+            return context.admission.add(job), True
+        except BaseException as error:
+            context.storage.remove_job(job.id)
+            refused = isinstance(error, LimitExceeded | ProblemError)
+            if refused and (known := self._known(job.fingerprint)) is not None:
+                return known, False
+            if isinstance(error, OSError):
+                text = f"the upload cannot be stored: {(error.strerror or str(error)).lower()}; try again later"
+                raise disk_full(text) from error
+            raise
+
+    def _known(self, fingerprint: str) -> Job | None:
+        """Return the job that an earlier request with this key made."""
+        job = None if self.key is None else self.context.store.by_idempotency_key(self.owner, self.key)
+        if job is not None and job.fingerprint != fingerprint:
+            raise ProblemError(
+                "key-reused",
+                "this Idempotency-Key was used with another scene or other options; use a new key for a new job",
+            )
+        return job
 
 
 def parse_options(text: str | bytes, *, photographs: bool | None = None) -> JobOptions:
@@ -192,89 +263,94 @@ def _scene_bytes(request: Request, kind: str, settings: ServiceSettings) -> int 
     return limit if kind == FORM_TYPE and limit < length <= limit + beside else length
 
 
-def _body(context: ServiceContainer, request: Request) -> AsyncIterator[bytes]:
-    return timed(request, context.settings, context.notifier.subscribe(STOPPING))
+UNPACKED_RATIO, UNPACKED_BYTES = 4, 16 << 20
+"""Largest size of an unpacked capture, as a multiple of its archive and in addition: photographs are compressed, and
+camera files as text shrink to a third. This much disk space is reserved."""
 
 
-async def _form_bytes(
-    context: ServiceContainer, request: Request, spool: Spool, capture: CaptureUpload
-) -> AsyncIterator[bytes]:
-    """Yield the body of a form; raise an error if it exceeds the limit for bytes other than scene and capture."""
-    received = 0
-    async for chunk in _body(context, request):
-        yield chunk
-        received += len(chunk)
-        if received - spool.size - capture.size > MAX_FORM_BYTES + len(chunk):
-            beside = f"{MAX_FORM_BYTES} bytes beside the scene and the capture"
-            raise invalid(f"the form has more than {beside}, which is the limit; send less")
+class CaptureUpload(Spool):
+    """The capture of a submission, if it has one: an archive in the form, which is unpacked, or the hash of an earlier
+    job's. As a context manager, it removes what no job has adopted. Finished, it has a ``reference``, the ``folder``
+    and ``bytes`` of its files, and whether there are ``photographs`` to train on and others to evaluate with."""
+
+    what, advice = "capture", "send fewer or smaller photographs"
+
+    def __init__(self, context: ServiceContainer, owner: str) -> None:
+        super().__init__(context.admission, context.storage.new_upload(), context.settings.max_capture_bytes)
+        self._context, self._owner = context, owner
+        self.folder = context.storage.new_upload()
+        self._unpacked = 0  # bytes that are reserved
+        self.reference: str | None = None
+        self.photographs: bool | None = None
+        self.bytes = 0
+
+    def _leave(self) -> None:
+        try:
+            super()._leave()
+        finally:
+            self._context.storage.discard(self.folder)  # moved to the job, or not needed
+            self._admission.release(self._unpacked, 0)
+
+    async def check(self, reference: str | None) -> None:
+        """Refuse the reference of a capture that no job of the owner has kept."""
+        if reference is not None and not await run_sync(self._context.store.with_capture, self._owner, reference):
+            raise _gone()
+
+    async def finish_archive(self, reference: str | None) -> str | None:
+        """Return the reference of the archive, or of an earlier job's capture without one."""
+        if self.size:
+            found = f"sha256:{await self.close()}"
+            if reference not in (None, found):
+                raise invalid(f"the option capture is not that of the archive, {found}; leave it out, or the archive")
+            reference = found
+        self.reference = reference
+        return reference
+
+    async def finish(self) -> None:
+        """Unpack the archive, or find the capture of the reference, and check it; after :meth:`finish_archive`."""
+        most = min(int(self._context.settings.max_capture_bytes), UNPACKED_RATIO * self.size + UNPACKED_BYTES)
+        if self.size:
+            await run_sync(self._admission.reserve, most)
+            self._unpacked = most
+            self.folder.mkdir()
+        elif self.reference is not None:
+            await run_sync(self._link, self.reference)
+        else:
+            return
+        facts = await self._unpack(most)
+        if facts["bytes"] is None:
+            raise _gone()
+        self.bytes, self.photographs = facts["bytes"], facts["photographs"]
+
+    def _link(self, reference: str) -> None:
+        for job_id in self._context.store.with_capture(self._owner, reference):
+            try:
+                return self._context.storage.link_capture(job_id, self.folder)
+            except OSError:  # the job is being removed, or this file system has no links
+                self._context.storage.discard(self.folder)
+        raise _gone()
+
+    async def _unpack(self, most: int) -> dict[str, Any]:
+        """Unpack the archive, if there is one, and check the capture, in a process; return its facts."""
+        settings = self._context.settings
+        task: dict[str, Any] = {"function": UNPACK, "folder": str(self.path.parent), "files": []}
+        task |= {"source": self.path.name if self.size else "", "work": self.folder.name}
+        task |= {"most_bytes": most, "most_files": settings.max_capture_files}
+        async with self._admission.unpacking:
+            outcome = await JobProcess(self._context.worker.runners).run(task)
+        if outcome.kind == "done":
+            return outcome.result
+        if outcome.code in (TIME_LIMIT, MEMORY_LIMIT):
+            takes = f"more than {settings.capture_seconds:g} s or {settings.job_memory:,} bytes of memory"
+            text = f"the capture takes {takes} to unpack and check, which is the limit; send fewer photographs"
+            raise ProblemError("invalid-views", text)
+        if outcome.code == "output":
+            raise disk_full(outcome.message)
+        if outcome.kind == "cancelled":
+            raise ProblemError("stopping", "the service is stopping; send the upload again in a minute", retry_after=60)
+        raise ProblemError(outcome.code, outcome.message or "the capture could not be unpacked; send it again")
 
 
-async def _receive_form(
-    context: ServiceContainer,
-    request: Request,
-    spool: Spool,
-    capture: CaptureUpload,
-    options: str | None,
-    name: str | None,
-) -> tuple[str | bytes, str | None]:
-    """Receive a form with the fields ``file``, ``capture`` and ``options``, in any order; return the options, perhaps
-    those of the URL, and the name."""
-    seen: list[str] = []
-    text = bytearray()
-    async for event in parts(request.headers["content-type"], _form_bytes(context, request, spool, capture)):
-        match event:
-            case PartBegin(field, filename):
-                if field not in FIELDS:
-                    known = alternatives([repr(name) for name in FIELDS])
-                    raise invalid(f"the form has an unknown field {field[:40]!r}; send {known}")
-                if field in seen:
-                    raise invalid(f"the form has the field {field!r} twice; send each field once")
-                seen.append(field)
-                name = name or filename if field == "file" else name
-                spool.name = filename or name or "" if field == "file" else spool.name
-            case bytes() if seen[-1] == "file":
-                await spool.write(event)
-            case bytes() if seen[-1] == "capture":
-                await capture.write(event)
-            case bytes():
-                text += event
-                if len(text) > MAX_OPTIONS_BYTES:
-                    raise invalid(f"the options exceed {MAX_OPTIONS_BYTES} bytes, which is the limit; send less")
-    if "file" not in seen:
-        raise invalid("the form has no field 'file'; send the scene in it")
-    if "options" in seen and options is not None:
-        raise invalid("the options are both in the form and in the URL; send them once")
-    if "capture" in seen and not capture.size:
-        raise invalid("the field 'capture' is empty; send the archive in it, or leave it out")
-    return bytes(text) if "options" in seen else options or "{}", name
-
-
-def _queue(context: ServiceContainer, job: Job, received: Received, capture: Path) -> tuple[Job, bool]:
-    """Queue a job with its upload and the folder of its capture; return it, or that of a request with the same key that
-    was faster, and whether it is new."""
-    owner, key, fingerprint = job.owner, job.idempotency_key, job.fingerprint
-    if (known := _known(context, owner, key, fingerprint)) is not None:
-        return known, False
-    try:
-        context.storage.adopt(received.path, job.id, f"scene{UPLOADS[received.info.format]}", capture)
-        return context.admission.add(job), True
-    except BaseException as error:
-        context.storage.remove_job(job.id)
-        if isinstance(error, LimitExceeded) and (known := _known(context, owner, key, fingerprint)) is not None:
-            return known, False
-        if isinstance(error, OSError):
-            text = f"the upload cannot be stored: {(error.strerror or str(error)).lower()}; try again later"
-            raise disk_full(text) from error
-        raise
-
-
-def _known(context: ServiceContainer, owner: str, key: str | None, fingerprint: str) -> Job | None:
-    if key is None:
-        return None
-    job = context.store.by_idempotency_key(owner, key)
-    if job is not None and job.fingerprint != fingerprint:
-        raise ProblemError(
-            "key-reused",
-            "this Idempotency-Key was used with another scene or other options; use a new key for a new job",
-        )
-    return job
+def _gone() -> ProblemError:
+    text = "the service does not have this capture, or not any more; send its archive in the field 'capture'"
+    return ProblemError("gone", text)

@@ -51,7 +51,9 @@ class _Parser:
 
     def __init__(self, boundary: bytes) -> None:
         self.found: list[PartBegin | bytes] = []
-        self.complete = False
+        self.begun, self.complete = False, False
+        self._line = re.compile(rb"(?:^|\n)--" + re.escape(boundary) + rb"(?:[ \t]*(?=\r\n)|(?=--))")
+        self._boundary, self._head = b"--" + boundary, b""
         self._name, self._value, self._size = b"", b"", 0
         self._headers: dict[bytes, bytes] = {}
         self._parser = MultipartParser(
@@ -68,7 +70,16 @@ class _Parser:
         )
 
     def feed(self, chunk: bytes) -> list[PartBegin | bytes]:
+        """Process the next bytes; those before the first boundary are removed, which the library does not."""
         self.found = []
+        if not self.begun:
+            self._head += chunk
+            first = self._line.search(self._head)
+            if (first.start() if first else len(self._head)) > MAX_PREAMBLE_BYTES + len(self._boundary):
+                raise invalid(f"the form has more than {MAX_PREAMBLE_BYTES} bytes before its first boundary")
+            if not first:
+                return []
+            self.begun, chunk = True, self._boundary + self._head[first.end() :]
         self._parser.write(chunk)
         return self.found
 
@@ -121,28 +132,6 @@ def _extended_name(disposition: bytes) -> str | None:
     return None
 
 
-class _Preamble:
-    """Removes the bytes before the first boundary, which the library does not."""
-
-    def __init__(self, boundary: bytes) -> None:
-        self._line = re.compile(rb"(?:^|\n)--" + re.escape(boundary) + rb"(?:[ \t]*(?=\r\n)|(?=--))")
-        self._boundary, self._head = b"--" + boundary, b""
-        self.over = False
-
-    def feed(self, chunk: bytes) -> bytes:
-        """Process the next bytes; return those that belong to parts."""
-        if self.over:
-            return chunk
-        self._head += chunk
-        found = self._line.search(self._head)
-        if (found.start() if found else len(self._head)) > MAX_PREAMBLE_BYTES + len(self._boundary):
-            raise invalid(f"the form has more than {MAX_PREAMBLE_BYTES} bytes before its first boundary")
-        if not found:
-            return b""
-        self.over = True
-        return self._boundary + self._head[found.end() :]
-
-
 async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterator[PartBegin | bytes]:
     """Yield the parts of a form as they arrive: the beginning of each, then its bytes."""
     _, options = parse_options_header(content_type)
@@ -150,13 +139,13 @@ async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterato
     if not 1 <= len(boundary) <= 256:
         raise invalid("the Content-Type has no valid boundary; let your HTTP library generate the header")
     try:
-        parser, preamble = _Parser(boundary), _Preamble(boundary)
+        parser = _Parser(boundary)
         async for chunk in chunks:
-            for event in parser.feed(preamble.feed(chunk)):
+            for event in parser.feed(chunk):
                 yield event
     except FormParserError as error:
         raise invalid(f"the form cannot be read: {error}") from error
-    if not preamble.over:
+    if not parser.begun:
         raise invalid("the form has no line with its boundary; let your HTTP library generate the body")
     if not parser.complete:
         raise invalid("the form ends before its last boundary; send it again")
@@ -178,39 +167,19 @@ CLOSE = {"Connection": "close"}
 STEP_BYTES = 16 << 20  # reserved per step as bytes arrive: a large Content-Length alone reserves nothing
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
-    """Complete upload: path, size, SHA-256 and what its headers state."""
-
-    path: Path
-    size: int
-    sha256: str
-    info: kissgs.SceneInfo
-
-
 class Spool:
-    """Writes one upload to disk: a scene, or the archive of a ``capture``. As a context manager, removes it unless
-    :meth:`finish` has succeeded. The header of a ``.ply`` is checked while it arrives; other formats when they are
-    complete. ``at_most`` bytes come according to the client; None if that is unknown."""
+    """Writes an upload of at most ``most`` bytes to ``path``, of which ``at_most`` come according to the client; None
+    if that is unknown. As a context manager, it removes the file unless a job has adopted it."""
 
-    def __init__(
-        self,
-        settings: ServiceSettings,
-        admission: Admission,
-        path: Path,
-        at_most: int | None = None,
-        *,
-        capture: bool = False,
-    ) -> None:
-        self._settings, self._admission, self._path = settings, admission, path
-        self._at_most, self._capture = at_most, capture
-        self.name = ""  # of the file according to the client; set it before the first write
+    what, advice = "upload", "prune the scene first, or compress it with the command line"
+
+    def __init__(self, admission: Admission, path: Path, most: int, at_most: int | None = None) -> None:
+        self._admission, self.path, self._most, self._at_most = admission, path, most, at_most
         self.size = 0  # bytes received so far
         self._pending = bytearray()
         self._reserved, self._written = 0, 0
         self._hash = hashlib.sha256()
         self._file: BinaryIO | None = None
-        self._checked, self._kept = capture, False
 
     async def __aenter__(self) -> Self:
         if self._at_most is not None:
@@ -223,7 +192,6 @@ class Spool:
 
     async def write(self, data: bytes) -> None:
         """Process the next bytes, unless the scene is invalid, exceeds a limit, or does not fit on the disk."""
-        line = max(self._pending.rfind(b"\n"), 0)  # start of the last line, which may continue
         self._pending += data
         self.size += len(data)
         self._refuse_size(self.size)
@@ -232,19 +200,9 @@ class Spool:
             coming = max(coming, self.size - self._reserved)
             await run_sync(self._admission.reserve, coming)
             self._reserved += coming
-        if not self._checked and (self.size > self._settings.max_header_bytes or LAST_LINE.search(self._pending, line)):
-            self._check_header()
+        self._check(len(data))
         if len(self._pending) >= BLOCK_BYTES:
             await run_sync(self._flush)
-
-    async def finish(self) -> Received:
-        """Write the remaining bytes to disk and validate the scene."""
-        await self.close()
-        async with self._admission.parsing:
-            info = await run_sync(self._read_info)
-        refuse_count(info.count, self.size, self._settings.max_gaussians)
-        self._kept = True
-        return Received(self._path, self.size, self._hash.hexdigest(), info)
 
     async def close(self) -> str:
         """Write the remaining bytes to disk, and return the SHA-256 of all."""
@@ -262,8 +220,7 @@ class Spool:
         if self._file is not None:
             with contextlib.suppress(OSError):  # the file is removed anyway
                 self._file.close()
-        if not self._kept:
-            self._path.unlink(missing_ok=True)
+        self.path.unlink(missing_ok=True)
         self._admission.release(self._reserved, self._written)
 
     def _flush(self) -> None:
@@ -278,35 +235,66 @@ class Spool:
     def _writing(self) -> Iterator[BinaryIO]:
         try:
             if self._file is None:
-                self._file = self._path.open("xb")
+                self._file = self.path.open("xb")
             yield self._file
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             raise disk_full(f"the upload cannot be written: {reason}; try again later") from error
 
+    def _refuse_size(self, size: int) -> None:
+        if size > self._most:
+            limit = f"{self._most:,} bytes, which is the limit"
+            raise ProblemError("too-large", f"the {self.what} exceeds {limit}; {self.advice}")
+
+    def _check(self, new: int) -> None:
+        """Check what has arrived, whose last ``new`` bytes are new."""
+
+
+class SceneUpload(Spool):
+    """Writes a scene to disk. The header of a ``.ply`` is checked while it arrives; other formats when they are
+    complete."""
+
+    def __init__(self, settings: ServiceSettings, admission: Admission, path: Path, at_most: int | None = None) -> None:
+        super().__init__(admission, path, settings.max_upload_bytes, at_most)
+        self._settings = settings
+        self.name = ""  # of the file according to the client; set it before the first write
+        self._checked = False
+
+    async def finish(self) -> tuple[str, kissgs.SceneInfo]:
+        """Write the remaining bytes to disk and validate the scene; return its SHA-256, and what its headers state."""
+        sha256 = await self.close()
+        async with self._admission.parsing:
+            info = await run_sync(self._read_info)
+        refuse_count(info.count, self.size, self._settings.max_gaussians)
+        return sha256, info
+
     def _read_info(self) -> kissgs.SceneInfo:
         """Read the headers of the complete upload; refuse formats that are not one binary file."""
         name = f"upload{Path(self.name).suffix}"
         try:
-            kind = kissgs.recognise(self._path, name=name)
+            kind = kissgs.recognise(self.path, name=name)
             if kind not in UPLOADS:
                 wanted = alternatives(tuple(UPLOADS.values()))
                 what = "a checkpoint of a trainer" if FORMATS[kind].is_pickle else "a zip file, but not a .sog"
                 raise ProblemError("unsupported", f"the upload is {what}; send a {wanted}")
-            with self._path.open("rb") as file:  # JSON is as large as the upload, and would be parsed in this process
+            with self.path.open("rb") as file:  # JSON is as large as the upload, and would be parsed in this process
                 if kind == "gltf" and file.read(4) != b"glTF":
                     raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")
-            return kissgs.read_scene_info(self._path, name=name)
+            return kissgs.read_scene_info(self.path, name=name)
         except kissgs.KissgsError as error:
             raise self._named(error) from error
 
-    def _check_header(self) -> None:
+    def _check(self, new: int) -> None:
         """Validate the header as soon as it has arrived, long before the last byte of an invalid file."""
-        head, limit = bytes(self._pending), self._settings.max_header_bytes
+        if self._checked:
+            return
+        line = max(self._pending.rfind(b"\n", 0, len(self._pending) - new), 0)  # start of what was the last line
+        limit = self._settings.max_header_bytes
+        if self.size <= limit and not LAST_LINE.search(self._pending, line):
+            return
+        head, whole = bytes(self._pending), self._most if self._at_most is None else self._at_most
         self._checked = True
-        whole = self._at_most if self._at_most is not None else self._settings.max_upload_bytes
-        name, start = f"upload{Path(self.name).suffix}", head[:HEAD_BYTES]
-        if kissgs.recognise(start, name=name, size=whole) != "ply":
+        if kissgs.recognise(head[:HEAD_BYTES], name=f"upload{Path(self.name).suffix}", size=whole) != "ply":
             return
         try:
             info = kissgs.read_ply_info(head[:limit], size=max(whole, self.size))
@@ -314,20 +302,9 @@ class Spool:
             raise self._named(error) from error
         refuse_count(info.count, max(whole, self.size), self._settings.max_gaussians)
 
-    def _refuse_size(self, size: int) -> None:
-        if self._capture and size > self._settings.max_capture_bytes:
-            most = f"{self._settings.max_capture_bytes:,} bytes, which is the limit"
-            raise ProblemError("too-large", f"the capture exceeds {most}; send fewer or smaller photographs")
-        if not self._capture and size > self._settings.max_upload_bytes:
-            raise ProblemError(
-                "too-large",
-                f"the upload exceeds {self._settings.max_upload_bytes:,} bytes, which is the limit; "
-                "prune the scene first, or compress it with the command line",
-            )
-
     def _named(self, error: kissgs.KissgsError) -> ProblemError:
         """Convert an error of the library to a problem that names the upload instead of a path of the server."""
-        text = str(error).replace(str(self._path), self._path.name).replace(self._path.name, "the upload")
+        text = str(error).replace(str(self.path), self.path.name).replace(self.path.name, "the upload")
         text = text.replace("the data", "the upload").replace("the input", "the upload")
         if "the upload" not in text:
             text = f"the upload cannot be read: {text}"

@@ -1,22 +1,119 @@
-"""Admission: checks on the queue, on simultaneous uploads and on disk space."""
+"""Admission: positions and times of jobs in the queue, and checks on it, on simultaneous uploads and on disk space."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import math
+import statistics
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NoReturn
 
 from ..core.models import Job, State
+from ..core.presets import can_train, limited_seconds, usual_seconds
 from ..core.problems import ProblemError, disk_full
+from ..core.schemas import CAPTURED, FINETUNED, TIMED
 from ..core.settings import ServiceSettings
 from ..storage.job_files import JobStorage
 from ..storage.job_records import LimitExceeded, Store
-from .status import QueueEstimator
+
+
+class QueueEstimator:
+    """Estimates of positions and times, from one reading of the queue for each change of it."""
+
+    def __init__(self, store: Store, workers: int) -> None:
+        self._store, self._workers = store, workers
+        self._lock = threading.Lock()
+        self._changes: int | None = None
+        self._latest: Queue | None = None
+
+    def current(self) -> Queue:
+        """Return the estimates at this moment."""
+        with self._lock:
+            changes = self._store.changes  # first, so that a change during the reading is read the next time
+            if self._latest is None or changes != self._changes:
+                self._latest, self._changes = Queue(self._store, self._workers), changes
+            return self._latest
+
+
+class Queue:
+    """All active jobs at one time, the rates of recent ones, and what follows for their positions and times."""
+
+    def __init__(self, store: Store, workers: int) -> None:
+        self._store, self._workers = store, workers
+        self._rates: dict[tuple[str, bool], float | None] = {}
+        active, turns = store.active(), store.turns
+        self._running = [job for job in active if job.state == State.RUNNING]
+        self._positions: dict[int, int] = {}
+        self._seconds_before: dict[int, float] = {}
+        before = 0.0
+        for job in _in_turn((job for job in active if job.state == State.QUEUED), turns):
+            self._positions[job.number] = 1 + len(self._positions)
+            self._seconds_before[job.number] = before
+            before += self._remaining(job)
+
+    @property
+    def now(self) -> float:
+        """The current time in seconds since 1970."""
+        return self._store.clock()
+
+    def _total(self, job: Job) -> float:
+        """Estimate the seconds of a job from start to end, from recent jobs with equal preset and evaluation."""
+        kind = _kind_without_limit(job), job.evaluate
+        if kind not in self._rates:
+            rates = self._store.rates(*kind)
+            self._rates[kind] = statistics.median(rates) if rates else None
+        rate = self._rates[kind]
+        total = usual_seconds(*kind, job.gaussians) if rate is None else rate * job.gaussians
+        if (limit := job.options.get("time_limit")) is not None:
+            total = limited_seconds(*kind, job.gaussians, total, limit)
+        return total
+
+    def _remaining(self, job: Job) -> float:
+        """Estimate the seconds that a queued or running job is still to run, from its progress if that is known."""
+        if (end := self._store.ends.get(job.number)) is not None:
+            return max(end - self.now, 0.0)
+        total, started = self._total(job), job.started_at if job.state == State.RUNNING else None
+        return max(total - (self.now - started if started is not None else 0.0), 0.1 * total, 0.5)
+
+    def position(self, job: Job) -> int:
+        """Return the position of a queued job; 1 is next."""
+        return self._positions.get(job.number, 1)  # just started
+
+    def seconds_left(self, job: Job) -> float:
+        """Estimate the seconds until a queued or running job ends."""
+        seconds = self._remaining(job)
+        if job.state != State.QUEUED:
+            return seconds
+        before = sum(map(self._remaining, self._running)) + self._seconds_before.get(job.number, 0.0)
+        return seconds + before / self._workers
+
+    def seconds_to_room(self) -> float:
+        """Estimate the seconds until the queue has room, 1 to 300."""
+        return min(300.0, max(1.0, min(map(self._remaining, self._running), default=1.0) / self._workers))
+
+
+def _kind_without_limit(job: Job) -> str:
+    """Return the kind of the same job without a time limit, with fine-tuning where that is left to the time."""
+    if not job.preset.endswith(TIMED):
+        return job.preset
+    open_to_tuning = job.options["finetune"]["enabled"] is None and CAPTURED not in job.preset and can_train()
+    return job.preset.removesuffix(TIMED) + (FINETUNED if open_to_tuning else "")
+
+
+def _in_turn(queued: Iterable[Job], turns: Mapping[str, int]) -> list[Job]:
+    """Return queued jobs in the order in which :meth:`Store.claim` starts them: one of each owner, then the next ones.
+    First is the owner whose ``turns``, the number of its last start, is the lowest; of one owner, the oldest job."""
+    waiting: dict[str, list[Job]] = {}
+    for job in sorted(queued, key=lambda job: job.number):
+        waiting.setdefault(job.owner, []).append(job)
+    owners = sorted(waiting.values(), key=lambda jobs: (turns.get(jobs[0].owner, 0), jobs[0].number))
+    return [job for turn in itertools.zip_longest(*owners) for job in turn if job is not None]
+
 
 BUSY_SECONDS = 5.0  # Retry-After of refusals because of simultaneous uploads, seconds
 
@@ -38,7 +135,7 @@ class Admission:
     unpacking: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(1))
     _reserved: int = 0
     _written: int = 0
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _lock: threading.RLock = field(default_factory=threading.RLock)
 
     def check(self, owner: str) -> None:
         """Refuse a request before its body is read, if :meth:`add` would refuse it afterwards."""
@@ -89,8 +186,7 @@ class Admission:
     def reserve(self, size: int) -> None:
         """Reserve disk space in bytes; if there is not enough, remove reclaimable files of ended jobs."""
         with self._lock:
-            if not self._fits(size) and not self._fits(size, self.store.reclaimable_bytes()):
-                raise self._full(size)
+            self.check_space(size)
             while not self._fits(size):
                 oldest = self.store.oldest_reclaimable()
                 if oldest is None:

@@ -22,7 +22,8 @@ from typing import IO, Any
 import kissgs
 from kissgs.formats import CAMERA_FILES, PHOTOGRAPHS, is_packable
 
-from .job_process import Task, sync_folder, write_file
+from ..core.files import sync_folder
+from .job_process import Task, write_file
 
 RECORD = "unpacked.json"  # the bytes of each file of a capture, to notice when a later job finds less
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06", b"PK\x07\x08")

@@ -17,7 +17,7 @@ from typing import Any
 import kissgs
 from kissgs.formats import CONTAINERS
 
-from ..core.files import THUMBNAIL, THUMBNAIL_SIZE
+from ..core.files import THUMBNAIL, THUMBNAIL_SIZE, sync_folder
 
 log = logging.getLogger("kissgs.service")
 
@@ -184,10 +184,3 @@ def write_file(path: Path, data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
-
-
-def sync_folder(folder: Path) -> None:
-    """Flush a folder's entries to the disk."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    os.fsync(descriptor)
-    os.close(descriptor)

@@ -1,14 +1,17 @@
-"""``JobProcess``: one start of a job, or a decoding, as a work item of a runner on this machine or on a Ray cluster."""
+"""``JobProcess``: one start of a job, or a decoding, as a work item of a runner on this machine or on a Ray cluster;
+and ``Decoder``, which decodes the container of a job to a ``.ply`` on the first request."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+from anyio.to_thread import run_sync
 
 import kissgs
 from kissgs import runners
@@ -16,7 +19,13 @@ from kissgs.runners import Outcome, Resources, Runner, WorkItem
 from kissgs.runners.process import LocalRunner
 from kissgs.runners.ray_runner import RayRunner
 
+from ..core.files import BYTES_PER_GAUSSIAN, container_file
+from ..core.models import Job, State
+from ..core.problems import ProblemError
 from ..core.settings import ServiceSettings
+from ..storage.job_files import RESULT, JobStorage
+from ..storage.job_records import Store
+from .admission import Admission
 from .job_process import without_paths
 
 log = logging.getLogger("kissgs.service")
@@ -40,22 +49,16 @@ def postponed(reason: str = "") -> Outcome:
     return Outcome("lost", code=runners.NOT_STARTED, message=reason)
 
 
-@dataclass(frozen=True, slots=True)
 class JobRunners:
     """The runners of all jobs, and what each of them requests. ``local`` decodes and unpacks, which is quick and for
     which a request waits: no job of a cluster delays it."""
 
-    settings: ServiceSettings
-    runner: Runner
-    local: Runner
-
-    @classmethod
-    def open(cls, settings: ServiceSettings) -> JobRunners:
+    def __init__(self, settings: ServiceSettings) -> None:
         """Open the runner that the settings name."""
-        local = LocalRunner()
-        if settings.ray_address is None:
-            return cls(settings, local, local)
-        return cls(settings, RayRunner(settings.ray_address), local)
+        self.settings = settings
+        self.local: Runner = LocalRunner()
+        address = settings.ray_address
+        self.runner = self.local if address is None else RayRunner(address)
 
     def health_problem(self) -> str | None:
         """Return why no job can run at the moment; None if jobs can."""
@@ -153,29 +156,94 @@ class JobProcess:
             log.error("a job's process failed: %s\n%s", outcome.message, outcome.log)
         if outcome.kind in ("done", "cancelled") or outcome.code in POSTPONED:
             return outcome
-        if outcome.code == runners.NODE_UNUSABLE:
-            return self._unusable(outcome)
+        if outcome.code == runners.NODE_UNUSABLE:  # another node of a cluster may be able to work
+            log.warning("a job could not run on %s: %s", outcome.node or "its machine", outcome.message)
+            if self._used is self._runner.local:
+                return Outcome("error", code="output", message=UNUSABLE_MACHINE)
+            return Outcome("lost", code="internal", message=UNUSABLE_NODES)
         if outcome.kind == "lost":
             log.warning("a job was lost: %s", outcome.message)
             message = "the machine that ran the job was lost; submit the scene again"
             return replace(outcome, code="crashed", message=message)
         if outcome.kind == "crashed":
             return replace(outcome, code="crashed", message=f"{outcome.message}; submit the scene again")
-        return replace(outcome, message=self._detail(outcome, task))
+        seconds = f"{self._runner.settings.job_seconds:g} s"
+        messages = {
+            runners.TIME_LIMIT: f"the job took longer than {seconds}; choose a faster preset or fewer Gaussians",
+            runners.MEMORY_LIMIT: "the job exceeded its memory limit; submit a scene with fewer Gaussians",
+            runners.INTERNAL: "the job failed because of an error in kissgs; please report it with the scene",
+        }
+        return replace(outcome, message=messages.get(outcome.code) or without_paths(outcome.message, task))
 
-    def _unusable(self, outcome: Outcome) -> Outcome:
-        """Return the outcome on a machine that cannot work: another node of a cluster may be able to."""
-        log.warning("a job could not run on %s: %s", outcome.node or "its machine", outcome.message)
-        if self._used is self._runner.local:
-            return Outcome("error", code="output", message=UNUSABLE_MACHINE)
-        return Outcome("lost", code="internal", message=UNUSABLE_NODES)
 
-    def _detail(self, outcome: Outcome, task: dict[str, Any]) -> str:
-        if outcome.code == runners.TIME_LIMIT:
-            seconds = self._runner.settings.job_seconds
-            return f"the job took longer than {seconds:g} s; choose a faster preset or fewer Gaussians"
-        if outcome.code == runners.MEMORY_LIMIT:
-            return "the job exceeded its memory limit; submit a scene with fewer Gaussians"
-        if outcome.code == runners.INTERNAL:
-            return "the job failed because of an error in kissgs; please report it with the scene"
-        return without_paths(outcome.message, task)
+@dataclass(frozen=True)
+class Decoder:
+    """Decoder that handles one container at a time: decoding is quick, and memory is meant for jobs."""
+
+    store: Store
+    storage: JobStorage
+    admission: Admission
+    runners: JobRunners
+    _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    _processes: dict[str, JobProcess] = field(default_factory=dict)
+
+    async def scene(self, job: Job) -> Path:
+        """Return the path of the decoded ``.ply`` of a succeeded job, whose name ends in its SHA-256."""
+        try:
+            found = await run_sync(self.storage.decoded, job.id)
+            if found is None:
+                async with self._lock:
+                    if await run_sync(self.storage.decoded, job.id) is None:
+                        await self._decode(job)
+                    found = await run_sync(self.storage.decoded, job.id)
+        except OSError as error:
+            raise _gone() from error
+        if found is None:
+            raise _gone()
+        return found
+
+    async def _decode(self, job: Job) -> None:
+        size = 2000 + BYTES_PER_GAUSSIAN[job.sh_degree] * job.gaussians
+        await run_sync(self.admission.reserve, size)
+        work = None
+        try:
+            work = await run_sync(self.storage.new_work, job.id)
+            await self._run(job, work)
+            await run_sync(self._keep, work, job)
+        except (ProblemError, OSError) as error:
+            current = await run_sync(self.store.get, job.id)
+            if current is None or current.state != State.SUCCEEDED:
+                raise _gone() from error
+            raise
+        finally:
+            if work is not None:
+                await run_sync(self.storage.discard, work)
+            await run_sync(self.admission.release, size, 0)
+
+    def _keep(self, work: Path, job: Job) -> None:
+        self.storage.keep_decoded(work, job.id)
+        reclaimable = self.storage.reclaimable_bytes(job.id)
+        self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id), reclaimable_bytes=reclaimable)
+
+    def stop(self, job_id: str) -> None:
+        """Kill the decoding of a job, if it is running."""
+        process = self._processes.get(job_id)
+        if process is not None:
+            process.kill()
+
+    async def _run(self, job: Job, work: Path) -> None:
+        source = f"{RESULT}/{container_file(job.options).name}"
+        task = {"function": DECODE, "folder": str(work.parent), "files": [source], "source": source, "work": work.name}
+        process = self._processes[job.id] = JobProcess(self.runners)
+        try:
+            outcome = await process.run(task)
+        finally:
+            del self._processes[job.id]
+        if outcome.kind == "cancelled":
+            raise _gone()
+        if outcome.kind != "done":
+            raise ProblemError(outcome.code, outcome.message or "it was ended")
+
+
+def _gone() -> ProblemError:
+    return ProblemError("gone", "the job was deleted or has expired meanwhile; submit the scene again")

@@ -16,12 +16,11 @@ from sqlalchemy.exc import SQLAlchemyError
 import kissgs
 from kissgs.runners import Outcome
 
-from ..core.clock import Clock
+from ..core.clock import JobNotifier, wait
 from ..core.files import container_file
 from ..core.metrics import Metrics
 from ..core.models import ACTIVE, Job, State
-from ..core.notifier import JobNotifier, wait
-from ..core.problems import PROBLEM_TYPES, problem
+from ..core.problems import problem
 from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings
 from ..storage.database import error_text, is_full
@@ -58,7 +57,6 @@ class JobCompletion:
     store: Store
     storage: JobStorage
     metrics: Metrics
-    clock: Clock
 
     def record(self, job: Job, outcome: Outcome, work: Path | None, stopping: bool) -> None:
         """Record how a start of a job ended, and whether it is started again; the call can be repeated if it fails.
@@ -78,30 +76,18 @@ class JobCompletion:
         if outcome.kind == "done" and work is not None:
             self.storage.keep_result(job.id, work)
         self.storage.remove_work(job.id)  # before requeueing, because another worker may then run the job
-        again = job.starts < self.settings.job_starts
-        match outcome.kind:
-            case "done":
-                self.succeed(job, outcome.result)
-            case "cancelled":
-                self._requeue(job)
-            case "lost" if outcome.code in POSTPONED:
-                self._requeue(job)
-            case "crashed" if stopping:  # a supervisor may also have sent the signal to job processes
-                self._requeue(job)
-            case "crashed" if job.crashes == 0 and again:
-                log.warning("job %s is started again", job.id)
-                self.metrics.restarts.inc()
-                self.store.move(job.number, State.QUEUED, crashes=1)
-            case "lost" if stopping or again:
-                log.warning("job %s is started again elsewhere", job.id)
-                self.metrics.restarts.inc()
-                self.store.move(job.number, State.QUEUED)
-            case "error" | "crashed" | "lost":
-                self.fail(job, outcome.code, outcome.message)
-
-    def _requeue(self, job: Job) -> None:
-        """Return a job to the queue without counting its start."""
-        self.store.move(job.number, State.QUEUED, starts=job.starts - 1)
+        crashed, lost, again = outcome.kind == "crashed", outcome.kind == "lost", job.starts < self.settings.job_starts
+        if outcome.kind == "done":
+            self.succeed(job, outcome.result)
+        elif outcome.kind == "cancelled" or outcome.code in POSTPONED or (crashed and stopping):
+            # The start does not count. A supervisor that stops the service may have sent the signal to job processes.
+            self.store.move(job.number, State.QUEUED, starts=job.starts - 1)
+        elif (crashed and job.crashes == 0 and again) or (lost and (stopping or again)):
+            log.warning("job %s is started again%s", job.id, " elsewhere" if lost else "")
+            self.metrics.restarts.inc()
+            self.store.move(job.number, State.QUEUED, crashes=job.crashes + crashed)
+        else:
+            self.fail(job, outcome.code, outcome.message)
 
     def is_permanent(self, error: Exception) -> bool:
         """Return whether a retry would always fail, because of this job's folder alone."""
@@ -110,7 +96,7 @@ class JobCompletion:
     def succeed(self, job: Job, summary: dict[str, Any]) -> None:
         """Record success of a job whose result is complete."""
         self.storage.discard_checkpoints(job.id)
-        kept = self.storage.upload_name(job.id) is not None
+        kept = self.storage.upload(job.id) is not None
         values = {
             "result": summary,
             "upload_kept": kept,
@@ -122,22 +108,23 @@ class JobCompletion:
             if current is None or current.state != State.SUCCEEDED:  # cancelled at the same moment
                 self.storage.remove_job(job.id)
 
-    def fail(self, job: Job, code: str, detail: str) -> None:
-        """Record failure of a job and remove its files."""
-        if self._failed(job, code, detail):
-            self.storage.remove_job(job.id)
-
-    def lose(self, job: Job) -> None:
-        """Record failure of a job whose upload is missing; other files move to the orphaned folder."""
-        if self._failed(job, "internal", LOST):
+    def fail(self, job: Job, code: str, detail: str, *, lost: bool = False) -> None:
+        """Record failure of a job and remove its files; if it has ``lost`` its upload, move others to the orphaned
+        folder."""
+        document = problem(code, detail).model_dump(exclude_none=True)
+        if not self.end(job, State.FAILED, problem=document, upload_kept=False, disk_bytes=0):
+            return
+        if lost:
             self.storage.set_aside(job.id, "has lost its upload")
+        else:
+            self.storage.remove_job(job.id)
 
     def end(self, job: Job, state: State, **values: Any) -> bool:  # noqa: ANN401
         """Set a job's final state and the columns ``values``; return False if it has already ended."""
-        moved = self.store.move(job.number, state, expires_at=self.clock() + self.settings.keep_seconds, **values)
+        moved = self.store.move(job.number, state, expires_at=self.store.clock() + self.settings.keep_seconds, **values)
         current = self.store.get(job.id)
         if moved and current is not None:
-            seconds = None if job.started_at is None else self.clock() - job.started_at
+            seconds = None if job.started_at is None else self.store.clock() - job.started_at
             self.metrics.job_ended(current, state, seconds)
             when = "before it was started" if seconds is None else f"after {seconds:.1f} s"
             log.info("job %s %s %s", job.id, state, when)
@@ -173,10 +160,6 @@ class JobCompletion:
             if not (is_full(error) and self.storage.free_reserve()):
                 raise
         return change()
-
-    def _failed(self, job: Job, code: str, detail: str) -> bool:
-        document = problem(code if code in PROBLEM_TYPES else "internal", detail).model_dump(exclude_none=True)
-        return self.end(job, State.FAILED, problem=document, upload_kept=False, disk_bytes=0)
 
 
 def outcome_of(error: Exception) -> Outcome:
@@ -328,11 +311,11 @@ class Worker:
         current = await run_sync(self.store.get, job.id)  # cancelled before its process was registered?
         if current is None or current.state != State.RUNNING:
             return Outcome("cancelled")
-        upload = await run_sync(self.storage.upload_name, job.id)
+        upload = await run_sync(self.storage.upload, job.id)
         if upload is None or (job.options.get("capture") and not await run_sync(self.storage.capture_files, job.id)):
             return Outcome("error", code="internal", message=LOST)
         process.work = await run_sync(self.storage.new_work, job.id)
-        task = await run_sync(self._task, job, upload, process.work)
+        task = await run_sync(self._task, job, upload.name, process.work)
 
         async def progress(stage: str, fraction: float, note: str, left: float | None) -> None:
             try:
@@ -386,20 +369,16 @@ class Worker:
                     return
                 outcome = INTERNAL_ERROR
         self.notifier.notify_end(job.id)
-        if outcome.code in POSTPONED:
-            await self._rest_after_postponed(outcome.message)
+        if outcome.code in POSTPONED:  # the same job is tried again, after a longer pause each time
+            if outcome.message not in ("", self._postponed_reason):
+                log.warning("jobs cannot be started and wait: %s", outcome.message)
+                self._postponed_reason = outcome.message
+            seconds = min(MOST_POSTPONED_SECONDS, IDLE_SECONDS * 2**self._postponed)
+            self._postponed += 1
+            await self._rest(seconds)
         else:
             self._postponed, self._postponed_reason = 0, ""
         self.notifier.notify(QUEUE)
-
-    async def _rest_after_postponed(self, reason: str) -> None:
-        """Wait before the same job is tried again, longer each time; log every new reason once."""
-        if reason and reason != self._postponed_reason:
-            log.warning("jobs cannot be started and wait: %s", reason)
-            self._postponed_reason = reason
-        seconds = min(MOST_POSTPONED_SECONDS, IDLE_SECONDS * 2**self._postponed)
-        self._postponed += 1
-        await self._rest(seconds)
 
     def _log_once(self, what: str, error: Exception) -> None:
         """Log a repeated failure only once, until the queue can be read again."""

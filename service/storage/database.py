@@ -185,16 +185,21 @@ class NewDatabaseError(SettingsError):
     """The database does not exist or is empty, although the data folder has jobs."""
 
 
-def connect(file: Path, *, create: bool = True) -> tuple[sa.Engine, Sessions, Sessions]:
-    """Open the database, check that it is intact, and ``create`` it and its tables if there are none. Return the
-    engine, sessions for writing, each with exclusive access, and sessions for reading, which wait for none."""
+def connect(file: Path, *, jobs: int = 0) -> tuple[sa.Engine, Sessions, Sessions]:
+    """Open the database, check that it is intact, and create it and its tables if there are none, unless the data
+    folder has ``jobs``. Return the engine, sessions for writing, each with exclusive access, and sessions for reading,
+    which wait for none."""
+    refusal = NewDatabaseError(
+        f"KISSGS_DATA_DIR: {file.parent / 'jobs'} has the files of {jobs} jobs, but the job database {file} is new and "
+        "has none of them; restore it, choose another folder, or move the folder of jobs away to start without jobs"
+    )
     opened: list[Any] = []
     first = _engine(file, START_SECONDS, opened)
     try:
-        if not create and not (file.exists() and file.stat().st_size):
-            raise NewDatabaseError("the job database is new")
+        if jobs and not (file.exists() and file.stat().st_size):
+            raise refusal
         with _writing(first).begin() as session:
-            _check(session, create=create)
+            _check(session, refusal if jobs else None)
         engine = _engine(file, LOCK_SECONDS)
         engine.connect().close()  # before the first engine closes, which would remove the journal
     except Exception as error:
@@ -241,16 +246,16 @@ def _engine(file: Path, wait: float, opened: list[Any] | None = None) -> sa.Engi
     return engine
 
 
-def _check(session: Session, *, create: bool) -> None:
-    """Check that all tables exist and can be read; create them if none exists."""
+def _check(session: Session, refusal: NewDatabaseError | None) -> None:
+    """Check that all tables exist and can be read; if none exists, create them, or raise ``refusal``."""
     connection = session.connection()
     required = set(Base.metadata.tables)
     existing = required & set(sa.inspect(connection).get_table_names())
     values = _meta_values(session) if "meta" in existing else {}
     version = values.get("schema")
     if version is None and not _has_rows(session, existing - {"meta"}):
-        if not create:
-            raise NewDatabaseError("the job database is empty")
+        if refusal is not None:
+            raise refusal
         Base.metadata.create_all(connection)
         session.add_all(
             [Meta(name="schema", value=SCHEMA_VERSION), Meta(name=IDENTITY, value=secrets.randbits(IDENTITY_BITS))]

@@ -32,7 +32,7 @@ import time
 from pathlib import Path
 from typing import IO, Any
 
-from ..core.files import UPLOAD_FILES
+from ..core.files import UPLOAD_FILES, sync_folder
 from ..core.settings import SettingsError
 
 log = logging.getLogger("kissgs.service")
@@ -118,10 +118,9 @@ class JobStorage:
         sync_folder(folder)
         sync_folder(self.jobs)
 
-    def upload(self, job_id: str) -> Path:
-        """Return the path of the job's upload."""
-        paths = [self.jobs / job_id / name for name in UPLOAD_FILES]
-        return next((path for path in paths if path.exists()), paths[0])
+    def upload(self, job_id: str) -> Path | None:
+        """Return the path of the job's upload; None if there is none."""
+        return next((path for name in UPLOAD_FILES if (path := self.jobs / job_id / name).is_file()), None)
 
     def result(self, job_id: str) -> Path:
         """Return the path of the job's result, a folder that exists only if the result is complete."""
@@ -154,11 +153,6 @@ class JobStorage:
         """Return the bytes that an ended job can do without."""
         return sum(map(tree_bytes, self.reclaimable_files(job_id)))
 
-    def upload_name(self, job_id: str) -> str | None:
-        """Return the name of the job's upload; None if there is none."""
-        path = self.upload(job_id)
-        return path.name if path.is_file() else None
-
     def checkpoints(self, job_id: str) -> list[str]:
         """Return the names of the job's checkpoints."""
         return sorted(path.name for path in (self.jobs / job_id).glob("checkpoint*.npz"))
@@ -185,11 +179,14 @@ class JobStorage:
         """Return the summary of a complete result with this container; None if there is none or it is damaged."""
         result = self.result(job_id)
         try:
-            text = (result / "summary.json").read_bytes()
+            summary: dict[str, Any] = json.loads((result / "summary.json").read_bytes())
             sizes = {str(path.relative_to(result)): path.stat().st_size for path in result.rglob("*")}
-        except OSError:
+            required = {f"files/{name}": entry["bytes"] for name, entry in summary["files"].items()}
+            required |= {container: summary["container"]["bytes"], "report.json": summary["report"]["bytes"]}
+            complete = all(sizes.get(name) == size for name, size in required.items())
+            return summary if complete and {"count", "seconds", "cpu_seconds"} <= summary.keys() else None
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
             return None
-        return _complete_summary(text, sizes, container)
 
     def keep_decoded(self, work: Path, job_id: str) -> None:
         """Move a decoded scene from a work folder to its final path."""
@@ -336,29 +333,6 @@ class JobStorage:
         return True
 
 
-def _complete_summary(text: bytes, sizes: dict[str, int], container: str) -> dict[str, Any] | None:
-    """Return the summary of a result that is complete; None if it is not. ``text`` is that of ``summary.json``,
-    ``sizes`` are the bytes of each file of the result by name, and ``container`` is the name of the container's
-    file."""
-    try:
-        summary: dict[str, Any] = json.loads(text)
-        required = {f"files/{name}": entry["bytes"] for name, entry in summary["files"].items()}
-        required |= {container: summary["container"]["bytes"], "report.json": summary["report"]["bytes"]}
-        complete = all(sizes.get(name) == size for name, size in required.items())
-        return summary if complete and {"count", "seconds", "cpu_seconds"} <= summary.keys() else None
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return None
-
-
 def tree_bytes(path: Path) -> int:
     """Return the size of a file, or of all files below a folder, bytes."""
     return sum(each.stat().st_size for each in (path, *path.rglob("*")) if each.is_file())
-
-
-def sync_folder(folder: Path) -> None:
-    """Flush a folder's entries to the disk, so that a power failure cannot undo a rename."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -11,7 +11,7 @@ from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
-from sqlalchemy.orm import Session, load_only
+from sqlalchemy.orm import Session
 
 from ..core.models import ACTIVE, ENDED, NOTE_CHARS, Event, Job, Meta, State
 from ..core.settings import SettingsError
@@ -40,8 +40,8 @@ class LimitExceeded(Exception):
 class Store:
     """Jobs and events in a database. Methods block for milliseconds and are safe in any thread."""
 
-    def __init__(self, file: Path, clock: Callable[[], float], *, create: bool = True) -> None:
-        self._engine, self._writing, self._reading = connect(file, create=create)
+    def __init__(self, file: Path, clock: Callable[[], float], *, jobs: int = 0) -> None:
+        self._engine, self._writing, self._reading = connect(file, jobs=jobs)
         self.monitor = DatabaseMonitor(file, self.meta_value(IDENTITY))
         self.clock = clock
         self.turns: dict[str, int] = {}  # by owner, the number of the last start of one of its jobs, counted from 1
@@ -109,14 +109,9 @@ class Store:
             query = query.where(Job.state == state)
         return self._all(query)
 
-    def in_state(self, *states: State) -> list[Job]:
-        """Return all jobs in one of ``states``, oldest first."""
-        return self._all(sa.select(Job).where(Job.state.in_(states)).order_by(Job.number))
-
     def active(self) -> list[Job]:
-        """Return all queued and running jobs, with only the columns that estimates need."""
-        columns = load_only(Job.owner, Job.state, Job.preset, Job.evaluate, Job.gaussians, Job.options, Job.started_at)
-        return self._all(sa.select(Job).where(Job.state.in_(ACTIVE)).options(columns))
+        """Return all queued and running jobs, oldest first."""
+        return self._all(sa.select(Job).where(Job.state.in_(ACTIVE)).order_by(Job.number))
 
     def events(self, number: int, after: int = 0) -> list[Event]:
         """Return the events of a job with a ``seq`` above ``after``, in order."""
@@ -168,8 +163,6 @@ class Store:
         """Return the bytes of all reclaimable files of ended jobs."""
         query = sa.select(sa.func.sum(Job.reclaimable_bytes)).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
         return self._one(query) or 0
-
-    # Jobs ----------------------------------------------------------------------------------------------------------
 
     def add(self, job: Job, *, max_queue: int, max_owner: int) -> Job:
         """Queue a job, unless ``max_queue`` are queued, or ``max_owner`` of its owner are queued or running."""
@@ -250,8 +243,6 @@ class Store:
             session.execute(sa.delete(Event).where(Event.job == number))
             session.execute(sa.delete(Job).where(Job.number == number))
 
-    # The clock -----------------------------------------------------------------------------------------------------
-
     def heartbeat(self) -> None:
         """Store the current time, with which the clock of the next start begins; it checks that it can be written."""
         with self._write() as session:
@@ -287,18 +278,9 @@ def _open(folder: JobStorage, clock: Callable[[], float], stored: set[str]) -> S
     if folder.free_bytes() < RESERVE_BYTES:
         folder.free_reserve()
     try:
-        try:
-            return Store(folder.database, clock, create=not stored)
-        except NewDatabaseError:
+        return Store(folder.database, clock, jobs=len(stored))
+    except SettingsError as error:
+        if isinstance(error, NewDatabaseError) or folder.free_bytes() >= RESERVE_BYTES:
             raise
-        except SettingsError:
-            if folder.free_bytes() >= RESERVE_BYTES:
-                raise
-        folder.remove_uploads()  # this may free enough space for the database
-        return Store(folder.database, clock, create=not stored)
-    except NewDatabaseError as error:
-        raise SettingsError(
-            f"KISSGS_DATA_DIR: {folder.jobs} has the files of {len(stored)} jobs, but the job database "
-            f"{folder.database} is new and has none of them; restore it, choose another folder, or move the folder of "
-            "jobs away to start without jobs"
-        ) from error
+    folder.remove_uploads()  # this may free enough space for the database
+    return Store(folder.database, clock, jobs=len(stored))

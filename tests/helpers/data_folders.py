@@ -10,8 +10,7 @@ import pytest
 
 from service.core.models import Job, State
 from service.core.settings import ServiceSettings
-from service.http.app import build
-from service.jobs.upkeep import recover
+from service.jobs.container import ServiceContainer
 
 
 @pytest.fixture
@@ -23,17 +22,22 @@ def no_variables(monkeypatch):
 
 
 def opened(folder):
-    return build(ServiceSettings(data_dir=folder))
+    return ServiceContainer(ServiceSettings(data_dir=folder))
 
 
 @contextlib.contextmanager
 def service(folder):
     context = opened(folder)
     try:
-        recover(context)
         yield context
     finally:
         context.close()
+
+
+def swept(context):
+    """Remove what has expired, as if the service had run for long; return the ids of the jobs."""
+    context.began = 0.0
+    return context.sweep()
 
 
 def add_a_row(store, owner="", *, max_queue=10, max_owner=3, **values):

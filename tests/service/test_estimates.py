@@ -7,7 +7,7 @@ import pytest
 from service.core.models import Job, State
 from service.core.presets import usual_seconds
 from service.http.submission import parse_options
-from service.jobs.status import QueueEstimator
+from service.jobs.admission import QueueEstimator
 
 SCENE = 500_000
 
@@ -53,7 +53,7 @@ def test_a_limited_job_takes_its_time_and_the_start(options):
 
 def test_more_time_than_it_takes_changes_nothing(monkeypatch):
     monkeypatch.setattr("service.http.submission.can_train", lambda: False)
-    monkeypatch.setattr("service.jobs.status.can_train", lambda: False)
+    monkeypatch.setattr("service.jobs.admission.can_train", lambda: False)
     assert seconds(time_limit="10h") == seconds() == usual_seconds("balanced", False, SCENE)
     assert seconds(time_limit="10h", preset="fast") == seconds(preset="fast")
 

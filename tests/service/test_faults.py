@@ -132,7 +132,7 @@ def test_the_record_of_a_deletion_finds_space(tmp_path, monkeypatch, needed):
         monkeypatch.setattr(context.store, "move", full)
         may_fail = pytest.raises(OperationalError) if needed not in ("jobs", "reserve") else contextlib.nullcontext()
         with may_fail:
-            context.worker.completion.expire(job.number, job_id)
+            context.completion.expire(job.number, job_id)
         assert (context.store.get(job_id).state == State.EXPIRED) == (needed in ("jobs", "reserve"))
         assert not (context.storage.jobs / job_id).exists()
 

@@ -18,7 +18,7 @@ from helpers.service import FAST, SLOW, SMALL, events, keys_of, problem, read_re
 from service.core.metrics import Metrics
 from service.core.problems import ProblemError
 from service.core.settings import ServiceSettings
-from service.http.middleware import RequestMiddleware
+from service.http.app import RequestMiddleware
 from service.http.server import TimeoutProtocol, config_of
 from service.http.submission import address_of
 from service.jobs.admission import Admission
@@ -119,7 +119,7 @@ def test_an_error_in_the_job_process_is_internal(tmp_path):
         pass
 
     task = {"function": "job_process:nothing", "folder": str(tmp_path), "files": [], "work": "work", "source": "x"}
-    outcome = asyncio.run(JobProcess(JobRunners.open(ServiceSettings())).run(task, ignore))
+    outcome = asyncio.run(JobProcess(JobRunners(ServiceSettings())).run(task, ignore))
     assert (outcome.kind, outcome.code) == ("error", "internal")
 
 

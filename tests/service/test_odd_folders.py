@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers.data_folders import add_a_job, finish_a_job, listing, names, opened, service
+from helpers.data_folders import add_a_job, finish_a_job, listing, names, opened, service, swept
 from helpers.running import wait_until
 from helpers.service import SLOW, SMALL, problem, scene_bytes
 from helpers.thread_runner import ThreadRunner
@@ -17,8 +17,7 @@ from helpers.thread_runner import ThreadRunner
 import kissgs
 from kissgs.runners import Outcome
 from service.core.models import State
-from service.jobs import container
-from service.jobs.upkeep import ExpiryTask
+from service.http.routes import facts
 
 
 def a_file(folder, elsewhere):
@@ -58,9 +57,9 @@ def test_expiring(tmp_path, change):
         before = listing(folder)
         change(folder, tmp_path / "elsewhere")
         context.clock._offset += 10**5
-        assert sorted(ExpiryTask(context, 0.0).sweep()) == sorted(jobs)
+        assert sorted(swept(context)) == sorted(jobs)
         context.clock._offset += 10**5
-        ExpiryTask(context, 0.0).sweep()
+        swept(context)
         assert context.store.ids() == set()
         assert_orphaned(folder, change, tmp_path / "elsewhere", before)
         assert names(context.storage.jobs) == {".orphaned"}
@@ -79,7 +78,7 @@ def test_folders_that_cannot_be_removed(tmp_path, monkeypatch, caplog):
 
         monkeypatch.setattr(Path, "iterdir", refuse)
         context.clock._offset += 10**5
-        assert sorted(ExpiryTask(context, 0.0).sweep()) == sorted(jobs)
+        assert sorted(swept(context)) == sorted(jobs)
         monkeypatch.undo()
         assert names(context.storage.jobs) == {jobs[0]}
         assert f"job {jobs[0]}: its folder cannot be removed: operation not permitted" in caplog.text
@@ -134,7 +133,7 @@ def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
         found = context.store.get(job.id)
         assert (found.state, found.problem["code"]) == (State.FAILED, "output")
         assert found.problem["detail"].endswith("cannot be written: directory not empty; try again later")
-        is_permanent = context.worker.completion.is_permanent
+        is_permanent = context.completion.is_permanent
         errors = [OSError(number, "") for number in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR, errno.ENOENT)]
         assert [is_permanent(error) for error in (*errors, OSError(errno.ENOSPC, ""))] == [True] * 4 + [False]
         context.storage.jobs.rename(tmp_path / "away")  # which may come back
@@ -143,7 +142,7 @@ def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
 
 
 def test_readiness(start, monkeypatch):
-    monkeypatch.setattr(container, "READY_SECONDS", 0.0)
+    monkeypatch.setattr(facts, "READY_SECONDS", 0.0)
     it = start()
     for name, replacement in (("jobs", None), ("incoming", "a file"), ("jobs", "another folder")):
         folder = it.folder / name
@@ -212,7 +211,7 @@ def test_clock_jumps(tmp_path, monkeypatch):
     for jump in (365 * 86400, -365 * 86400):
         monkeypatch.setattr(time, "time", lambda jump=jump: real() + jump)
         asyncio.run(run_one(context))
-        ExpiryTask(context, 0.0).sweep()
+        swept(context)
         found = context.store.get(job_id)
         assert found.state == State.SUCCEEDED
         assert 0 <= found.finished_at - found.started_at < 60

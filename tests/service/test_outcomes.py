@@ -55,7 +55,8 @@ async def ignore(stage, fraction, note):
 def outcome_on(cluster, local=None, finetune=False, **settings):
     task = {"function": "job_process:compress", "folder": "/jobs/1", "files": [], "source": "x.ply", "work": "work-1"}
     task["settings"] = {"preset": "fast", "finetune": {"enabled": finetune}}
-    runners = JobRunners(ServiceSettings(job_threads=1, **settings), cluster, local or Cluster())
+    runners = JobRunners(ServiceSettings(job_threads=1, **settings))
+    runners.runner, runners.local = cluster, local or Cluster()
     return asyncio.run(JobProcess(runners).run(task, ignore))
 
 
@@ -171,7 +172,7 @@ DONE = Outcome("done", SUMMARY)
 @pytest.fixture
 def record(context):
     """``record(job, outcome, work)`` records how a start ended."""
-    return lambda job, outcome, work: context.worker.completion.record(job, outcome, work, False)
+    return lambda job, outcome, work: context.completion.record(job, outcome, work, False)
 
 
 def start(context):
@@ -215,7 +216,7 @@ def test_a_crash_while_the_service_stops_does_not_count(context):
     """Some supervisors signal the job process, too."""
     job_id = add_a_job(context)
     job, work = start(context)
-    context.worker.completion.record(job, Outcome("crashed", code="crashed"), work, True)
+    context.completion.record(job, Outcome("crashed", code="crashed"), work, True)
     assert (context.store.get(job_id).state, context.store.get(job_id).starts) == (State.QUEUED, 0)
 
 

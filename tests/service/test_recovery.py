@@ -11,7 +11,8 @@ import kissgs
 from service.core.models import State
 from service.core.schemas import JobOptions
 from service.core.settings import SettingsError
-from service.jobs.status import Queue, job_status
+from service.http.routes.common import job_status
+from service.jobs.admission import Queue
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 

@@ -11,12 +11,11 @@ from pathlib import Path
 
 import pytest
 from fastapi import Response
-from helpers.data_folders import database, finish_a_job, listing, names, opened, service
+from helpers.data_folders import database, finish_a_job, listing, names, opened, service, swept
 
 from service.core.models import SCHEMA_VERSION, State
 from service.core.settings import SettingsError
 from service.http.routes import facts
-from service.jobs.upkeep import ExpiryTask
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 
@@ -223,7 +222,7 @@ def test_other_files_are_not_removed(jobs_folder):
         assert not (jobs_folder / "jobs" / job / "work-0123456789abcdef").exists()
         assert {name: (jobs_folder / name).read_text() for name in others} == dict.fromkeys(others, "mine")
         context.clock._offset += 10**6
-        ExpiryTask(context, 0.0).sweep()
+        swept(context)
         assert context.storage.job_ids() == set()
     others[-1] = f"jobs/.orphaned/{job}/notes.txt"
     assert {name: (jobs_folder / name).read_text() for name in others} == dict.fromkeys(others, "mine")

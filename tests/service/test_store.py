@@ -7,7 +7,7 @@ import pytest
 from helpers.data_folders import add_a_row as add
 
 from service.core.models import ENDED, State
-from service.jobs.status import QueueEstimator
+from service.jobs.admission import QueueEstimator
 from service.storage.job_records import Store
 
 ALLOWED = {

@@ -9,7 +9,7 @@ from urllib.parse import quote
 import pytest
 from helpers.service import FAST, ROOT, SLOW, SMALL, problem
 
-from service.http.routes.common import accepts
+from service.http.routes.jobs import accepts
 
 
 def test_synchronous_compression(service, local):

@@ -9,7 +9,7 @@ from helpers.service import SMALL, problem, read_response
 
 from service.core.problems import ProblemError
 from service.core.settings import ServiceSettings
-from service.http.uploads import MAX_PREAMBLE_BYTES, PartBegin, Spool, parts
+from service.http.uploads import MAX_PREAMBLE_BYTES, PartBegin, SceneUpload, parts
 from service.jobs.admission import Admission
 
 HEAD = SMALL.index(b"end_header\n") + 11
@@ -59,13 +59,12 @@ class UnlimitedAdmission:
 
 
 async def receive_scene(folder, *packets, complete=True):
-    async with Spool(ServiceSettings(), UnlimitedAdmission(), folder / "x.part") as spool:
+    async with SceneUpload(ServiceSettings(), UnlimitedAdmission(), folder / "x.part") as spool:
         for packet in packets:
             await spool.write(packet)
         if complete:
-            found = await spool.finish()
-            assert (found.size, found.info.count) == (sum(map(len, packets)), 300)
-            found.path.unlink()
+            _, info = await spool.finish()
+            assert (spool.size, spool.path.stat().st_size, info.count) == (*[sum(map(len, packets))] * 2, 300)
 
 
 @pytest.mark.parametrize("end", [b"\n", b"\r\n"])
@@ -239,7 +238,7 @@ def test_extended_file_names(given):
 
 def test_two_uploads_at_a_time_are_parsed(tmp_path, monkeypatch):
     """The headers of sixteen simultaneous uploads once took memory all at once."""
-    running, counts, read = [], [], Spool._read_info
+    running, counts, read = [], [], SceneUpload._read_info
 
     def watched(spool):
         running.append(spool)
@@ -248,7 +247,7 @@ def test_two_uploads_at_a_time_are_parsed(tmp_path, monkeypatch):
         running.remove(spool)
         return read(spool)
 
-    monkeypatch.setattr(Spool, "_read_info", watched)
+    monkeypatch.setattr(SceneUpload, "_read_info", watched)
 
     async def receive():
         admission = UnlimitedAdmission()
@@ -256,9 +255,9 @@ def test_two_uploads_at_a_time_are_parsed(tmp_path, monkeypatch):
         await asyncio.gather(*(one(admission, tmp_path / f"{i}.part") for i in range(8)))
 
     async def one(admission, path):
-        async with Spool(ServiceSettings(), admission, path) as spool:
+        async with SceneUpload(ServiceSettings(), admission, path) as spool:
             await spool.write(SMALL)
-            assert (await spool.finish()).info.count == 300
+            assert (await spool.finish())[1].count == 300
 
     asyncio.run(receive())
     assert max(counts) == 2

@@ -1,21 +1,24 @@
-"""Functions shared by the routes: documentation of errors, look-up of jobs, and waiting for their end."""
+"""Functions shared by the routes: documentation of errors, keys, jobs, their status, and waiting for their end."""
 
 from __future__ import annotations
 
 import asyncio
-import re
-from collections.abc import Iterable
+import hashlib
+import hmac
+from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from anyio.to_thread import run_sync
 from fastapi import Depends, Path, Request
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from ...core.models import ACTIVE, Job
-from ...core.notifier import ended
+from ...core.clock import ended
+from ...core.files import THUMBNAIL
+from ...core.models import ACTIVE, Job, State
 from ...core.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemError
-from ...core.schemas import JobStatus
-from ...jobs.container import Owner, Service, ServiceContainer
-from ...jobs.status import job_status
+from ...core.schemas import Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
+from ...jobs.admission import Queue
+from ...jobs.container import ServiceContainer
 from ...storage.job_files import JOB
 
 MAX_WAIT_SECONDS = 30.0  # maximum duration of a long poll, shorter than typical idle time-outs of proxies
@@ -36,6 +39,40 @@ def problems(*codes: str) -> dict[int | str, dict[str, Any]]:
         if code == "unauthorized":
             answer["headers"] = {"WWW-Authenticate": {"schema": {"type": "string"}, "description": "Bearer"}}
     return dict(sorted(answers.items(), key=lambda item: int(item[0])))
+
+
+def _context(request: Request) -> ServiceContainer:
+    context: ServiceContainer = request.app.state.context
+    return context
+
+
+Service = Annotated[ServiceContainer, Depends(_context)]
+
+_bearer = HTTPBearer(auto_error=False, description="A key, if the service requires one (see /v1/limits).")
+
+
+def _owner(context: Service, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> str:
+    """Return the owner of the request's key; empty if no keys are configured."""
+    keys = context.settings.keys
+    if not keys:
+        return ""
+    digest = hashlib.sha256((given.credentials if given else "").encode()).hexdigest()
+    found = ""
+    for owner, sha256 in keys:  # compare with all keys, so that the time reveals nothing
+        if hmac.compare_digest(sha256, digest):
+            found = owner
+    if not found:
+        raise ProblemError(
+            "unauthorized",
+            "this key is unknown; check it, or ask the operator for a new one"
+            if given
+            else "this service requires a key; send it as 'Authorization: Bearer KEY'",
+            headers={"WWW-Authenticate": 'Bearer realm="kissgs"'},
+        )
+    return found
+
+
+Owner = Annotated[str, Depends(_owner)]
 
 
 async def _find(
@@ -92,19 +129,88 @@ async def wait_for_end(context: ServiceContainer, job: Job, seconds: float, requ
         disconnected.cancel()
 
 
-def accepts(headers: Iterable[str], media_type: str) -> bool:
-    """Whether ``Accept`` headers allow a media type. The most specific range decides; no range allows every type."""
-    weights: dict[str, float] = {}
-    for text in ",".join(headers).lower().split(","):
-        name, *parameters = (part.strip() for part in text.split(";"))
-        quality = next((part[2:] for part in parameters if part.startswith("q=")), "1")
-        if name:
-            weights[name] = float(quality) if re.fullmatch(r"[01](\.[0-9]{0,3})?", quality) else 1.0
-    ranges = (media_type, f"{media_type.partition('/')[0]}/*", "*/*")
-    return next((weights[name] > 0 for name in ranges if name in weights), not weights)
-
-
 async def _disconnected(request: Request) -> None:
     """Wait until the client has closed the connection."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
+
+
+_OF_RESULTS = ("source_format", "compacted", "finetuning", "invisible", "cleaned", "evaluation")
+"""Entries of a result's summary that the status has under the same names."""
+
+
+def job_status(job: Job, queue: Queue) -> JobStatus:
+    """Return the current status of a job."""
+    waits, runs, result = job.state == State.QUEUED, job.state == State.RUNNING, job.result or {}
+    estimate = None
+    if waits or runs:
+        seconds = queue.seconds_left(job)
+        estimate = Estimate(seconds_left=round(seconds, 1), ready_at=_as_datetime(queue.now + seconds))
+    return JobStatus(
+        state=State(job.state),
+        position=queue.position(job) if waits else None,
+        progress=Progress(stage=job.stage, fraction=job.fraction, note=job.note) if runs and job.stage else None,
+        estimate=estimate,
+        options=JobOptions.stored(job.options),
+        kept=result.get("count"),
+        note=result.get("note") or None,
+        sizes=_sizes(job),
+        timings=_timings(job, queue.now),
+        links=_links(job),
+        expires_at=_as_datetime(job.expires_at) if job.expires_at is not None else None,
+        id=job.id,
+        name=job.name,
+        upload_bytes=job.upload_bytes,
+        gaussians=job.gaussians,
+        sh_degree=job.sh_degree,
+        starts=job.starts,
+        problem=job.problem,
+        **{name: result.get(name) for name in _OF_RESULTS},
+    )
+
+
+def _sizes(job: Job) -> Sizes | None:
+    if job.result is None:
+        return None
+    container = job.result["container"]["bytes"]
+    return Sizes(
+        container=container,
+        files={name: file["stored"] for name, file in job.result["files"].items()},
+        ratio=job.upload_bytes / container,
+        bytes_per_gaussian=container / max(job.gaussians, 1),
+    )
+
+
+def _timings(job: Job, now: float) -> Timings:
+    started, finished = job.started_at, job.finished_at
+    until = finished if finished is not None else now
+    return Timings(
+        created_at=_as_datetime(job.created_at),
+        started_at=_as_datetime(started) if started is not None else None,
+        finished_at=_as_datetime(finished) if finished is not None else None,
+        queue_seconds=max(0.0, started - job.created_at) if started is not None else None,
+        run_seconds=max(0.0, until - started) if started is not None and job.state != State.QUEUED else None,
+        stages=job.result["seconds"] if job.result else None,
+        cpu_seconds=job.result["cpu_seconds"] if job.result else None,
+    )
+
+
+def _links(job: Job) -> Links:
+    here, done = f"/v1/jobs/{job.id}", job.state == State.SUCCEEDED
+    return Links(
+        self=here,
+        events=f"{here}/events",
+        cancel=f"{here}/cancel" if job.state in ACTIVE else None,
+        result=f"{here}/result" if done else None,
+        files=f"{here}/files/{{name}}" if done and (job.result or {}).get("files") else None,
+        thumbnail=f"{here}/{THUMBNAIL}" if done and "thumbnail" in (job.result or {}) else None,
+        decoded=f"{here}/decoded" if done else None,
+        source=f"{here}/source" if done and job.upload_kept else None,
+        report=f"{here}/report" if done else None,
+        preview=f"/preview/{job.id}" if done else None,
+    )
+
+
+def _as_datetime(seconds: float) -> datetime:
+    """Convert seconds since 1970 to a datetime in UTC."""
+    return datetime.fromtimestamp(seconds, UTC)

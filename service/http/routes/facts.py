@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import asdict
 from typing import Annotated
 
@@ -17,10 +18,10 @@ from ...core.metrics import CONTENT_TYPE
 from ...core.presets import can_train, presets
 from ...core.problems import PROBLEM_TYPES, ProblemError
 from ...core.schemas import Health, Limits, Presets, ProblemKind, Version
-from ...jobs.container import Service, ServiceContainer
+from ...jobs.container import ServiceContainer
 from ...storage.database import error_text
 from ...storage.job_files import ORPHANED
-from .common import MAX_WAIT_SECONDS, NO_STORE, problems
+from .common import MAX_WAIT_SECONDS, NO_STORE, Service, problems
 
 router = APIRouter()
 
@@ -31,25 +32,20 @@ API_VERSION = "1.0"
 async def get_limits(context: Service) -> Limits:
     """Limits of uploads and jobs; requests beyond them are refused."""
     settings = context.settings
-    return Limits(
-        formats=[ending.removeprefix(".") for ending in (*UPLOADS.values(), *DOUBLE_ENDINGS)],
-        containers=list(CONTAINER_FILES),
-        max_sh_degree=3,
-        max_jobs_per_key=settings.max_jobs_per_key if settings.keys else None,
-        job_memory_bytes=settings.job_memory,
-        max_wait_seconds=MAX_WAIT_SECONDS,
-        max_upload_bytes=settings.max_upload_bytes,
-        max_capture_bytes=settings.max_capture_bytes,
-        max_header_bytes=settings.max_header_bytes,
-        max_gaussians=settings.max_gaussians,
-        max_queue=settings.max_queue,
-        max_uploads=settings.max_uploads,
-        job_seconds=settings.job_seconds,
-        keep_seconds=settings.keep_seconds,
-        sync_seconds=settings.sync_seconds,
-        keys_required=bool(settings.keys),
-        training=can_train(),
-    )
+    limits = {
+        **settings.model_dump(include=set(Limits.model_fields)),  # those of the same name
+        "formats": [ending.removeprefix(".") for ending in (*UPLOADS.values(), *DOUBLE_ENDINGS)],
+        "containers": list(CONTAINER_FILES),
+        "max_header_bytes": settings.max_header_bytes,
+        "max_sh_degree": 3,
+        "max_jobs_per_key": settings.max_jobs_per_key if settings.keys else None,
+        "job_memory_bytes": settings.job_memory,
+        "sync_seconds": settings.sync_seconds,
+        "max_wait_seconds": MAX_WAIT_SECONDS,
+        "keys_required": bool(settings.keys),
+        "training": can_train(),
+    }
+    return Limits.model_validate(limits)
 
 
 @router.get("/v1/presets", tags=["facts"], operation_id="presets", summary="List the presets")
@@ -103,22 +99,31 @@ async def get_livez() -> Health:
 async def get_readyz(context: Service, response: Response) -> Health:
     """Checks of the worker, the database and the disk, at most two seconds old; route requests elsewhere while one of
     them fails."""
-    health = await context.readiness.health(lambda: _check(context))
+    health = await _health(context)
     response.status_code = 200 if health.ready else 503
     response.headers.update(NO_STORE)
     return health
 
 
-async def _check(context: ServiceContainer) -> Health:
-    found = {
-        "worker": context.worker.health_problem(),
-        "database": await run_sync(_database_problem, context),
-        "disk": await run_sync(_disk_problem, context),
-    }
-    checks = {part: text or "ok" for part, text in found.items()}
-    if count := await run_sync(context.storage.count_orphaned):
-        checks["orphaned"] = f"folders without a job in jobs/{ORPHANED} of the data folder: {count}"
-    return Health(ready=not any(found.values()), checks=checks)
+READY_SECONDS = 2.0  # of a check's result: each check writes to the disk, and anybody may ask for one
+
+
+async def _health(context: ServiceContainer) -> Health:
+    """Return the latest result of the checks, or that of new ones."""
+    latest, clock = context.readiness, asyncio.get_running_loop().time
+    async with latest.lock:
+        if latest.found is None or clock() - latest.checked > READY_SECONDS:
+            found = {
+                "worker": context.worker.health_problem(),
+                "database": await run_sync(_database_problem, context),
+                "disk": await run_sync(_disk_problem, context),
+            }
+            checks = {part: text or "ok" for part, text in found.items()}
+            if count := await run_sync(context.storage.count_orphaned):
+                checks["orphaned"] = f"folders without a job in jobs/{ORPHANED} of the data folder: {count}"
+            latest.found = Health(ready=not any(found.values()), checks=checks)
+            latest.checked = clock()
+        return latest.found
 
 
 @router.get(

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import re
+from collections.abc import AsyncIterator, Iterable
 from typing import Annotated, Any
 
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
+from ...core.clock import wait
 from ...core.models import ACTIVE, Job, State
 from ...core.problems import ProblemError
 from ...core.schemas import JobPage, JobStatus
-from ...jobs.container import Owner, Service, ServiceContainer
-from ..submission import RAW_TYPES, submit
-from .common import MAX_WAIT_SECONDS, NO_STORE, RequestedJob, accepts, problems, reload, statuses, wait_for_end
+from ...jobs.container import ServiceContainer
+from ..submission import RAW_TYPES, Submission
+from .common import MAX_WAIT_SECONDS, NO_STORE, Owner, RequestedJob, Service, problems, reload, statuses, wait_for_end
 from .results import CONTAINER_TYPES, get_result
 
 log = logging.getLogger("kissgs.service")
@@ -52,7 +56,7 @@ async def _submit(
     name: Name = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Job:
-    return await submit(context, request, owner, options=options, name=name, key=idempotency_key)
+    return await Submission(context, request, owner, options, name, idempotency_key).job()
 
 
 SubmittedJob = Annotated[Job, Depends(_submit)]
@@ -257,7 +261,7 @@ async def follow_job(
     if job.state not in ACTIVE and after >= job.last_event:
         return Response(status_code=204)
     return StreamingResponse(
-        context.event_stream.stream(job, after),
+        _events(context, job, after),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -288,9 +292,8 @@ async def delete_job(context: Service, job: RequestedJob) -> Response:
     """Cancel a job if it has not ended, and remove all its data."""
     await context.worker.cancel(job)
     context.decoder.stop(job.id)
-    completion = context.worker.completion
-    await run_sync(completion.expire, job.number, job.id)  # first, as a folder without a job would be kept
-    await run_sync(completion.forget, job.number)
+    await run_sync(context.completion.expire, job.number, job.id)  # first, as a folder without a job would be kept
+    await run_sync(context.completion.forget, job.number)
     context.notifier.notify_end(job.id)
     log.info("job %s deleted", job.id)
     return Response(status_code=204)
@@ -302,3 +305,38 @@ async def _accepted(context: ServiceContainer, response: Response, job: Job) -> 
     seconds = status.estimate.seconds_left if status.estimate else 0
     response.headers["Retry-After"] = str(max(1, min(60, round(seconds))))
     return status
+
+
+KEEPALIVE_SECONDS = 15.0  # without an event; then a comment is sent, so that the connection is not taken for dead
+RETRY_MILLISECONDS = 1000  # delay after which a browser reconnects, milliseconds
+
+
+async def _events(context: ServiceContainer, job: Job, after: int) -> AsyncIterator[str]:
+    """Yield the events with a ``seq`` above ``after``, until the job ends or is deleted, or the service stops."""
+    yield f"retry: {RETRY_MILLISECONDS}\n\n"
+    while True:
+        changed = context.notifier.subscribe(job.id)  # before reading, so that no later event is missed
+        found = await run_sync(context.store.events, job.number, after)
+        current = await run_sync(context.store.get, job.id)  # afterwards, so that it is not older than its last event
+        for event in found:
+            after, data = event.seq, event.data
+            if event.kind == "state" and current is not None and after == current.last_event:
+                (status,) = await statuses(context, current)  # with the latest state only
+                data = {**data, "job": status.model_dump(mode="json", exclude_none=True)}
+            yield f"id: {after}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"
+        if current is None or (after >= current.last_event and current.state not in ACTIVE) or context.notifier.closing:
+            return
+        if not await wait(changed, KEEPALIVE_SECONDS):
+            yield ": keep-alive\n\n"
+
+
+def accepts(headers: Iterable[str], media_type: str) -> bool:
+    """Whether ``Accept`` headers allow a media type. The most specific range decides; no range allows every type."""
+    weights: dict[str, float] = {}
+    for text in ",".join(headers).lower().split(","):
+        name, *parameters = (part.strip() for part in text.split(";"))
+        quality = next((part[2:] for part in parameters if part.startswith("q=")), "1")
+        if name:
+            weights[name] = float(quality) if re.fullmatch(r"[01](\.[0-9]{0,3})?", quality) else 1.0
+    ranges = (media_type, f"{media_type.partition('/')[0]}/*", "*/*")
+    return next((weights[name] > 0 for name in ranges if name in weights), not weights)

@@ -20,8 +20,7 @@ from starlette.types import Message, Receive, Scope, Send
 from ...core.files import CONTAINER_FILES, THUMBNAIL, container_file
 from ...core.models import Job, State
 from ...core.problems import ProblemError
-from ...jobs.container import Service
-from .common import RequestedJob, problems
+from .common import RequestedJob, Service, problems
 
 
 class StoredFile(FileResponse):
@@ -32,16 +31,11 @@ class StoredFile(FileResponse):
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        sha256: str,
-        media_type: str,
-        download: str | None = None,
-        headers: dict[str, str] | None = None,
+        self, path: Path, *, sha256: str, media_type: str, download: str | None = None, cached: str = "no-cache"
     ) -> None:
         digest = f"sha-256=:{base64.b64encode(bytes.fromhex(sha256)).decode()}:"
-        fixed = {"ETag": f'"{sha256}"', "Content-Digest": digest, "Repr-Digest": digest, **(headers or {})}
+        fixed = {"ETag": f'"{sha256}"', "Content-Digest": digest, "Repr-Digest": digest}
+        fixed["Cache-Control"] = f"private, {cached}"
         if download is not None:
             plain = download.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_").replace("\\", "_")
             extended = quote(download, safe="")  # RFC 6266
@@ -99,8 +93,7 @@ _MEDIA_TYPES = {".webp": "image/webp", ".json": "application/json", ".yaml": "ap
 
 CONTAINER_TYPES = tuple(dict.fromkeys(file.media_type for file in CONTAINER_FILES.values()))  # of results
 
-_PRIVATE = {"Cache-Control": "private, no-cache"}
-_FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}  # headers of container files, which never change
+_FOREVER = "max-age=31536000, immutable"  # of container files, which never change
 
 _UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range")
 
@@ -151,7 +144,7 @@ async def get_result(context: Service, job: RequestedJob) -> StoredFile:
     """The container, `.zip` (SOG-XT) or `.sog`, or the `.spz` or `.compressed.ply`, until the job expires."""
     sha256, kind = _result(job)["container"]["sha256"], container_file(job.options)
     file, download = context.storage.result(job.id) / kind.name, f"{job.name}{kind.ending}"
-    return await _stored(file, sha256=sha256, media_type=kind.media_type, download=download, headers=_PRIVATE)
+    return await _stored(file, sha256=sha256, media_type=kind.media_type, download=download)
 
 
 @_route("/files/{name}", "Download one file of the container", " ".join(_MEDIA_TYPES.values()))
@@ -166,7 +159,7 @@ async def get_file(
         raise ProblemError("not-found", f"the job has no file {name[:80]!r}; sizes.files of its status lists all files")
     media_type = _MEDIA_TYPES.get(Path(name).suffix, BINARY)
     file = context.storage.result(job.id) / "files" / name
-    return await _stored(file, sha256=files[name]["sha256"], media_type=media_type, headers=_FOREVER)
+    return await _stored(file, sha256=files[name]["sha256"], media_type=media_type, cached=_FOREVER)
 
 
 @_route("/thumbnail.webp", "Download an image of the result", "image/webp")
@@ -178,7 +171,7 @@ async def get_thumbnail(context: Service, job: RequestedJob) -> Response:
             "not-found", "the result has no thumbnail: it shows nothing, drawing it failed, or an older version made it"
         )
     file = context.storage.result(job.id) / THUMBNAIL
-    return await _stored(file, sha256=entry["sha256"], media_type="image/webp", headers=_FOREVER)
+    return await _stored(file, sha256=entry["sha256"], media_type="image/webp", cached=_FOREVER)
 
 
 @_route("/decoded", "Download the decoded scene", BINARY, "disk-full", "memory-limit", "crashed", "time-limit")
@@ -187,7 +180,7 @@ async def get_decoded(context: Service, job: RequestedJob) -> Response:
     _result(job)
     file = await context.decoder.scene(job)
     sha256, download = file.stem.rpartition("-")[2], f"{job.name}.decoded.ply"
-    return await _stored(file, sha256=sha256, media_type=BINARY, download=download, headers=_PRIVATE)
+    return await _stored(file, sha256=sha256, media_type=BINARY, download=download)
 
 
 @_route("/source", "Download the upload", BINARY)
@@ -195,10 +188,10 @@ async def get_source(context: Service, job: RequestedJob) -> Response:
     """The uploaded scene, for comparisons, unless it was removed to free disk space."""
     _result(job)
     file = await run_sync(context.storage.upload, job.id)
-    if not job.upload_kept:
+    if file is None or not job.upload_kept:
         raise ProblemError("gone", "the upload was removed to free disk space; the result is still available")
     download = f"{job.name}{file.suffix}"
-    return await _stored(file, sha256=job.upload_sha256, media_type=BINARY, download=download, headers=_PRIVATE)
+    return await _stored(file, sha256=job.upload_sha256, media_type=BINARY, download=download)
 
 
 @_route("/report", "Download the report", "application/json")
@@ -206,7 +199,7 @@ async def get_report(context: Service, job: RequestedJob) -> Response:
     """The report of the compression, as from the library."""
     sha256 = _result(job)["report"]["sha256"]
     file = context.storage.result(job.id) / "report.json"
-    return await _stored(file, sha256=sha256, media_type="application/json", headers=_PRIVATE)
+    return await _stored(file, sha256=sha256, media_type="application/json")
 
 
 async def _stored(path: Path, **values: Any) -> StoredFile:  # noqa: ANN401
