@@ -56,7 +56,12 @@ class Remote:
             import httpx
         except ModuleNotFoundError as error:
             raise UnsupportedError("a kissgs service needs httpx, which is missing: pip install httpx") from error
-        if not _is_address(server):
+        try:
+            parts = urlsplit(server)
+            named = bool(parts.hostname) and parts.port != 0
+        except ValueError:
+            named = False
+        if not named or parts.scheme not in ("http", "https") or parts.path not in ("", "/"):
             raise UnsupportedError(
                 f"{server!r} is not the address of a service; write it as http://localhost:8000, without a path"
             )
@@ -152,33 +157,21 @@ class Remote:
         force_views: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
-        """Upload a scene; retry if the connection breaks or the service is overloaded, without a second job.
-
-        Args:
-            source: the scene: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.ksplat`` or ``.glb``.
-            settings: None for the preset ``balanced``.
-            container: ``"sogxt"`` or ``"sog"``.
-            evaluate: whether the service also compares rendered images.
-            origin: see :class:`kissgs.ReadOptions`.
-            capture: see :meth:`compress`.
-            force_views: see :meth:`compress`.
-            progress: receives "upload" and "wait for server".
-
-        Returns:
-            The status of the job.
-
-        Raises:
-            KissgsError: see :meth:`compress`.
-        """
+        """Upload a scene, and return the status of its job; retry if the connection breaks or the service is
+        overloaded, without a second job. Arguments and errors are those of :meth:`compress`."""
         path, key, progress = Path(source), uuid.uuid4().hex, Share(progress)
-        options = {**_given(settings or Settings()), "format": container, "evaluate": evaluate}
-        options |= {} if origin is None else {"origin": origin}
-        options |= {} if capture is None else {"capture": f"sha256:{_sha256(Path(capture))}"}
-        options |= {"force_views": True} if force_views else {}  # which services of older versions do not know
+        options = {**_given(settings or Settings()), "format": container, "evaluate": evaluate, "origin": origin}
+        options |= {"capture": None, "force_views": force_views}
+        if capture is not None:
+            with open_scene_file(Path(capture), "; name an archive", InvalidViewsError) as opened:
+                options["capture"] = f"sha256:{hashlib.file_digest(opened.file, 'sha256').hexdigest()}"
         params = {"options": json.dumps(options), "name": path.name}
 
         def send(kind: str, parts: Sequence[bytes | Path]) -> dict[str, Any]:
-            size = sum(map(_size, parts))
+            size = 0
+            for part in parts:
+                with open_scene_file(part) as opened:
+                    size += opened.size
             headers = {"Content-Type": kind, "Content-Length": str(size), "Idempotency-Key": key}
             body = _blocks(parts, size, progress)
             timeout = (10.0, ANSWER_SECONDS, 60.0, 60.0)
@@ -197,10 +190,7 @@ class Remote:
             raise _with_file_name(error, path) from error
 
     def follow(self, job: str, progress: Progress = silent) -> dict[str, Any]:
-        """Wait until a job has ended, and pass its progress on.
-
-        Returns:
-            The status of the job, which has succeeded.
+        """Wait until a job has succeeded, pass its progress on, and return its status.
 
         Raises:
             KissgsError: the job failed or was cancelled.
@@ -232,12 +222,7 @@ class Remote:
     def download(
         self, status: dict[str, Any], destination: Path, *, overwrite: bool = False, progress: Progress = silent
     ) -> None:
-        """Write the container of a job that has succeeded, and verify its checksum.
-
-        Raises:
-            KissgsError: see :meth:`compress`.
-        """
-
+        """Write the container of a job that has succeeded, and verify its checksum; for errors see :meth:`compress`."""
         progress = Share(progress)
 
         def fetch() -> None:
@@ -330,16 +315,6 @@ class Share:
         self._receive(stage, self._latest, note, seconds_left)
 
 
-def _is_address(server: str) -> bool:
-    try:
-        parts = urlsplit(server)
-        return (
-            parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0 and parts.path in ("", "/")
-        )
-    except ValueError:
-        return False
-
-
 def _given(settings: Settings) -> dict[str, Any]:
     """Return the settings as JSON without what belongs to the preset, which the server's version decides."""
     values = settings.model_dump(mode="json", exclude_unset=True)
@@ -349,14 +324,6 @@ def _given(settings: Settings) -> dict[str, Any]:
     return values
 
 
-def _sha256(capture: Path) -> str:
-    with open_scene_file(capture, "; name an archive", InvalidViewsError) as opened:
-        digest = hashlib.sha256()
-        while block := opened.file.read(BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
-
-
 def _form(boundary: str, **files: Path) -> list[bytes | Path]:
     """Return the parts of a form with these files, in order."""
     parts: list[bytes | Path] = []
@@ -364,11 +331,6 @@ def _form(boundary: str, **files: Path) -> list[bytes | Path]:
         head = f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n'
         parts += [head.encode(), path, b"\r\n"]
     return [*parts, f"--{boundary}--\r\n".encode()]
-
-
-def _size(part: bytes | Path) -> int:
-    with open_scene_file(part) as opened:
-        return opened.size
 
 
 def _blocks(parts: Sequence[bytes | Path], size: int, progress: Progress) -> Iterator[bytes]:
@@ -422,10 +384,9 @@ def _checked(response: httpx.Response) -> httpx.Response:
 
 def _error(code: str, detail: str) -> KissgsError:
     """Return the error of a problem of the scene or the settings that the library itself would raise, or another."""
-    kinds: dict[str, type[KissgsError]] = {
-        kind.code: kind for kind in (InvalidSceneError, InvalidViewsError, UnsupportedError)
-    }
-    error = kinds.get(code, RemoteError)(detail)
-    if isinstance(error, RemoteError):
-        error.problem = code
+    for kind in (InvalidSceneError, InvalidViewsError, UnsupportedError):
+        if kind.code == code:
+            return kind(detail)
+    error = RemoteError(detail)
+    error.problem = code
     return error

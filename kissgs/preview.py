@@ -25,12 +25,11 @@ from kissgs._version import __version__
 from kissgs.core.context import Context, JobProgress, Progress, silent
 from kissgs.core.errors import InvalidSceneError, KissgsError, UnsupportedError
 from kissgs.core.positions import WORLD
-from kissgs.formats import CONTAINERS, FORMATS, ending_of
-from kissgs.io.containers import META_NAME, Source, open_source, zip_bytes
+from kissgs.formats import CONTAINERS, ending_of
+from kissgs.io.containers import META_NAME, open_source, zip_bytes
 from kissgs.io.files import reason_of
 from kissgs.io.ply import write_ply
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.io.streamed import StreamedFormat
 from kissgs.pipeline.pipeline import compress
 from kissgs.pipeline.scene_files import open_scene, recognise, scene_root
 from kissgs.sog import decode as sog
@@ -51,24 +50,24 @@ class StreamedFolder:
     unusable: tuple[str, ...]  # no files, or links that lead out of the folder or nowhere
 
 
-def is_streamed(source: Path | bytes) -> bool:
-    """Whether a scene is a streamed one, in a folder or a zip."""
-    return FORMATS[recognise(source)].manifest is not None
+STREAMED = {"streamed-sog": sog.STREAMED, "streamed-sogxt": sogxt.STREAMED}
 
 
-def is_streamed_folder(source: Path) -> bool:
-    """Whether a path is the folder of a streamed scene, or its manifest, and no zip."""
-    return scene_root(source).is_dir() and is_streamed(source)
-
-
-def streamed_folder(source: Path) -> StreamedFolder:
-    """Return the files of a streamed scene; the page names those that cannot be reached, and shows the rest."""
-    folder, kind = scene_root(source), _format(source)
+def streamed_folder(source: Path) -> StreamedFolder | None:
+    """Return the files of a streamed scene, given its folder or its manifest; None for other scenes, and for a zip. The
+    page names those that cannot be reached, and shows the rest."""
+    folder = scene_root(source)
+    kind = STREAMED.get(recognise(source)) if folder.is_dir() else None
+    if kind is None:
+        return None
     with kind.open(folder) as opened:
-        tree = kind.read_manifest(opened)
-        names = [kind.manifest]
+        tree, names = kind.read_manifest(opened), [kind.manifest]
         for name in (*tree.filenames, *([tree.environment] if tree.environment else [])):
-            names += _container_files(opened, name)
+            names.append(name)
+            parent, _, last = name.rpartition("/")
+            if last == META_NAME:  # a container in a folder
+                with contextlib.suppress(KissgsError):
+                    names += [f"{parent}/{image}" if parent else image for image in read_layout(opened, name).images]
     root = folder.resolve()
     inside = dict[str, Path]()
     for name in names:
@@ -82,25 +81,12 @@ def streamed_folder(source: Path) -> StreamedFolder:
     return StreamedFolder(_stem(root), kind.manifest, inside, missing, unusable)
 
 
-def _format(source: Path | bytes) -> StreamedFormat:
-    return sog.STREAMED if recognise(source) == "streamed-sog" else sogxt.STREAMED
-
-
-def _container_files(files: Source, name: str) -> list[str]:
-    """Return the files of one container: a folder's metadata and images, or the container itself."""
-    parent, _, last = name.rpartition("/")
-    if last != META_NAME:
-        return [name]
-    try:
-        layout = read_layout(files, name)
-    except KissgsError:
-        return [name]
-    return [name, *(f"{parent}/{image}" if parent else image for image in layout.images)]
-
-
-def fitting_level(source: Path | bytes, max_gaussians: int | None = None) -> tuple[int, int]:
-    """Return the finest level that fits into a page of one file, or else the coarsest, and the number of levels."""
-    kind = _format(source)
+def fitting_level(source: Path | bytes, max_gaussians: int | None = None) -> tuple[int, int] | None:
+    """Return the finest level of a streamed scene that fits into a page of one file, or else the coarsest, and the
+    number of levels; None for other scenes."""
+    kind = STREAMED.get(recognise(source))
+    if kind is None:
+        return None
     with kind.open(scene_root(source) if isinstance(source, Path) else source) as files:
         tree = kind.read_manifest(files)
         environment = 0 if tree.environment is None else kind.opened(files, tree.environment).count
@@ -386,13 +372,17 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = SLOWEST_SECONDS
 
     def do_GET(self) -> None:
-        self._answer(body=True)
-
-    def do_HEAD(self) -> None:
-        self._answer(body=False)
-
-    def _answer(self, *, body: bool) -> None:
-        status, content, media_type = self._find(unquote(urlsplit(self.path).path))
+        path, status, content, suffix = unquote(urlsplit(self.path).path), HTTPStatus.OK, b"", ""
+        if self.headers.get("Host") not in self.server.hosts:
+            status, content = HTTPStatus.FORBIDDEN, b"this server answers requests to this machine only\n"
+        else:
+            try:
+                found = self.server.contents[path]
+                content = found if isinstance(found, bytes) else found.read_bytes()
+                suffix = ".html" if path == "/" else Path(path).suffix
+            except (KeyError, OSError):  # a file of a streamed scene may have been removed meanwhile
+                status, content = HTTPStatus.NOT_FOUND, b"there is no such file\n"
+        media_type = _TYPES.get(suffix, "application/octet-stream")
         self.send_response(status)
         for name, value in _HEADERS.items():
             self.send_header(name, value)
@@ -401,20 +391,10 @@ class _Handler(BaseHTTPRequestHandler):
         if media_type == _TYPES[".html"]:
             self.send_header("Content-Security-Policy", self.server.policy)
         self.end_headers()
-        if body:
+        if self.command != "HEAD":
             self.wfile.write(content)
 
-    def _find(self, path: str) -> tuple[HTTPStatus, bytes, str]:
-        """Return the status, the content and its media type."""
-        if self.headers.get("Host") not in self.server.hosts:
-            return HTTPStatus.FORBIDDEN, b"this server answers requests to this machine only\n", _TYPES[""]
-        try:
-            found = self.server.contents[path]
-            content = found if isinstance(found, bytes) else found.read_bytes()
-        except (KeyError, OSError):  # a file of a streamed scene may have been removed meanwhile
-            return HTTPStatus.NOT_FOUND, b"there is no such file\n", _TYPES[""]
-        suffix = ".html" if path == "/" else Path(path).suffix
-        return HTTPStatus.OK, content, _TYPES.get(suffix, "application/octet-stream")
+    do_HEAD = do_GET
 
     def version_string(self) -> str:
         """Return the header ``Server``."""

@@ -47,8 +47,6 @@ class Surface:
     luminous: bool = False  # shows its paint without lighting
 
 
-# --- Shapes ---------------------------------------------------------------------------------------
-
 GROUND_RADIUS = 6.5
 BALL_CENTRE, BALL_RADIUS = f32([-1.35, -0.8, -0.5]), 0.8
 KNOT_CENTRE, KNOT_RADII = f32([0.1, -1.36, 0.9]), (0.8, 0.34, 0.2)
@@ -107,9 +105,6 @@ def block(uv: UV) -> Patch:
     a, b = 2 * (5 * uv[:, 0] - pick.astype(np.float32)) - 1, 2 * uv[:, 1] - 1
     local = normals + a[:, None] * np.roll(normals, 1, axis=1) + b[:, None] * np.roll(normals, 2, axis=1)
     return BLOCK_CENTRE + BLOCK_HALF * local @ BLOCK_AXES, normals @ BLOCK_AXES, np.full_like(a, 20 * BLOCK_HALF**2)
-
-
-# --- Paint ----------------------------------------------------------------------------------------
 
 
 def _noise(points: Rows, frequency: float) -> Column:
@@ -229,15 +224,18 @@ def _parts(count: int, sh_degree: int, rng: np.random.Generator) -> Iterator[Spl
     yield _floaters(count - int(ends[-1]), sh_degree, rng)
 
 
-# --- Geometry of the Gaussians --------------------------------------------------------------------------
-
-
 def _cover(
     surface: Surface, n: int, shadows: list[Float32[np.ndarray, "S S"]], sh_degree: int, rng: np.random.Generator
 ) -> Splats:
     points, normals, spacing = _scatter(surface, n, rng)
-    opacities = _opacities(n, rng)
-    gradient = _brightness_gradient(surface, points, spacing)
+    # Logits: 66 % nearly opaque, 30 % translucent and 4 % nearly transparent, as training leaves them.
+    kind = rng.choice(3, n, p=(0.66, 0.30, 0.04))
+    logits = rng.normal(np.array([3.2, -0.6, -5.0])[kind], np.array([1.8, 1.3, 0.7])[kind])
+    opacities = np.clip(logits, OPACITY_LOGIT_MIN, OPACITY_LOGIT_MAX).astype(np.float32)
+    # The gradient of the paint's brightness, from one-sided differences over a third of the spacing.
+    here, step = surface.paint(points).mean(axis=1), spacing / 3
+    there = [surface.paint(points + step[:, None] * axis).mean(axis=1) for axis in np.eye(3, dtype=np.float32)]
+    gradient: Rows = (np.stack(there, axis=1) - here[:, None]) / step[:, None]
     edge = np.minimum(2 * spacing * np.linalg.norm(gradient, axis=1), 1)
     along = np.cross(normals, gradient) + 1e-3 * rng.standard_normal((n, 3), np.float32)
     # Training stretches Gaussians along the edges of the texture, and leaves translucent ones larger.
@@ -261,7 +259,12 @@ def _scatter(surface: Surface, n: int, rng: np.random.Generator) -> tuple[Rows, 
     """Return ``n`` points of the surface, their normals, and the expected distance between neighbours. A grid of n to
     4n cells covers the surface. Along a Z-order curve through it, each n-th part of the integral of the density gets
     one Gaussian. Independent draws would leave holes, which a trained scene does not have."""
-    corners, side = _z_order(n)
+    bits = ((n - 1).bit_length() + 1) // 2
+    side, index = 2**bits, np.arange(4**bits)
+    corners = np.zeros((4**bits, 2), np.float32)
+    for bit in range(bits):
+        corners[:, 0] += ((index >> (2 * bit)) & 1) << bit
+        corners[:, 1] += ((index >> (2 * bit + 1)) & 1) << bit
     points, _, area = surface.shape((corners + 0.5) / np.float32(side))
     distance2 = (points**2).sum(axis=1)
     step = 0.02 * np.sqrt(distance2)[:, None] * rng.standard_normal(points.shape, np.float32)
@@ -274,33 +277,6 @@ def _scatter(surface: Surface, n: int, rng: np.random.Generator) -> tuple[Rows, 
     points, normals, _ = surface.shape((corners[cells] + rng.random((n, 2), np.float32)) / np.float32(side))
     spacing = np.sqrt(filled[-1] / (n * side**2 * density[cells]))
     return points, normals, spacing.astype(np.float32)
-
-
-def _z_order(n: int) -> tuple[Float32[np.ndarray, "C 2"], int]:
-    """Return the cells of a square grid of at least ``n`` cells along the Z-order curve, and the grid's side."""
-    bits = ((n - 1).bit_length() + 1) // 2
-    index = np.arange(4**bits)
-    corners = np.zeros((4**bits, 2), np.float32)
-    for bit in range(bits):
-        corners[:, 0] += ((index >> (2 * bit)) & 1) << bit
-        corners[:, 1] += ((index >> (2 * bit + 1)) & 1) << bit
-    return corners, 2**bits
-
-
-def _brightness_gradient(surface: Surface, points: Rows, spacing: Column) -> Rows:
-    """Return the paint's brightness gradient per world unit, from one-sided differences over a third of the spacing."""
-    here = surface.paint(points).mean(axis=1)
-    step = spacing / 3
-    there = [surface.paint(points + step[:, None] * axis).mean(axis=1) for axis in np.eye(3, dtype=np.float32)]
-    gradient: Rows = (np.stack(there, axis=1) - here[:, None]) / step[:, None]
-    return gradient
-
-
-def _opacities(n: int, rng: np.random.Generator) -> Column:
-    """Return logits: 66 % nearly opaque, 30 % translucent and 4 % nearly transparent, as training leaves them."""
-    kind = rng.choice(3, n, p=(0.66, 0.30, 0.04))
-    logits = rng.normal(np.array([3.2, -0.6, -5.0])[kind], np.array([1.8, 1.3, 0.7])[kind])
-    return np.clip(logits, OPACITY_LOGIT_MIN, OPACITY_LOGIT_MAX).astype(np.float32)
 
 
 def _orient(
@@ -351,9 +327,6 @@ def _floaters(n: int, sh_degree: int, rng: np.random.Generator) -> Splats:
     )
 
 
-# --- Appearance of the Gaussians --------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Light:
     direction: Float32[np.ndarray, "3"]  # unit vector towards the light
@@ -379,9 +352,11 @@ def _appearance(
         return albedo, sh
     band = np.sqrt(np.arange(sh.shape[1])).astype(int)
     received = np.full_like(albedo, AMBIENT)
+    cells = ((points[:, [0, 2]] / np.float32(SHADOW_EXTENT) + 1) * (SHADOW_CELLS / 2)).astype(int)
+    column, row = np.clip(cells, 0, SHADOW_CELLS - 1).T
     for light, shadow in zip(LIGHTS, shadows, strict=True):
         facing = normals @ light.direction
-        reach = _look_up(shadow, points) if surface.shadowed else np.ones_like(facing)
+        reach = shadow[column, row] if surface.shadowed else np.ones_like(facing)
         diffuse = np.maximum((facing + light.wrap) / (1 + light.wrap), 0)
         received += (reach * diffuse)[:, None] * light.colour
         # A camera looking along d sees the reflected light if d is close to ``mirrored``: a round lobe, whose SH
@@ -402,12 +377,6 @@ def _shadow_map(light: Float32[np.ndarray, "3"], rng: np.random.Generator) -> Fl
     for axis in (0, 1):  # a penumbra
         reach = np.mean([np.roll(reach, shift, axis) for shift in range(-3, 4)], axis=0)
     return f32(reach)
-
-
-def _look_up(shadow: Float32[np.ndarray, "S S"], points: Rows) -> Column:
-    cells = ((points[:, [0, 2]] / np.float32(SHADOW_EXTENT) + 1) * (SHADOW_CELLS / 2)).astype(int)
-    column, row = np.clip(cells, 0, SHADOW_CELLS - 1).T
-    return np.asarray(shadow[column, row])
 
 
 def _sh_noise(n: int, sh_degree: int, rng: np.random.Generator) -> Float32[np.ndarray, "M K 3"]:

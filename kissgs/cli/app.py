@@ -18,10 +18,10 @@ from kissgs.cli.compress import compact, compress
 from kissgs.cli.convert import convert, decompress, info, sample, settings
 from kissgs.cli.evaluate import evaluate
 from kissgs.cli.files import discard_stdout, write_stdout
+from kissgs.cli.interrupts import unwinding
 from kissgs.cli.options import SCENE_OPTIONS, SEE_SCENE_OPTIONS, with_default_values
 from kissgs.cli.remote import app as remote
 from kissgs.cli.render import render, view
-from kissgs.cli.signals import unwinding
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 
 app = typer.Typer(

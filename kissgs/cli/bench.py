@@ -47,9 +47,13 @@ def warmup() -> None:
     """Compile and cache all kernels, and measure the speed of this machine, by which --time chooses what to do."""
     from kissgs.compaction import merging  # noqa: F401
     from kissgs.core import numba_kernels
+    from kissgs.pipeline.limited_time import save_speed
+    from kissgs.pipeline.pipeline import compress
     from kissgs.planning import kernels, kmeans_kernels  # noqa: F401
     from kissgs.rendering import ssim_kernels  # noqa: F401
     from kissgs.rendering.cpu import frame, neighbours  # noqa: F401
+    from kissgs.settings import Preset, Settings
+    from kissgs.synthetic import sample_scene
 
     if has_torch():  # without it nothing is trained
         from kissgs.finetuning import planes  # noqa: F401
@@ -59,24 +63,14 @@ def warmup() -> None:
         for number, kernel in enumerate(numba_kernels.kernels):
             progress("kernels", number / len(numba_kernels.kernels))
             kernel.load()
+        scene, settings = sample_scene(SAMPLE_COUNT), Settings(preset=Preset.BALANCED)
+        compress(scene, settings=settings)  # loads what is needed
+        started = time.perf_counter()
+        compress(scene, settings=settings)
         try:
-            _measure_speed()
+            save_speed(time.perf_counter() - started, settings.preset, SAMPLE_COUNT)
         except OutputError as error:
             sys.stderr.write(f"kissgs: the speed of this machine is not saved, --time assumes the usual one: {error}\n")
-
-
-def _measure_speed() -> None:
-    """Encode a synthetic scene twice, the first time to load what is needed, and save the time of the second."""
-    from kissgs.pipeline.limited_time import save_speed
-    from kissgs.pipeline.pipeline import compress
-    from kissgs.settings import Preset, Settings
-    from kissgs.synthetic import sample_scene
-
-    scene, settings = sample_scene(SAMPLE_COUNT), Settings(preset=Preset.BALANCED)
-    compress(scene, settings=settings)
-    started = time.perf_counter()
-    compress(scene, settings=settings)
-    save_speed(time.perf_counter() - started, settings.preset, SAMPLE_COUNT)
 
 
 # ``kissgs bench``: bytes, seconds and quality of a scene with each preset and in limited times.

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
-from kissgs.cli.files import CHECKPOINT, Result, Work, for_each_input, progress_bar, say_notes, sibling, source, stdout
+from kissgs.cli import files
+from kissgs.cli.files import CHECKPOINT, Result, Work, for_each_input, progress_bar, say_notes, sibling, source
 from kissgs.cli.options import (
     EncodingOptions,
     ForceOption,
@@ -94,7 +95,6 @@ def compact(
 
     The preset fast merges; balanced and paper prune and train.
     """
-    from kissgs.cli.signals import stoppable
     from kissgs.cli.tables import compaction_table
     from kissgs.io.ply import write_ply
     from kissgs.pipeline.pipeline import compact as run
@@ -109,7 +109,7 @@ def compact(
     def work(scene: str, target: Path) -> Result:
         piped = str(target) == "-"
         capture = open_views(training.views, scene)
-        with progress_bar(quiet) as bar, stoppable(bar, settings.searches) as progress:
+        with progress_bar(quiet) as bar, files.stoppable(bar, settings.searches) as progress:
             result = run(
                 source(scene),
                 None if piped else target,
@@ -126,10 +126,10 @@ def compact(
             )
         if piped:
             say_notes(scene, (result.report.note, *result.report.cleaned.notes), quiet)
-            with stdout():
-                write_ply(sys.stdout.buffer, result.splats)
+            with files.stdout() as file:
+                write_ply(file, result.splats)
             delete_checkpoints(result.checkpoint)
-        return Result(result.report.as_dict(), compaction_table(result.report, str(target)))
+        return result.report.as_dict(), compaction_table(result.report, str(target))
 
     for_each_input(scenes, output, ".ply", work, as_json=as_json, quiet=quiet)
 

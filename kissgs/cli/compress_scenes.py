@@ -12,20 +12,22 @@ import socket
 import sys
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 from rich.text import Text
 
-from kissgs.cli.files import CHECKPOINT, Result, output, progress_bar, say_notes, sibling, source, write_stdout
+from kissgs.cameras.views import Views
+from kissgs.cli import files
+from kissgs.cli.files import CHECKPOINT, Result, progress_bar, say_notes, sibling, source, stoppable, write_stdout
 from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
 from kissgs.cli.options import open_views
-from kissgs.cli.signals import stoppable
 from kissgs.cli.tables import report_table, streamed_table
-from kissgs.core.context import Progress, silent, with_seconds_left
+from kissgs.core.context import Progress, silent
 from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 from kissgs.formats import ContainerName
 from kissgs.io.containers import check_destination
@@ -35,12 +37,10 @@ from kissgs.pipeline.encoding import FILES
 from kissgs.pipeline.limited_time import resolved
 from kissgs.pipeline.pipeline import Compressed, compress
 from kissgs.pipeline.scene_files import scene_root
-from kissgs.runners import INTERNAL, Outcome, RayRunner, Resources, RunHandle, Runner, WorkItem, error_of
+from kissgs.runners import INTERNAL, PROCESS_BYTES, Outcome, Resources, Runner, WorkItem, error_of
+from kissgs.runners.ray_runner import RayRunner
 from kissgs.settings import Settings
 from kissgs.training.checkpoint import delete_checkpoints
-
-if TYPE_CHECKING:
-    from kissgs.cameras.views import Views
 
 
 class SceneCompression(BaseModel):
@@ -94,7 +94,7 @@ def compress_here(options: SceneCompression, scene: str, target: Path) -> Result
         say_notes(scene, (made.report.note, *made.report.cleaned.notes), options.quiet)
         write_stdout(made.to_zip())
         delete_checkpoints(*made.checkpoints)
-    return Result(made.report.as_dict(), report_table(made.report, str(target)))
+    return made.report.as_dict(), report_table(made.report, str(target))
 
 
 # ``kissgs compress -o FOLDER/lod-meta.json`` of one scene, into levels of detail.
@@ -113,11 +113,10 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
     if scene == "-":
         raise UnsupportedError("levels of detail need a file: it is read more than once")
     with progress_bar(options.quiet) as bar, contextlib.ExitStack() as ending:
-        from kissgs.streaming.layout import continuation, work_folder
+        from kissgs.streaming.work_folder import continuation, work_folder
 
         work = work_folder(target)
         say_when_interrupted(lambda: continuation(work) if work.exists() else NOTHING_LEFT)
-        forward = with_seconds_left(bar)
         bar("kernels", 0.0)
         from kissgs.streaming.compress import compress_streamed as run
 
@@ -127,11 +126,6 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
             runner = RayRunner(ray)
             ending.callback(runner.close)
 
-        def progress(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
-            if stage == "scratch" and not options.quiet:
-                sys.stderr.write(f"kissgs: {note}\n")
-            forward(stage, fraction, note, seconds_left)
-
         report = run(
             scene,
             target,
@@ -140,14 +134,12 @@ def compress_streamed(options: SceneCompression, ray: str | None, scene: str, ta
             overwrite=options.force,
             runner=runner,
             threads=options.threads,
-            progress=progress,
+            progress=files.announcing(bar, "scratch", options.quiet),
         )
-    return Result(asdict(report), streamed_table(report, str(target)))
+    return asdict(report), streamed_table(report, str(target))
 
 
 # ``kissgs compress --ray``: scenes as work items on the nodes of a Ray cluster.
-
-PROCESS_BYTES = 500_000_000  # memory that a scene of any size needs, bytes: mostly the libraries
 
 MEMORY_RATIO, TRAINING_RATIO, PACKED_RATIO = 4, 12, 10
 """Memory that a scene needs for each byte of its ``.ply``: without and with training; and by how much the files of
@@ -192,7 +184,7 @@ class ClusterCompression:
 
     address: str
     options: SceneCompression
-    _handles: dict[Path, RunHandle | KissgsError] = field(default_factory=dict)
+    _outcomes: dict[Path, Future[Outcome]] = field(default_factory=dict)
     _work: dict[Path, Path] = field(default_factory=dict)
     _bar: Progress = silent
 
@@ -208,9 +200,12 @@ class ClusterCompression:
             requested = self._request(runner, len(inputs))
             for name, target in inputs:
                 try:
-                    self._handles[target] = self._submit(runner, name, target, requested)
+                    self._outcomes[target] = self._submit(runner, name, target, requested)
                 except (KissgsError, OSError) as error:  # the command itself reports inputs that cannot be read
-                    self._handles[target] = error if isinstance(error, KissgsError) else OutputError(str(error))
+                    self._outcomes[target] = Future()
+                    self._outcomes[target].set_exception(
+                        error if isinstance(error, KissgsError) else OutputError(str(error))
+                    )
             yield
         finally:
             try:
@@ -221,17 +216,14 @@ class ClusterCompression:
 
     def result(self, name: str, target: Path) -> Result:
         """Wait for the result of one scene, and move it to its place."""
-        handle = self._handles[target]
-        if isinstance(handle, KissgsError):
-            raise handle
         with progress_bar(self.options.quiet) as self._bar:
-            outcome = handle.outcome.result()
+            outcome = self._outcomes[target].result()
         self._bar = silent
         if outcome.kind != "done":
             raise self._error(outcome, target)
         check_destination(target, overwrite=self.options.force, names=FILES)
         move_into_place(Path(outcome.result["written"]), target)
-        return Result(outcome.result["report"], Text.from_ansi(outcome.result["table"].removesuffix("\n")))
+        return outcome.result["report"], Text.from_ansi(outcome.result["table"].removesuffix("\n"))
 
     def _request(self, runner: Runner, count: int) -> Resources:
         """Return the processors and GPUs of each of ``count`` scenes, which share all without ``--threads``."""
@@ -242,7 +234,7 @@ class ClusterCompression:
             raise UnsupportedError(f"{refusal}; choose another number with --threads, or --device cpu")
         return requested
 
-    def _submit(self, runner: Runner, name: str, target: Path, requested: Resources) -> RunHandle:
+    def _submit(self, runner: Runner, name: str, target: Path, requested: Resources) -> Future[Outcome]:
         options = self.options
         check_destination(target, overwrite=options.force, names=FILES)
         scene = Path(name).absolute()
@@ -257,7 +249,7 @@ class ClusterCompression:
         file = scene_root(scene)
         size = file.stat().st_size if file.is_file() else 0
         resources = with_memory(runner, requested, self._memory(file, size))
-        console = output()
+        console = files.output()
         arguments = {
             "scene": str(scene),
             "bytes": size,
@@ -269,9 +261,9 @@ class ClusterCompression:
         }
 
         def progress(stage: str, fraction: float, note: str = "") -> None:
-            ended = sum(isinstance(each, KissgsError) or each.outcome.done() for each in list(self._handles.values()))
-            details = f"{ended} of {len(self._handles)} scenes; {Path(name).name}: {stage}{note and f'; {note}'}"
-            self._bar("scenes", ended / max(len(self._handles), 1), details)
+            ended = sum(each.done() for each in list(self._outcomes.values()))
+            details = f"{ended} of {len(self._outcomes)} scenes; {Path(name).name}: {stage}{note and f'; {note}'}"
+            self._bar("scenes", ended / max(len(self._outcomes), 1), details)
 
         return runner.submit(WorkItem("kissgs.cli.compress_scenes:compress_scene", arguments, resources), progress)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -33,9 +32,9 @@ def info(files: FilesArgument, as_json: JsonOption = False, *, common: SceneOpti
 
     def work(file: str, target: Path) -> Result:
         found = describe(Path(file), common.reading())
-        return Result(found.as_dict(), info_table(found))
+        return found.as_dict(), info_table(found)
 
-    for_each_input(files, Path("-"), "", work, as_json=as_json, quiet=False, writes=False)
+    for_each_input(files, None, "", work, as_json=as_json, quiet=False, writes=False)
 
 
 def settings() -> None:
@@ -83,12 +82,12 @@ def decompress(
         if piped:
             from kissgs.io.ply import write_ply
 
-            with stdout():
-                write_ply(sys.stdout.buffer, splats)
-            return Result({}, "")
+            with stdout() as file:
+                write_ply(file, splats)
+            return {}, ""
         report = {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": target.stat().st_size}
         line = f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}"
-        return Result({**report, "notes": list(splats.notes)}, line)
+        return {**report, "notes": list(splats.notes)}, line
 
     for_each_input(containers, output, ".ply", work, as_json=as_json, quiet=quiet, unreadable=InvalidContainerError)
 
@@ -135,15 +134,14 @@ def convert(
             splats, cleaned = clean(read_scene(source(scene), reading, threads=common.threads, progress=progress))
             splats = splats if origin else in_world(splats)
             with stdout() if piped else atomic_file(target, overwrite=force) as file:
-                stream = sys.stdout.buffer if file is None else file
-                losses = write_scene(stream, splats, kind, raw_axes=common.raw_axes, progress=progress)
+                losses = write_scene(file, splats, kind, raw_axes=common.raw_axes, progress=progress)
         notes = [*splats.notes, *cleaned.notes, *losses]
         say_notes(str(target), notes, quiet)
         if piped:
-            return Result({}, "")
+            return {}, ""
         degree, size = 0 if kind == "splat" else splats.sh_degree, target.stat().st_size
         report = {"format": kind, "count": len(splats), "sh_degree": degree, "bytes": size, "notes": notes}
-        return Result(report, f"{target}  {gaussians(len(splats))}, {size:,} bytes")
+        return report, f"{target}  {gaussians(len(splats))}, {size:,} bytes"
 
     for_each_input(inputs, output, f".{kind}", work, as_json=as_json, quiet=quiet)
 

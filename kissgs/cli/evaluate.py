@@ -81,8 +81,14 @@ def evaluate(
             page = html_report(result, sides[0], sides[1], Context(threads, capture.device, progress))
             with atomic_file(html, overwrite=force) as file:
                 file.write(page.encode(errors="replace"))  # file names may be invalid UTF-8
-    if not common.quiet:
-        _warn_of_differences(sides)
+    for side in sides:
+        say_notes(side.name, side.splats.notes, common.quiet)
+    if sides[0].splats.antialiased != sides[1].splats.antialiased and not common.quiet:
+        marked, other = sides if sides[0].splats.antialiased else sides[::-1]
+        sys.stderr.write(
+            f"kissgs: {marked.name} is marked as trained with antialiasing, and {other.name} is not; each is drawn so "
+            "(for both: --antialiased or --classic)\n"
+        )
     sizes = {"reference": sides[0].bytes, "candidate": sides[1].bytes}
     if as_json:
         print_json({**result.as_dict(), "bytes": sizes})
@@ -106,14 +112,3 @@ def _sides_of(paths: Sequence[Path], common: SceneOptions, progress: Progress) -
         splats = load(path, threads=common.threads, progress=progress, **reading)
         sides.append(ReportScene(name=path.name, splats=splats, bytes=stored_bytes(path)))
     return sides
-
-
-def _warn_of_differences(sides: list[ReportScene]) -> None:
-    for side in sides:
-        say_notes(side.name, side.splats.notes, quiet=False)
-    if sides[0].splats.antialiased != sides[1].splats.antialiased:
-        marked, other = sides if sides[0].splats.antialiased else sides[::-1]
-        sys.stderr.write(
-            f"kissgs: {marked.name} is marked as trained with antialiasing, and {other.name} is not; each is drawn so "
-            "(for both: --antialiased or --classic)\n"
-        )

@@ -11,24 +11,21 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import FrameType
+from typing import Any, BinaryIO
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
-from kissgs.core.context import JobProgress, Step, silent
+from kissgs.cli.interrupts import NOTHING_LEFT, Interrupted, say_when_interrupted
+from kissgs.core.context import JobProgress, Step, silent, with_seconds_left
 from kissgs.core.context import Progress as Receiver
-from kissgs.core.errors import InvalidSceneError, KissgsError, OutputError, UnsupportedError
+from kissgs.core.errors import InvalidSceneError, KissgsError, OutputError, StopSearch, UnsupportedError
 from kissgs.formats import DOUBLE_ENDINGS, ENDINGS, FOLDER_ENDING, SCENE_ENDINGS, named_manifest, names_folder
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
-
 
 # Terminal output: the console for tables, and the progress bar.
 
@@ -85,10 +82,10 @@ class _TimeColumn(ProgressColumn):
 def progress_bar(quiet: bool, steps: Sequence[Step] = ()) -> Iterator[Receiver]:
     """Yield a receiver of progress events that draws a bar on standard error, if that is a terminal. With ``steps``, it
     gets the fractions of stages, see :class:`kissgs.core.context.JobProgress`; else those of the whole command."""
-    console = Console(stderr=True)
     if quiet:
         yield silent
         return
+    console = Console(stderr=True)
     columns = (BarColumn(), TextColumn("{task.percentage:>3.0f} %"), _TimeColumn(), TextColumn("{task.description}"))
     with (
         Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
@@ -116,27 +113,66 @@ def progress_bar(quiet: bool, steps: Sequence[Step] = ()) -> Iterator[Receiver]:
         job.stop()
 
 
+def announcing(progress: Receiver, announced: str, quiet: bool, about: str = "") -> Receiver:
+    """Return a receiver that prints the first note of a stage as a line on standard error, after ``about``."""
+    said, forward = quiet, with_seconds_left(progress)
+
+    def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
+        nonlocal said
+        if stage == announced and not said:
+            sys.stderr.write(f"kissgs: {about}{note}\n")
+            said = True
+        forward(stage, fraction, "" if stage == announced else note, seconds_left)
+
+    return receive
+
+
+STOPPING = (
+    "\nkissgs: stopping: completing the best result so far, if any, which may take minutes; Ctrl-C again aborts\n"
+)
+
+
+@contextlib.contextmanager
+def stoppable(progress: Receiver, searches: bool) -> Iterator[Receiver]:
+    """Yield a receiver with which one Ctrl-C ends a search for a goal with its best result, and a second one aborts."""
+    if not searches:
+        yield progress
+        return
+    pressed, forward, before = False, with_seconds_left(progress), signal.getsignal(signal.SIGINT)
+
+    def on_interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal pressed
+        pressed = True
+        signal.signal(signal.SIGINT, before)
+        os.write(2, STOPPING.encode())  # at once: the next progress event may take a while
+
+    def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
+        nonlocal pressed
+        if pressed:
+            pressed = False
+            raise StopSearch
+        forward(stage, fraction, note, seconds_left)
+
+    signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield receive
+    except StopSearch as error:
+        say_when_interrupted(lambda: f"nothing met the goal yet, and {NOTHING_LEFT}")
+        raise Interrupted(signal.SIGINT) from error
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 # Input and output files of the commands, and the handling of failures among several inputs.
 
-_SLASHES = tuple({"/", os.sep})
-
-
-@dataclass(frozen=True)
-class Result:
-    """The result of a command for one input: for ``--json``, and as a table or a line for the terminal."""
-
-    report: dict[str, Any]
-    shown: RenderableType
-
-
+Result = tuple[dict[str, Any], RenderableType]  # of one input: for ``--json``, and a table or a line for the terminal
 Work = Callable[[str, Path], Result]  # gets an input and the path of its output, "-" for standard output
-
 Pairs = list[tuple[str, Path]]
 
 
 def for_each_input(
     names: list[str],
-    output: str | Path | None,
+    output: str | None,
     suffix: str,
     work: Work,
     *,
@@ -151,33 +187,29 @@ def for_each_input(
     about to write into it. The context of ``during``, which gets all inputs with their outputs, encloses the work. A
     slash at the end of ``output`` names a folder."""
     from kissgs.io.checkpoint import one_per_step
+    from kissgs.io.files import reason_of
 
     inputs = one_per_step(expand(names))
     if writes and output is None:
         _refuse_output_as_input(inputs, suffix)
-    if writes and as_json and str(output) == "-":
+    if writes and as_json and output == "-":
         raise OutputError("--json and -o - both write to standard output; choose one")
-    folder = output is not None and str(output).endswith(_SLASHES)
-    output = None if output is None else Path(output)
-    targets = _targets(inputs, output, suffix, folder) if writes else [Path("-")] * len(inputs)
-
-    def entry(name: str, target: Path) -> dict[str, Any]:
-        check_input(name, unreadable)
-        result = work(name, target)
-        if not (quiet or as_json or (writes and str(target) == "-")):
-            show(result.shown)
-        return {"input": name, **({"output": str(target)} if writes else {}), **result.report}
-
-    with contextlib.ExitStack() as ending:
-        if writes and output is not None and output not in targets:
-            _make_folder(output)
-        pairs = list(zip(inputs, targets, strict=True))
-        if during is not None:
-            ending.enter_context(during(pairs))
-        reports, failed = [], False
+    targets = _targets(inputs, output, suffix) if writes else [Path("-")] * len(inputs)
+    if writes and output is not None and Path(output) not in targets:
+        try:
+            Path(output).mkdir(parents=True, exist_ok=True)
+        except (OSError, ValueError) as error:
+            raise OutputError(f"cannot make the folder {Path(output)!s:.100}: {reason_of(error)}") from error
+    pairs = list(zip(inputs, targets, strict=True))
+    reports, failed = [], False
+    with contextlib.nullcontext() if during is None else during(pairs):
         for name, target in pairs:
             try:
-                reports.append(entry(name, target))
+                check_input(name, unreadable)
+                report, shown = work(name, target)
+                if not (quiet or as_json or (writes and str(target) == "-")):
+                    show(shown)
+                reports.append({"input": name, **({"output": str(target)} if writes else {}), **report})
             except KissgsError as error:
                 if len(pairs) == 1:
                     raise
@@ -206,30 +238,34 @@ def check_input(name: str, unreadable: type[KissgsError]) -> None:
         raise unreadable(f"cannot read {name:.100}: {reason_of(error)}") from error
 
 
-def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folder: bool) -> list[Path]:
+def _targets(inputs: list[str], output: str | None, suffix: str) -> list[Path]:
     """Return the output path of each input: next to it, in the folder ``output``, or the file ``output``."""
     if "-" in inputs and (len(inputs) > 1 or output is None):
         raise OutputError("standard input has no name and must be the only input; give the output with -o")
-    if output is not None and not is_named_folder and (str(output) == "-" or _ends_with(output, suffix)):
-        if len(inputs) > 1:
-            remedy = "compress one scene at a time" if named_manifest(output) else "give a folder with -o"
-            raise OutputError(f"{len(inputs)} inputs cannot all become {output}; {remedy}")
-        return [output]
-    if output is not None and not names_folder(str(output) + "/" * is_named_folder):
-        ending = output.suffix.lower()
-        if suffix and ending in (*ENDINGS, *SCENE_ENDINGS):
-            command = "compress" if ending in ENDINGS else "convert"
-            raise OutputError(f"this command writes {suffix}; for {ending}, use kissgs {command}")
-        file = f"in {suffix} if it is a file, or " if suffix else ""
-        raise OutputError(f"there is no folder {output!s:.100}; end it {file}in a slash to make a folder")
-    if output is not None and "-" in inputs:
-        raise OutputError(f"-o {output} is a folder, but standard input has no name; give -o NAME{suffix}")
-    targets = []
-    for name, stem in zip(inputs, _names(inputs) if output is not None else map(_stem, inputs), strict=True):
-        if not stem:
-            raise OutputError(f"{name} has no name to derive the output from; give the output with -o")
-        folder = output if output is not None else Path(name).parent
-        targets.append(folder / (stem + (suffix or FOLDER_ENDING)))
+    if output is None:
+        folders, stems = [Path(name).parent for name in inputs], list(map(_stem, inputs))
+    else:
+        path = Path(output)
+        file = "" if output.endswith(("/", os.sep)) else path.name.lower()
+        if output == "-" or (suffix and file.endswith(suffix) and file != suffix):
+            if len(inputs) > 1:
+                remedy = "compress one scene at a time" if named_manifest(path) else "give a folder with -o"
+                raise OutputError(f"{len(inputs)} inputs cannot all become {path}; {remedy}")
+            return [path]
+        if not names_folder(output):
+            ending = path.suffix.lower()
+            if suffix and ending in (*ENDINGS, *SCENE_ENDINGS):
+                command = "compress" if ending in ENDINGS else "convert"
+                raise OutputError(f"this command writes {suffix}; for {ending}, use kissgs {command}")
+            as_file = f"in {suffix} if it is a file, or " if suffix else ""
+            raise OutputError(f"there is no folder {path!s:.100}; end it {as_file}in a slash to make a folder")
+        if "-" in inputs:
+            raise OutputError(f"-o {path} is a folder, but standard input has no name; give -o NAME{suffix}")
+        folders, stems = [path] * len(inputs), _names(inputs)
+    if "" in stems:
+        name = inputs[stems.index("")]
+        raise OutputError(f"{name} has no name to derive the output from; give the output with -o")
+    targets = [folder / (stem + (suffix or FOLDER_ENDING)) for folder, stem in zip(folders, stems, strict=True)]
     if len(set(targets)) < len(targets):
         raise OutputError("two inputs have the same name and would become one file; process them one by one")
     return targets
@@ -261,11 +297,6 @@ def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:
     read, written = (Path(name).suffix.lower() for name in inputs)
     if written != read and written in {suffix, *(ENDINGS if suffix in ENDINGS else ())} - {""}:
         raise OutputError(f"{inputs[1]:.100} does not exist; if it is the output, name it with -o {inputs[1]:.100}")
-
-
-def _ends_with(path: Path, suffix: str) -> bool:
-    """Whether a path names a file with this ending, such as ".ply" or ".compressed.ply"."""
-    return bool(suffix) and path.name.lower().endswith(suffix) and len(path.name) > len(suffix)
 
 
 def source(name: str) -> Path | bytes:
@@ -301,16 +332,6 @@ def is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112  Path.is_dir raises where a name is too long
 
 
-def _make_folder(folder: Path) -> None:
-    """Make a folder and its parents, if they do not exist."""
-    from kissgs.io.files import reason_of
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise OutputError(f"cannot make the folder {folder!s:.100}: {reason_of(error)}") from error
-
-
 def expand(names: list[str]) -> list[str]:
     """Expand the glob patterns that the shell has not expanded."""
     found: list[str] = []
@@ -326,12 +347,12 @@ def expand(names: list[str]) -> list[str]:
 
 
 @contextlib.contextmanager
-def stdout() -> Iterator[None]:
-    """Write to standard output inside this context: errors of a full or closed one become an OutputError."""
+def stdout() -> Iterator[BinaryIO]:
+    """Open standard output: errors of a full or closed one become an OutputError."""
     if sys.stdout is None:
         raise OutputError("standard output is closed; there is nowhere to write to")
     try:
-        yield
+        yield sys.stdout.buffer
         sys.stdout.flush()
     except BrokenPipeError:
         os._exit(128 + signal.SIGPIPE)  # the reader has closed the pipe
@@ -349,18 +370,15 @@ def discard_stdout() -> None:
 
 def write_stdout(data: bytes) -> None:
     """Write bytes to standard output."""
-    with stdout():
-        sys.stdout.buffer.write(data)
+    with stdout() as file:
+        file.write(data)
 
 
 def write_output(target: Path, data: bytes, *, force: bool) -> None:
     """Write a file atomically, or to standard output for "-"."""
-    if str(target) == "-":
-        write_stdout(data)
-        return
     from kissgs.io.files import atomic_file
 
-    with atomic_file(target, overwrite=force) as file:
+    with stdout() if str(target) == "-" else atomic_file(target, overwrite=force) as file:
         file.write(data)
 
 

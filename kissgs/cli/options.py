@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import functools
-import glob
 import inspect
-import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass, replace
@@ -17,7 +15,6 @@ from typer import Argument, Option
 from kissgs.cli.files import is_folder
 from kissgs.core.context import Device
 from kissgs.core.errors import UnsupportedError
-from kissgs.formats import ENDINGS, SCENE_ENDINGS
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
@@ -46,7 +43,7 @@ def steps_of(text: str) -> Values:
     if text == "auto":
         return {"enabled": True}
     if not text.isdecimal():
-        raise UnsupportedError(f"{FINETUNE} {text}: give a number of steps, or none for that of the preset")
+        raise UnsupportedError(f"--finetune {text}: give a number of steps, or none for that of the preset")
     return {"enabled": True, "steps": text} if int(text) else {"enabled": False}
 
 
@@ -383,9 +380,7 @@ def chosen(
     return made(preset, time_limit=time, compact=values["compact"], finetune=values["finetune"], **values["encode"])
 
 
-FINETUNE, RAY = "--finetune", "--ray"
-
-OPTIONAL_VALUES = {FINETUNE: r"[0-9]+|auto", RAY: r"auto|[^\s/]+:[0-9]+|ray://\S+"}
+OPTIONAL_VALUES = {"--finetune": r"[0-9]+|auto", "--ray": r"auto|[^\s/]+:[0-9]+|ray://\S+"}
 """Options whose value may be left out, and what a value looks like."""
 
 
@@ -398,17 +393,8 @@ def with_default_values(words: list[str]) -> list[str]:
         result.append(word)
         following = words[n + 1] if n + 1 < len(words) else ""
         if word in OPTIONAL_VALUES and not re.fullmatch(OPTIONAL_VALUES[word], following):
-            if words[0] == "compress" and word == RAY and _is_host(following):
-                raise UnsupportedError(f"--ray takes HOST:PORT, such as head:6379, not {following:.100}")
             result.append("auto")
     return result
-
-
-def _is_host(word: str) -> bool:
-    """Whether a word after ``--ray`` is rather meant as a machine without a port, or as a URL, than as a scene."""
-    if word.startswith("-") or not word or glob.has_magic(word) or os.path.lexists(word):
-        return False
-    return "://" in word or ("/" not in word and Path(word).suffix.lower() not in (*ENDINGS, *SCENE_ENDINGS, ".json"))
 
 
 def open_views(

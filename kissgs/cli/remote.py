@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from kissgs.cli.files import Result, for_each_input, is_folder, print_json, progress_bar, show
+from kissgs.cli.files import Result, announcing, for_each_input, is_folder, print_json, progress_bar, show
 from kissgs.cli.options import (
     EncodingOptions,
     FilesArgument,
@@ -21,12 +20,11 @@ from kissgs.cli.options import (
     output_option,
     with_option_groups,
 )
-from kissgs.core.errors import OutputError, UnsupportedError
+from kissgs.core.errors import OutputError, RemoteError, UnsupportedError
 from kissgs.formats import OUTPUT_FORMATS, ending_of, named_container
 
 if TYPE_CHECKING:
     from kissgs.client import Remote
-    from kissgs.core.context import Progress
 
 ServerOption = Annotated[str, Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="URL of the service.")]
 ServiceJsonOption = Annotated[bool, Option("--json", help="Print the response of the service as JSON.")]
@@ -56,8 +54,9 @@ def compress(
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job."""
-    from kissgs.cameras.captures.load import capture_of
+    from kissgs.cameras.captures.load import capture_of, pack_capture
     from kissgs.cli.tables import status_table
+    from kissgs.client import WAIT
     from kissgs.io.files import open_scene_file, refuse_existing
     from kissgs.pipeline.scene_files import scene_root
 
@@ -68,8 +67,15 @@ def compress(
 
         @functools.cache
         def packed(capture: Path, within: Path) -> Path:
-            _check_reachable(remote)
-            return _pack(capture, within / "scene", Path(tempfile.mkdtemp(dir=folder)), quiet or as_json)
+            try:
+                remote.jobs(1)  # here, as packing may take minutes
+            except RemoteError as error:
+                if error.retry_after is None:  # else it is overloaded for a while
+                    raise
+            archive = Path(tempfile.mkdtemp(dir=folder)) / "capture.zip"
+            with progress_bar(quiet or as_json) as progress:
+                pack_capture(capture, archive, progress, scene=within / "scene")
+            return archive
 
         def work(scene: str, target: Path) -> Result:
             refuse_existing(target, overwrite=force)  # here, as packing may take minutes
@@ -86,9 +92,9 @@ def compress(
                     origin=encoding.origin,
                     capture=capture,
                     overwrite=force,
-                    progress=_announcing(progress, server, quiet),
+                    progress=announcing(progress, WAIT, quiet, f"{server}: "),
                 )
-            return Result(status, status_table(status, str(target)))
+            return status, status_table(status, str(target))
 
         for_each_input(scenes, output, ending_of(kind), work, as_json=as_json, quiet=quiet)
 
@@ -117,13 +123,13 @@ def get(
 ) -> None:
     """Wait for a job to finish, and download its container."""
     from kissgs.cli.tables import status_table
-    from kissgs.client import Share
+    from kissgs.client import WAIT, Share
     from kissgs.io.files import refuse_existing
 
     with _service(server) as remote, progress_bar(False) as bar:
-        progress = _announcing(bar, server, False)
+        progress = announcing(bar, WAIT, False, f"{server}: ")
         known = remote.status(job)
-        kind = known["options"].get("format") or named_container(None, output)  # older services state none
+        kind = known["options"]["format"]
         ending = f".{kind}" if kind in OUTPUT_FORMATS else ending_of(kind)
         target = output or Path(f"{known['name']}{ending}")
         if not target.name.lower().endswith(ending):
@@ -145,41 +151,3 @@ def _service(server: str) -> Remote:
     from kissgs.client import Remote
 
     return Remote(server, key=os.environ.get("KISSGS_KEY"))
-
-
-def _check_reachable(remote: Remote) -> None:
-    """Raise RemoteError if the service cannot be reached or refuses the key; it may be overloaded for a while."""
-    from kissgs.core.errors import RemoteError
-
-    try:
-        remote.jobs(1)
-    except RemoteError as error:
-        if error.retry_after is None:
-            raise
-
-
-def _pack(views: Path, scene: Path, folder: Path, quiet: bool) -> Path:
-    """Pack a capture for a scene into an archive in the folder."""
-    from kissgs.cameras.captures.load import pack_capture
-
-    archive = folder / "capture.zip"
-    with progress_bar(quiet) as progress:
-        pack_capture(views, archive, progress, scene=scene)
-    return archive
-
-
-def _announcing(progress: Progress, server: str, quiet: bool) -> Progress:
-    """Return a receiver that prints a line when the service refuses a request for the first time."""
-    from kissgs.client import WAIT
-    from kissgs.core.context import with_seconds_left
-
-    said, forward = quiet, with_seconds_left(progress)
-
-    def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
-        nonlocal said
-        if stage == WAIT and not said:
-            sys.stderr.write(f"kissgs: {server}: {note}\n")
-            said = True
-        forward(stage, fraction, "" if stage == WAIT else note, seconds_left)
-
-    return receive

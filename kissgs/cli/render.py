@@ -71,16 +71,15 @@ def view(
 
 def _write(scene: str, common: SceneOptions, output: Path, force: bool) -> None:
     from kissgs.io.files import refuse_existing
-    from kissgs.preview import fitting_level, is_streamed, page_container, standalone_page
+    from kissgs.preview import fitting_level, page_container, standalone_page
 
     if output.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{output!s:.100} is not the name of a page: end it in .html")
     refuse_existing(output, overwrite=force)
     content, chosen, reading = source(scene), "", common.reading()
-    if common.level is None and is_streamed(content):
-        level, levels = fitting_level(content, reading.max_gaussians)
-        reading = replace(reading, level=level)
-        chosen = f", level {level} of 0 to {levels - 1}"
+    if common.level is None and (fitting := fitting_level(content, reading.max_gaussians)) is not None:
+        reading = replace(reading, level=fitting[0])
+        chosen = f", level {fitting[0]} of 0 to {fitting[1] - 1}"
     with progress_bar(common.quiet) as progress:
         container = page_container(content, reading, threads=common.threads, progress=progress)
     say_notes(scene, container.notes, common.quiet)
@@ -106,10 +105,11 @@ def _serve(scene: str, common: SceneOptions, port: int, browser: bool) -> None:
 
 def _prepare(scene: str, common: SceneOptions) -> PageScene | StreamedFolder:
     """Return what the server gets: a scene in memory, or the folder of a streamed one."""
-    from kissgs.preview import is_streamed_folder, page_scene, streamed_folder
+    from kissgs.preview import page_scene, streamed_folder
 
     content = source(scene)
-    if common.level is None and isinstance(content, Path) and is_streamed_folder(content):
+    folder = streamed_folder(content) if common.level is None and isinstance(content, Path) else None
+    if folder is not None:
         if common.max_gaussians is not None:
             raise UnsupportedError(
                 "--max-gaussians does not apply to a streamed scene that the page loads in parts; "
@@ -120,28 +120,21 @@ def _prepare(scene: str, common: SceneOptions) -> PageScene | StreamedFolder:
                 "--antialiased and --classic do not apply to a streamed scene that the page loads in parts; name a "
                 "--level"
             )
-        folder = streamed_folder(content)
-        if not common.quiet:
-            _warn(scene, folder)
+        if folder.missing and not common.quiet:
+            sys.stderr.write(
+                f"kissgs: {scene} lacks {_listed(folder.missing)}, so a part will be missing; export or download the "
+                "scene again\n"
+            )
+        if folder.unusable and not common.quiet:
+            sys.stderr.write(
+                f"kissgs: the page gets only files inside {scene}, not links out of it, so a part will be missing; "
+                f"copy what they lead to: {_listed(folder.unusable)}\n"
+            )
         return folder
     with progress_bar(common.quiet) as progress:
         prepared = page_scene(content, common.reading(), threads=common.threads, progress=progress)
     say_notes(scene, prepared.notes, common.quiet)
     return prepared
-
-
-def _warn(scene: str, folder: StreamedFolder) -> None:
-    """Say which files the page cannot get: those that are missing, and those that are there."""
-    if folder.missing:
-        sys.stderr.write(
-            f"kissgs: {scene} lacks {_listed(folder.missing)}, so a part will be missing; export or download the scene "
-            "again\n"
-        )
-    if folder.unusable:
-        sys.stderr.write(
-            f"kissgs: the page gets only files inside {scene}, not links out of it, so a part will be missing; copy "
-            f"what they lead to: {_listed(folder.unusable)}\n"
-        )
 
 
 def _listed(names: tuple[str, ...]) -> str:
@@ -272,7 +265,13 @@ def render(
     from kissgs.pipeline.scene_files import load
     from kissgs.rendering.images import animated_webp, png
 
-    suffix, threads, quiet = _suffix(file, output), common.threads, common.quiet or as_json
+    threads, quiet, suffix = common.threads, common.quiet or as_json, ".png"
+    if file == "-":
+        raise UnsupportedError("kissgs render reads a file, not standard input")
+    if output not in (None, "-") and not names_folder(output):
+        suffix = Path(output).suffix.lower()
+        if suffix not in (".png", ".webp"):
+            raise UnsupportedError(f"{output}: images are written as .png or .webp")
     image.refuse_contradictions(capture.views)
     size, background, views = image.pixels(), image.colour(), capture.open(Path(file))
 
@@ -305,18 +304,6 @@ def render(
         cameras = [{"name": view.name, **camera_as_dict(view.camera)} for view in rendered.views]
         report = {"width": width, "height": height, "frames": len(rendered.images), "bytes": len(data)}
         line = f"{target}  {width}x{height}, {rendered.description}{saved}"
-        return Result({**report, "cameras": cameras}, line)
+        return {**report, "cameras": cameras}, line
 
     for_each_input([file], output, suffix, work, as_json=as_json, quiet=quiet)
-
-
-def _suffix(file: str, output: str | None) -> str:
-    """Return the ending of the output: .png unless ``output`` ends in .webp."""
-    if file == "-":
-        raise UnsupportedError("kissgs render reads a file, not standard input")
-    if output in (None, "-") or names_folder(output):
-        return ".png"
-    suffix = Path(output).suffix.lower()
-    if suffix not in (".png", ".webp"):
-        raise UnsupportedError(f"{output}: images are written as .png or .webp")
-    return suffix

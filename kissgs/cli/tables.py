@@ -20,7 +20,6 @@ from kissgs.settings import Preset, Settings
 if TYPE_CHECKING:
     from kissgs.compaction.result import CompactionReport
     from kissgs.evaluation.html import ReportScene
-    from kissgs.finetuning.result import FinetuneReport
     from kissgs.pipeline.pipeline import Report
     from kissgs.pipeline.scene_files import Info
     from kissgs.streaming.compress import StreamedReport
@@ -33,6 +32,8 @@ CHANGES = {
     **CLEANED_TEXTS,
 }
 """Text for each kind of removed or changed Gaussians, by key of the report."""
+
+TARGETS = {"photos": "photographs", "renderings": "renderings of the scene"}  # of training
 
 
 def table_of(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
@@ -70,15 +71,21 @@ def _how_to_view(target: str) -> list[Text]:
 def report_table(report: Report, target: str) -> RenderableType:
     """Format the report of one compression."""
     sizes, counts = (report.source_bytes, report.container_bytes), (report.source_count, report.count)
-    head = _result(target, sizes, counts, report.sh_degree, sum(report.seconds.values()), report.cpu_seconds)
+    head = _result(target, sizes, counts, report.sh_degree, (sum(report.seconds.values()), report.cpu_seconds))
     head.append(f", peak memory {size(report.peak_memory)}")
     details: list[RenderableType] = []
     if report.compaction is not None:
         details += _compaction(report.compaction, search=not report.trials)
     if report.trials:
         details.append(_search_table(report))
-    if report.finetuning is not None:
-        details += _finetuning(report.finetuning)
+    if (tuned := report.finetuning) is not None:
+        first_size = "" if tuned.bytes_before is None else f"{size(tuned.bytes_before)} -> "
+        first_psnr = "" if tuned.psnr_before is None else f"{format_metric(tuned.psnr_before, 2)} -> "
+        line = (
+            f"fine-tuned on {TARGETS[tuned.target_source]}: {first_size}{size(tuned.bytes_after)}, held-out PSNR "
+            f"{first_psnr}{format_metric(tuned.psnr_after, 2)} dB, {tuned.seconds:.0f} s"
+        )
+        details += [Text(line), *_noted(tuned.note)]
     details += _noted(report.note)
     if report.evaluation is not None:
         details.append(_evaluation(report.evaluation))
@@ -89,44 +96,34 @@ def report_table(report: Report, target: str) -> RenderableType:
 
 def status_table(status: Mapping[str, Any], target: str) -> RenderableType:
     """Format the status of a job of a service that has succeeded, as :func:`report_table` does it for a report."""
-    timings, sizes, evaluation = status["timings"], status["sizes"], status.get("evaluation")
-    counts, seconds = (status["gaussians"], status["kept"]), sum(timings["stages"].values())
-    bytes_of = status["upload_bytes"], sizes["container"]
-    head = _result(target, bytes_of, counts, status["sh_degree"], seconds, timings["cpu_seconds"])
+    timings, evaluation = status["timings"], status.get("evaluation")
+    sizes, counts = (status["upload_bytes"], status["sizes"]["container"]), (status["gaussians"], status["kept"])
+    times = sum(timings["stages"].values()), timings["cpu_seconds"]
+    head = _result(target, sizes, counts, status["sh_degree"], times)
     details = _noted(status.get("note") or "")
     if evaluation is not None:
         psnr = evaluation.get("psnr")  # null: infinite
         mean = ImageMetrics(
             psnr=float("inf" if psnr is None else psnr), ssim=evaluation["ssim"], ms_ssim=evaluation["ms_ssim"]
         )
-        patches = evaluation.get("detail")  # services of older versions state none
-        detail = "" if patches is None else f"; {detail_text(_detail(patches), 'renderings')}"
-        details.append(Text(f"{mean.summary} to the scene's own renderings{detail}"))
+        # A failed rendering is the text "NaN".
+        detail = Detail(*(float(evaluation["detail"][name]) for name in ("worst", "worst_percent", "share_below")))
+        details.append(Text(f"{mean.summary} to the scene's own renderings; {detail_text(detail, 'renderings')}"))
     changed = {"invisible": status.get("invisible") or 0, **(status.get("cleaned") or {})}
     return Group(head, *details, *_changes(changed), *_how_to_view(target))
 
 
-def _detail(patches: Mapping[str, Any]) -> Detail:
-    """Return the figures of a service's JSON, where a failed rendering is the text "NaN"."""
-    return Detail(*(float(patches[name]) for name in ("worst", "worst_percent", "share_below")))
-
-
 def _result(
-    target: str,
-    bytes_of: tuple[int, int],
-    counts: tuple[int, int],
-    sh_degree: int,
-    seconds: float,
-    cpu_seconds: float,
+    target: str, sizes: tuple[int, int], counts: tuple[int, int], degree: int, times: tuple[float, float]
 ) -> Text:
-    """Format the result of a compression: sizes and counts of the scene and of the container, and its time."""
-    (before, after), (all_of_them, kept) = bytes_of, counts
+    """Format the result of a compression: sizes and counts before and after it, and its wall and CPU time."""
+    (before, after), (all_of_them, kept), (seconds, cpu_seconds) = sizes, counts, times
     return Text.assemble(
         (target, "bold"),
         f"  {size(before)} -> {size(after)}, ",
         (f"{before / after:.1f}x smaller", "bold green"),
         f", {after / max(all_of_them, 1):.2f} bytes per Gaussian\n",
-        f"{kept:,} of {gaussians(all_of_them)}, SH degree {sh_degree}; {seconds:.1f} s ({cpu_seconds:.1f} CPU s)",
+        f"{kept:,} of {gaussians(all_of_them)}, SH degree {degree}; {seconds:.1f} s ({cpu_seconds:.1f} CPU s)",
     )
 
 
@@ -164,9 +161,9 @@ def _compaction(report: CompactionReport, *, search: bool = True) -> list[Render
         lines.append(Text(f"search: {'; '.join(trial.summary() for trial in report.trials)}"))
     if not report.steps:
         return lines
-    trained = {"photos": "trained on photographs", "renderings": "trained on renderings of the scene"}
     if report.source:
-        lines.append(Text(f"{trained.get(report.target_source, 'scored with')}: {report.source}"))
+        how = f"trained on {TARGETS[report.target_source]}" if report.target_source in TARGETS else "scored with"
+        lines.append(Text(f"{how}: {report.source}"))
     heads, rows = ["step", "Gaussians", "seconds"], []
     if report.steps[0].bytes is not None:
         heads += ["PSNR", "SSIM", "MS-SSIM", "bytes"]
@@ -177,18 +174,6 @@ def _compaction(report: CompactionReport, *, search: bool = True) -> list[Render
             row += [format_metric(step.psnr, 2), format_metric(step.ssim, 4), coarse, f"{step.bytes:,}"]
         rows.append(row)
     return [*lines, table_of(heads, rows)]
-
-
-def _finetuning(report: FinetuneReport) -> list[Text]:
-    """Format the result of fine-tuning in one line, and its note."""
-    targets = "photographs" if report.target_source == "photos" else "renderings of the scene"
-    first_size = "" if report.bytes_before is None else f"{size(report.bytes_before)} -> "
-    first_psnr = "" if report.psnr_before is None else f"{format_metric(report.psnr_before, 2)} -> "
-    line = (
-        f"fine-tuned on {targets}: {first_size}{size(report.bytes_after)}, held-out PSNR "
-        f"{first_psnr}{format_metric(report.psnr_after, 2)} dB, {report.seconds:.0f} s"
-    )
-    return [Text(line), *_noted(report.note)]
 
 
 def _search_table(report: Report) -> Table:
@@ -222,16 +207,6 @@ def _beyond(surroundings: Evaluation) -> str:
     return f"beyond the capture: {mean}; {surroundings.extremes}"
 
 
-def parts_table(parts: Mapping[str, int], count: int, whole: str = "total") -> Table:
-    """Return a table of bytes per file or attribute: absolute, share of the whole, and bits per Gaussian."""
-    total = sum(parts.values())
-    heads = ("part", "bytes", "share", "bits/Gaussian")
-    cells = ((name, f"{n:,}", f"{n / max(total, 1):.1%}", f"{8 * n / max(count, 1):.2f}") for name, n in parts.items())
-    table = table_of(heads, cells)
-    table.add_row(whole, f"{total:,}", "", f"{8 * total / max(count, 1):.2f}", style="bold")
-    return table
-
-
 def info_table(info: Info) -> RenderableType:
     """Format the output of ``kissgs info``."""
     streamed = FORMATS[info.kind].manifest is not None
@@ -239,8 +214,12 @@ def info_table(info: Info) -> RenderableType:
     body = f"{gaussians(info.count)}, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits per Gaussian"
     blocks: list[RenderableType] = [head, Text(body)]
     if info.parts:
+        total, count = sum(info.parts.values()), max(info.count, 1)
+        parts = [(name, f"{n:,}", f"{n / max(total, 1):.1%}", f"{8 * n / count:.2f}") for name, n in info.parts.items()]
+        table = table_of(("part", "bytes", "share", "bits/Gaussian"), parts)
         whole = f"total of level {info.details['level']}" if streamed else "total"
-        blocks.append(parts_table(info.parts, info.count, whole))
+        table.add_row(whole, f"{total:,}", "", f"{8 * total / count:.2f}", style="bold")
+        blocks.append(table)
     # Channels of a container share a step, so few reach the highest level.
     of = "value of {} level" if FORMATS[info.kind].is_container else "{} value"
     ranges = [(name, f"{low:.5g}", f"{high:.5g}") for name, (low, high) in info.ranges.items()]
@@ -255,8 +234,7 @@ def settings_table() -> RenderableType:
     settings = Settings.from_preset(Preset.BALANCED)
     table = table_of(("setting", "balanced", "meaning"), [])
     table.columns[1].justify = table.columns[2].justify = "left"
-    for group in (settings.encode, settings.compact, settings.finetune):
-        prefix = "" if group is settings.encode else f"{'compact' if group is settings.compact else 'finetune'}."
+    for prefix, group in (("", settings.encode), ("compact.", settings.compact), ("finetune.", settings.finetune)):
         for name in group.public():
             value = getattr(group, name)
             meaning = type(group).model_fields[name].description or ""
@@ -278,29 +256,22 @@ def evaluation_table(
         )
     if evaluation.split == "train" != asked:
         notes.append("no view is held out: the scene may have been trained on these views")
-    return Group(
-        _sizes(evaluation, reference, candidate),
-        f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}",
-        *_noted(*notes),
-        "",
-        *_metrics_of_views(evaluation),
-        "",
-        _sentence(evaluation.extremes),
-        *([] if surroundings is None else [_sentence(_beyond(surroundings))]),
-    )
-
-
-def _sentence(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}."
-
-
-def _sizes(evaluation: Evaluation, reference: ReportScene, candidate: ReportScene) -> Text:
     head = Text.assemble((candidate.name, "bold"), " compared with ", (reference.name, "bold"))
     if reference.bytes is not None and candidate.bytes:
         ratio = reference.bytes / candidate.bytes
         change = f"{ratio:.1f}x smaller" if ratio >= 1 else f"{1 / ratio:.1f}x larger"
         head.append(f"  {size(reference.bytes)} -> {size(candidate.bytes)}, ").append(change, "bold green")
-    return head.append(f"; {evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians")
+    head.append(f"; {evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians")
+    extremes = [evaluation.extremes, *([] if surroundings is None else [_beyond(surroundings)])]
+    return Group(
+        head,
+        f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}",
+        *_noted(*notes),
+        "",
+        *_metrics_of_views(evaluation),
+        "",
+        *(f"{text[0].upper()}{text[1:]}." for text in extremes),
+    )
 
 
 def _metrics_of_views(evaluation: Evaluation) -> list[RenderableType]:

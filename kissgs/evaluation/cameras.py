@@ -50,10 +50,6 @@ class Parts:
     parts: list[Part]
     part_of: Int[np.ndarray, " N"]
 
-    def shares(self, weights: Float64[np.ndarray, " N"], pixels: int) -> Float64[np.ndarray, " P"]:
-        """Return the share of an image that each part covers, given the blending weights of all Gaussians in it."""
-        return np.bincount(self.part_of + 1, weights, minlength=len(self.parts) + 1)[1:] / pixels
-
     def overlooked(self, shares: Float64[np.ndarray, "V P"], views: Sequence[View], pool: Workers) -> list[int]:
         """Return the parts whose loss hardly changes the view that shows them best, least visible parts first."""
 
@@ -70,19 +66,19 @@ class Parts:
         best: dict[int, tuple[float, View]] = {}
         remaining = list(parts)
         for _ in range(MAX_DRAWS):
-            drawn = [(part, self._draw_camera(self.parts[part], rng)) for part in remaining]
+            drawn = []
+            for part, sphere in ((part, self.parts[part]) for part in remaining):
+                fov = float(rng.uniform(*FIELDS_OF_VIEW))
+                narrow = np.arctan(np.tan(fov / 2) * HEIGHT / WIDTH)
+                distance = sphere.radius / np.sin(narrow) * log_uniform(rng, *DISTANCES)
+                position = sphere.center + distance * random_direction(rng)
+                drawn.append((part, camera_at(position, sphere.center, fov, (WIDTH, HEIGHT))))
             found_views = pool.map(lambda each: self._over_best_background(*each), drawn)
             for part, found in zip(remaining, found_views, strict=True):
                 if part not in best or found[0] < best[part][0]:
                     best[part] = found
             remaining = [part for part in remaining if best[part][0] > VISIBLE_PSNR]
         return [best[part][1] for part in parts]
-
-    def _draw_camera(self, part: Part, rng: np.random.Generator) -> Camera:
-        fov = float(rng.uniform(*FIELDS_OF_VIEW))
-        narrow = np.arctan(np.tan(fov / 2) * HEIGHT / WIDTH)
-        distance = part.radius / np.sin(narrow) * log_uniform(rng, *DISTANCES)
-        return camera_at(part.center + distance * random_direction(rng), part.center, fov, (WIDTH, HEIGHT))
 
     def _over_best_background(self, part: int, camera: Camera) -> tuple[float, View]:
         """Return the view over the grey on which the part's loss is most visible, and its PSNR without the part."""
@@ -170,7 +166,12 @@ def _draw_views(
     sampler: _PoseSampler, parts: Parts, rng: np.random.Generator, pool: Workers, progress: Progress
 ) -> tuple[list[View], Float64[np.ndarray, "V P"]]:
     """Draw each view until it is accepted; return them and the share of each image that each part covers."""
-    count, quantiles = COUNT, _target_quantiles(rng)
+    # One number from 0 to 1 per view selects its target, stratified over the near kinds and over the other kinds.
+    near, count = np.array([KINDS[n % len(KINDS)] in ("around", "close-up") for n in range(COUNT)]), COUNT
+    quantiles = np.empty(count)
+    for group in (near, ~near):
+        size = int(group.sum())
+        quantiles[group] = rng.permutation((np.arange(size) + rng.random(size)) / size)
     views = [sampler.view(n, 0, float(quantiles[n]), rng) for n in range(count)]
     shares = np.zeros((count, len(parts.parts)))
     rejected = list(range(count)) if sampler.any_visible else []
@@ -184,16 +185,6 @@ def _draw_views(
         for n in rejected:
             views[n] = sampler.view(n, attempt, float(quantiles[n]), rng)
     return views, shares
-
-
-def _target_quantiles(rng: np.random.Generator) -> Float64[np.ndarray, " count"]:
-    """Return one number from 0 to 1 per view, stratified over the near kinds and over the other kinds."""
-    near = np.array([KINDS[n % len(KINDS)] in ("around", "close-up") for n in range(COUNT)])
-    numbers = np.empty(COUNT)
-    for group in (near, ~near):
-        size = int(group.sum())
-        numbers[group] = rng.permutation((np.arange(size) + rng.random(size)) / size)
-    return numbers
 
 
 def _grey(level: float) -> Float32[np.ndarray, "3"]:
@@ -231,7 +222,11 @@ class _PoseSampler:
         close_rank = _whole_log_uniform(rng, fewest, most)
         target = self._position(target_index)
         if kind == "far":
-            target, radius = self._bounding_sphere(EXTENT_SHARES[(number // len(KINDS) + attempt) % len(EXTENT_SHARES)])
+            # The sphere around the box that holds this share of Gaussians along each axis.
+            share = EXTENT_SHARES[(number // len(KINDS) + attempt) % len(EXTENT_SHARES)]
+            low, high = np.quantile(self.columns.astype(np.float64), [(1 - share) / 2, (1 + share) / 2], axis=1)
+            least = MIN_SIGMAS * float(np.median(self.sizes))
+            target, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), least)
             narrow = np.tan(fov / 2) * HEIGHT / WIDTH
             position = target + direction * radius / np.sin(np.arctan(narrow))
         elif kind == "across":
@@ -255,12 +250,6 @@ class _PoseSampler:
         radius = float(np.sqrt(np.partition(squares, count - 1)[count - 1], dtype=np.float64))
         return max(radius, MIN_SIGMAS * float(self.sizes[index]))
 
-    def _bounding_sphere(self, share: float) -> tuple[Vec3, float]:
-        """Return centre and radius of the sphere around the box that holds this share of Gaussians along each axis."""
-        low, high = np.quantile(self.columns.astype(np.float64), [(1 - share) / 2, (1 + share) / 2], axis=1)
-        radius = 0.5 * float(np.linalg.norm(high - low))
-        return 0.5 * (low + high), max(radius, MIN_SIGMAS * float(np.median(self.sizes)))
-
 
 def _whole_log_uniform(rng: np.random.Generator, low: int, high: int) -> int:
     return int(np.clip(np.rint(log_uniform(rng, low, high)), low, high))
@@ -275,11 +264,12 @@ def _check_camera(parts: Parts, camera: Camera) -> tuple[bool, Float64[np.ndarra
             return False, np.zeros(len(parts.parts))
         weights = blending_weights(frame, single)
     pixels = frame.transmittance.size
+    shares = np.bincount(parts.part_of + 1, weights, minlength=len(parts.parts) + 1)[1:] / pixels
     shown = np.flatnonzero(weights > 0)
     inside = mahalanobis_distances(parts.splats.select(shown), camera.position) < INSIDE_SIGMAS
     largest, around = weights.max() / pixels, weights[shown[inside]].sum() / pixels
     accepted = largest < MAX_SINGLE_SHARE and around < MAX_INSIDE_SHARE and cut < MAX_CUT_SHARE
-    return bool(accepted), parts.shares(weights, pixels)
+    return bool(accepted), shares
 
 
 def _cut_share(splats: Splats, camera: Camera, pool: Workers) -> float:

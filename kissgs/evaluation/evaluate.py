@@ -15,13 +15,13 @@ from kissgs.cameras.captures.colmap import gsplat_similarities
 from kissgs.cameras.captures.load import as_views
 from kissgs.cameras.photographs import orientation
 from kissgs.cameras.views import Similarity, View, Views
-from kissgs.core.array_types import Float32, Float64, Shaped
+from kissgs.core.array_types import Float32, Float64
 from kissgs.core.context import DEFAULT_CONTEXT, Context, Device, JobProgress, Progress, load_kernels, silent
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 from kissgs.core.positions import Origin, with_origin
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, PatchChanges, Split, ViewComparison
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison
 from kissgs.evaluation.scene_parts import share_shown
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import drawn_opacities
@@ -324,7 +324,7 @@ def _compare_views(
 ) -> Evaluation:
     """Compare two clean scenes view by view."""
     used, chosen = _select_split(views, split)
-    photographed = _have_photos(chosen)
+    photographed = chosen[0].photo is not None
     compared, blank = [], len(reference) > 0
     for done, view in enumerate(chosen):
         context.progress("evaluate", done / len(chosen))
@@ -336,7 +336,13 @@ def _compare_views(
             reference_images[done] = image
         other = render_clamped(candidate, view.camera, background, context)
         blank = blank and bool((image == np.clip(background, 0, 1)).all())
-        comparison, changes = _compare(image, other, view.load_photo() if photographed else None, measure)
+        found, patches = measure(other, image)
+        comparison, changes = Comparison(reference=None, candidate=found, candidate_vs_reference=found), patches - 1
+        if photographed:
+            photo = view.load_photo()
+            (before, patches_before), (after, patches_after) = measure(image, photo), measure(other, photo)
+            comparison = Comparison(reference=before, candidate=after, candidate_vs_reference=found)
+            changes = patches_after - patches_before
         origin = reference.origin
         compared.append(ViewComparison(view=view, comparison=comparison, patch_changes=changes, origin=origin))
     return Evaluation(
@@ -378,7 +384,8 @@ def _measure(flip: bool, lpips: bool, device: Device) -> Measure:
 
 
 def _select_split(views: Views, split: str) -> tuple[Split, tuple[View, ...]]:
-    """Return the split that is used, and its views; if "test" is empty, those of "train"."""
+    """Return the split that is used, and its views; if "test" is empty, those of "train". All of them have photographs,
+    or none has."""
     splits: dict[str, tuple[View, ...]] = {"test": views.test, "train": views.train, "all": views.all}
     used = "train" if split == "test" and not views.test else split
     if used not in splits:
@@ -387,30 +394,10 @@ def _select_split(views: Views, split: str) -> tuple[Split, tuple[View, ...]]:
         raise InvalidViewsError(
             f"there is no view to evaluate from: the split {used!r} of {views.source} is empty; choose another split"
         )
-    _have_photos(splits[used])
-    return cast(Split, used), splits[used]
-
-
-def _compare(
-    reference: Float32[np.ndarray, "H W 3"],
-    candidate: Float32[np.ndarray, "H W 3"],
-    photo: Shaped[np.ndarray, "H W 3"] | None,
-    measure: Measure,
-) -> tuple[Comparison, PatchChanges]:
-    found, patches = measure(candidate, reference)
-    if photo is None:
-        return Comparison(reference=None, candidate=found, candidate_vs_reference=found), patches - 1
-    (before, patches_before), (after, patches_after) = measure(reference, photo), measure(candidate, photo)
-    comparison = Comparison(reference=before, candidate=after, candidate_vs_reference=found)
-    return comparison, patches_after - patches_before
-
-
-def _have_photos(views: Sequence[View]) -> bool:
-    """Return whether all of these views have photographs; raise InvalidViewsError if only some have."""
-    without = [view.name for view in views if view.photo is None]
-    if without and len(without) < len(views):
+    without = [view.name for view in splits[used] if view.photo is None]
+    if without and len(without) < len(splits[used]):
         raise InvalidViewsError(
-            f"{len(without)} of {len(views)} views have no photograph, the first is {without[0]!r}; give all views a "
-            "photograph, or none"
+            f"{len(without)} of {len(splits[used])} views have no photograph, the first is {without[0]!r}; give all "
+            "views a photograph, or none"
         )
-    return not without
+    return cast(Split, used), splits[used]

@@ -12,9 +12,9 @@ from importlib.resources import files
 from string import Template
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageColor
 
-from kissgs.core.array_types import Float32, Float64, UInt8
+from kissgs.core.array_types import Float32, UInt8
 from kissgs.core.context import DEFAULT_CONTEXT, Context
 from kissgs.core.splats import Splats
 from kissgs.evaluation.evaluate import background_of, render_clamped
@@ -24,19 +24,8 @@ from kissgs.rendering.metrics import PATCH, patch_edges
 
 # Error maps: differences of two images per pixel, as colours, and the crop with the largest error.
 
-INFERNO = (
-    (0, 0, 4),
-    (27, 12, 65),
-    (74, 12, 107),
-    (120, 28, 109),
-    (165, 44, 96),
-    (207, 68, 70),
-    (237, 105, 37),
-    (251, 155, 6),
-    (247, 209, 61),
-    (252, 255, 164),
-)
-"""Matplotlib's colour map "inferno" at ten points, RGB from 0 to 255: its lightness grows evenly."""
+INFERNO = ("#000004", "#1b0c41", "#4a0c6b", "#781c6d", "#a52c60", "#cf4446", "#ed6925", "#fb9b06", "#f7d13d", "#fcffa4")
+"""Matplotlib's colour map "inferno" at ten points: its lightness grows evenly."""
 
 FULL_SCALES = (1, 2, 3, 5, 10, 15, 20, 30, 50, 100, 255)  # of 255 levels, for which the brightest colour may stand
 WINDOW = 32  # side of the square over which the largest error is searched, pixels
@@ -57,8 +46,8 @@ def full_scale(psnr: float) -> int:
 
 def heat_map(levels: Float32[np.ndarray, "H W"], full: float) -> UInt8[np.ndarray, "H W 3"]:
     """Return ``levels`` as RGB colours, black for 0 to pale yellow for ``full`` and above; NaN counts as ``full``."""
-    steps = np.linspace(0, 255, len(INFERNO))
-    table = np.stack([np.interp(np.arange(256), steps, channel) for channel in zip(*INFERNO, strict=True)], axis=1)
+    steps, channels = np.linspace(0, 255, len(INFERNO)), zip(*map(ImageColor.getrgb, INFERNO), strict=True)
+    table = np.stack([np.interp(np.arange(256), steps, channel) for channel in channels], axis=1)
     share = np.nan_to_num(levels / full, nan=1.0).clip(0, 1)
     return np.rint(table).astype(np.uint8)[np.rint(share * 255).astype(np.uint8)]
 
@@ -67,18 +56,14 @@ def worst_crop(levels: Float32[np.ndarray, "H W"], side: int) -> tuple[slice, sl
     """Return rows and columns of a square of ``side`` pixels around the :data:`WINDOW` of the largest mean square."""
     height, width = levels.shape
     down, across = min(WINDOW, height), min(WINDOW, width)
-    sums = _sums(np.square(np.nan_to_num(levels.astype(np.float64), nan=255.0)), down, across)
+    squares = np.square(np.nan_to_num(levels.astype(np.float64), nan=255.0))
+    corners = np.pad(squares, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+    strips = corners[down:] - corners[:-down]
+    sums = strips[:, across:] - strips[:, :-across]  # over every window
     top, left = np.unravel_index(sums.argmax(), sums.shape)
     if sums[top, left] <= 0:
         top, left = (height - down) // 2, (width - across) // 2
     return _interval(int(top) + down // 2, side, height), _interval(int(left) + across // 2, side, width)
-
-
-def _sums(values: Float64[np.ndarray, "H W"], down: int, across: int) -> Float64[np.ndarray, "h w"]:
-    """Return the sums over every rectangle of ``down`` rows and ``across`` columns."""
-    corners = np.pad(values, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
-    strips = corners[down:] - corners[:-down]
-    return np.asarray(strips[:, across:] - strips[:, :-across])
 
 
 def _interval(middle: int, side: int, length: int) -> slice:
@@ -203,7 +188,7 @@ def html_report(
         table=_views_table(evaluation, shown),
         worst_views=escape(f"Candidate to reference: {evaluation.extremes}.{beyond}"),
         sections="\n".join([patches, *sections]),
-        colours=", ".join("#" + bytes(color).hex() for color in INFERNO),
+        colours=", ".join(INFERNO),
         quality=QUALITY,
         max_side=MAX_SIDE,
     )
@@ -217,23 +202,18 @@ def _worst_first(evaluation: Evaluation) -> list[int]:
 Patch = tuple[int, int, int]  # index of a view, and row and column of a patch in it
 
 
-def _patches_to_show(evaluation: Evaluation) -> list[Patch]:
-    """Return the patches that lose most, the worst first, none beside another; without any loss, none."""
+def _worst_patches(evaluation: Evaluation, scenes: Sequence[ReportScene], context: Context) -> str:
+    """Return a section with crops around the patches that lose most detail, the worst first and none beside another;
+    empty without any loss."""
     remaining = [np.where(np.isnan(view.patch_changes), -np.inf, view.patch_changes) for view in evaluation.views]
-    found = list[Patch]()
-    while len(found) < MAX_PATCHES:
+    patches, figures = list[Patch](), dict[Patch, str]()
+    while len(patches) < MAX_PATCHES:
         i = min(range(len(remaining)), key=lambda each: remaining[each].min())
         row, column = map(int, np.unravel_index(remaining[i].argmin(), remaining[i].shape))
         if remaining[i][row, column] >= 0:
             break
         remaining[i][max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = np.inf
-        found.append((i, row, column))
-    return found
-
-
-def _worst_patches(evaluation: Evaluation, scenes: Sequence[ReportScene], context: Context) -> str:
-    """Return a section with crops around the patches that lose most detail; empty without any loss."""
-    patches, figures = _patches_to_show(evaluation), dict[Patch, str]()
+        patches.append((i, row, column))
     for i in dict.fromkeys(i for i, _, _ in patches):
         compared = evaluation.views[i]
         renderings, photo = _images(evaluation, compared, scenes, context)
@@ -297,7 +277,14 @@ def _section(
         image = Image.fromarray(pixels)
         image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
         sources[layer] = _data_uri(image, quality=QUALITY)
-    figures = [_slider(name, sources["reference"], sources["candidate"], mark)]
+    figures = [
+        f'<figure class="slider"><div class="stage"><img src="{sources["candidate"]}" alt="candidate, {name}">'
+        f'<img class="before" src="{sources["reference"]}" alt="reference, {name}">{mark}'
+        '<span class="tag left">reference</span><span class="tag right">candidate</span>'
+        '<input type="range" min="0" max="100" value="50" step="0.1" '
+        f'aria-label="how much of {name} shows the reference"></div><figcaption>drag to compare; the square is '
+        "enlarged below</figcaption></figure>"
+    ]
     if photo is not None:
         figures.append(_figure(sources["photograph"], f"photograph {name}", "the photograph"))
     caption = (
@@ -307,29 +294,15 @@ def _section(
     figures.append(_figure(sources["difference"], f"difference in {name}", caption, mark))
     crops = [_figure(_lossless(pixels[crop]), f"{layer}, enlarged", layer) for layer, pixels in layers.items()]
     shape = "tall" if levels.shape[0] > levels.shape[1] else "wide" if photo is None else "wide photographed"
+    comparison = compared.comparison
+    numbers = f"candidate to reference {comparison.candidate_vs_reference.summary}"
+    if comparison.change is not None:
+        change = _signed(comparison.change, 2)
+        numbers = f"candidate to photograph {comparison.candidate.summary}, change {change} dB · {numbers}"
     return (
-        f'<section class="card" id="{anchor}"><h2>{name}</h2><p class="numbers">{_numbers(compared.comparison)} · '
-        f"{compared.pose}</p>"
+        f'<section class="card" id="{anchor}"><h2>{name}</h2><p class="numbers">{numbers} · {compared.pose}</p>'
         f'<div class="images {shape}">{"".join(figures)}</div>'
         f'<div class="crops">{"".join(crops)}</div></section>'
-    )
-
-
-def _numbers(comparison: Comparison) -> str:
-    to_reference = f"candidate to reference {comparison.candidate_vs_reference.summary}"
-    if comparison.reference is None:
-        return to_reference
-    change = _signed(comparison.change or 0.0, 2)
-    return f"candidate to photograph {comparison.candidate.summary}, change {change} dB · {to_reference}"
-
-
-def _slider(name: str, reference: str, candidate: str, mark: str) -> str:
-    return (
-        f'<figure class="slider"><div class="stage"><img src="{candidate}" alt="candidate, {name}">'
-        f'<img class="before" src="{reference}" alt="reference, {name}">{mark}<span class="tag left">reference</span>'
-        '<span class="tag right">candidate</span><input type="range" min="0" max="100" value="50" step="0.1" '
-        f'aria-label="how much of {name} shows the reference"></div><figcaption>drag to compare; the square is '
-        "enlarged below</figcaption></figure>"
     )
 
 

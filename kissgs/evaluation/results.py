@@ -363,7 +363,13 @@ def drop_of(evaluation: Evaluation) -> float:
         drop = _drop_by(squared_error(mean.candidate_vs_reference.psnr) / squared_error(ASSUMED_PSNR))
         groups = [_errors_to_renderings(evaluation), _errors_to_renderings(over_scene(evaluation))]
     else:
-        drop, groups = -mean.change, [_errors_added(evaluation)]
+        pairs = [
+            (squared_error(view.comparison.candidate.psnr), squared_error(view.comparison.reference.psnr))
+            for view in evaluation.views
+            if view.comparison.reference is not None
+        ]
+        mean_error = max(sum(reference for _, reference in pairs) / len(pairs), 1e-30)
+        drop, groups = -mean.change, [[(candidate - reference) / mean_error for candidate, reference in pairs]]
     worst = _worst(groups) / MAX_ERROR_RATIO
     return _at_least(drop, worst if worst <= 0 else _drop_by(worst))
 
@@ -394,17 +400,6 @@ def _ssim_drops(evaluation: Evaluation) -> list[float]:
 def _errors_to_renderings(evaluation: Evaluation) -> list[float]:
     """Return each view's squared error to the reference's rendering, in units of that of :data:`ASSUMED_PSNR`."""
     return [squared_error(psnr) / squared_error(ASSUMED_PSNR) for psnr in _psnrs(evaluation)]
-
-
-def _errors_added(evaluation: Evaluation) -> list[float]:
-    """Return the growth of each view's squared error to its photograph, in units of the reference's mean error."""
-    pairs = [
-        (squared_error(view.comparison.candidate.psnr), squared_error(view.comparison.reference.psnr))
-        for view in evaluation.views
-        if view.comparison.reference is not None
-    ]
-    mean_error = sum(reference for _, reference in pairs) / len(pairs)
-    return [(candidate - reference) / max(mean_error, 1e-30) for candidate, reference in pairs]
 
 
 def _worst(groups: Sequence[Sequence[float]]) -> float:

@@ -13,13 +13,12 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from kissgs.core.context import Progress
 from kissgs.core.errors import KissgsError
-from kissgs.runners.contract import MEMORY_LIMIT
+from kissgs.runners import MEMORY_LIMIT, Send, event_sender
 
 EVENT_SECONDS = 0.25  # minimum seconds between progress events of a stage
 
@@ -28,19 +27,24 @@ WITHOUT_MEMORY = ("can't start new thread", "error return without exception set"
 
 PR_SET_PDEATHSIG = 1  # of Linux' prctl: the signal that a process gets when its parent dies
 
-Send = Callable[[dict[str, Any]], None]
-
 
 def main() -> None:
     """Read the task, run it, and send its result or its error."""
-    task = json.loads(_first_line())
+    line = os.fdopen(0, "rb", closefd=False).readline()  # nothing follows it
+    if not line.endswith(b"\n"):
+        os._exit(1)
+    task = json.loads(line)
     for number in (signal.SIGINT, signal.SIGTERM):  # sent to the parent, which ends this process if needed
         signal.signal(number, signal.SIG_IGN)
-    _die_with(task["parent"])
+    if sys.platform == "linux":  # which kills it when its parent dies: a long call into a library would delay the exit
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+        if os.getppid() != task["parent"]:  # it has died before
+            os._exit(1)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    send = _sender()
+    send = event_sender(os.dup(1))
+    os.dup2(2, 1)  # for what libraries print
     _limit_resources(task["memory_limit"])
-    send({"outcome": _outcome(task, Throttle(send))})
+    send({"outcome": _outcome(task, throttled(send))})
     os._exit(0)  # without waiting for threads of libraries
 
 
@@ -72,36 +76,20 @@ def _lacks_memory(error: Exception, limit: int | None) -> bool:
     return used > limit / 2
 
 
-class Throttle:
-    """Progress callback that sends the start and end of each stage, and between them one event per interval."""
+def throttled(send: Send) -> Progress:
+    """Return a receiver that sends the start of each stage, and then at most one event per interval."""
+    last, due = ("", -1.0, ""), 0.0
 
-    def __init__(self, send: Send) -> None:
-        self._send = send
-        self._last, self._next = ("", -1.0, ""), 0.0
-
-    def __call__(self, stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
-        """See :class:`kissgs.Progress`."""
-        now = time.monotonic()
-        event = stage, round(min(1.0, max(0.0, fraction)), 4), note
-        if event == self._last or (stage == self._last[0] and now < self._next):
+    def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
+        nonlocal last, due
+        now, event = time.monotonic(), (stage, round(min(1.0, max(0.0, fraction)), 4), note)
+        if event == last or (stage == last[0] and now < due):
             return
-        self._last, self._next = event, now + EVENT_SECONDS
+        last, due = event, now + EVENT_SECONDS
         left = None if seconds_left is None else round(seconds_left, 2)
-        self._send({"stage": stage, "fraction": event[1], "note": note, "seconds_left": left})
+        send({"stage": stage, "fraction": event[1], "note": note, "seconds_left": left})
 
-
-def _sender() -> Send:
-    """Return a function that sends events on standard output, and redirect output of libraries to standard error."""
-    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-    lock = threading.Lock()
-
-    def send(event: dict[str, Any]) -> None:
-        with lock:
-            out.write(json.dumps(event) + "\n")
-            out.flush()
-
-    return send
+    return receive
 
 
 def _limit_resources(memory: int | None) -> None:
@@ -125,24 +113,6 @@ def _load_numba() -> None:
 
     cpu_target.typing_context.refresh()
     cpu_target.target_context.refresh()
-
-
-def _first_line() -> bytes:
-    line = b""
-    while not line.endswith(b"\n"):
-        block = os.read(0, 65536)  # nothing follows the line, so no data is lost
-        if not block:
-            os._exit(1)
-        line += block
-    return line
-
-
-def _die_with(parent: int) -> None:
-    """Let Linux kill this process when its parent dies: a long call into a library would delay the exit."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
-        if os.getppid() != parent:  # it has died before
-            os._exit(1)
 
 
 def _exit_with_parent() -> None:

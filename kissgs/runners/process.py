@@ -8,7 +8,6 @@ import json
 import math
 import os
 import re
-import secrets
 import shutil
 import signal
 import socket
@@ -22,21 +21,9 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import IO, Any
 
+from kissgs import runners
 from kissgs.core.context import Progress, silent
-from kissgs.runners.contract import (
-    CRASHED,
-    INTERNAL,
-    MEMORY_LIMIT,
-    NODE_UNUSABLE,
-    NOT_STARTED,
-    TIME_LIMIT,
-    Outcome,
-    Resources,
-    RunHandle,
-    WorkItem,
-    log,
-    report,
-)
+from kissgs.runners import Outcome, Runner, WorkItem, log, report
 
 PREFIX = "kissgs-item-"  # beginning of the names of temporary folders of items
 
@@ -124,14 +111,21 @@ class ItemProcess:
                 folder = self._item.folder or stack.enter_context(temporary_folder())
                 process = self._start(errors, folder)
             except OSError as error:
-                outcome = self._not_started(error)
+                reason, machine = (error.strerror or str(error)).lower(), socket.gethostname()
+                message = f"the machine {machine} could not start a process: {reason}"
+                outcome = Outcome("lost", code=runners.NOT_STARTED, message=message)
+                of_folder = isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError)
+                if self._item.folder is not None and of_folder:
+                    message = f"the machine {machine} cannot use the folder of the work: {reason}"
+                    outcome = Outcome("error", code=runners.NODE_UNUSABLE, message=message, log=self._item.folder)
             else:
                 status, final = yield from self._follow(process)
                 outcome = self._explain(final, status, errors)
         yield outcome  # now that no file is left
 
     def _follow(self, process: subprocess.Popen[bytes]) -> Generator[ProgressEvent, None, tuple[int, Outcome | None]]:
-        """Yield the progress of the process; return its status and its own outcome, None if it has sent none."""
+        """Yield the progress of the process; return its status and its own outcome, None if it has sent none: it is
+        killed then."""
         threading.Thread(target=self._watch, args=(process.pid,), daemon=True).start()
         final: Outcome | None = None
         try:
@@ -142,17 +136,19 @@ class ItemProcess:
                 else:
                     yield event["stage"], event["fraction"], event["note"], event["seconds_left"]
         finally:  # also if the caller asks for no more events
-            status = self._finish(process, wait=final is not None)
+            if final is None:
+                with self._lock:
+                    self._kill()
+            if hasattr(os, "waitid"):  # not on macOS
+                os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+            with self._lock:  # from here on, its id may be another process's
+                self._ended.set()
+                status = process.wait()
+            for pipe in (process.stdin, process.stdout):
+                assert pipe is not None  # noqa: S101
+                with contextlib.suppress(BrokenPipeError):  # a task that the process has not read
+                    pipe.close()
         return status, final
-
-    def _not_started(self, error: OSError) -> Outcome:
-        reason, machine = (error.strerror or str(error)).lower(), socket.gethostname()
-        of_folder = isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError)
-        if self._item.folder is not None and of_folder:
-            message = f"the machine {machine} cannot use the folder of the work: {reason}"
-            return Outcome("error", code=NODE_UNUSABLE, message=message, log=str(self._item.folder))
-        message = f"the machine {machine} could not start a process: {reason}"
-        return Outcome("lost", code=NOT_STARTED, message=message)
 
     def _start(self, errors: IO[bytes], folder: Path | str) -> subprocess.Popen[bytes]:
         process = subprocess.Popen(
@@ -175,22 +171,6 @@ class ItemProcess:
             process.stdin.flush()
         return process
 
-    def _finish(self, process: subprocess.Popen[bytes], *, wait: bool) -> int:
-        """Wait for the end of the process, which is killed unless its final event has come, and return its status."""
-        if not wait:
-            with self._lock:
-                self._kill()
-        if hasattr(os, "waitid"):  # not on macOS
-            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        with self._lock:  # from here on, its id may be another process's
-            self._ended.set()
-            status = process.wait()
-        for pipe in (process.stdin, process.stdout):
-            assert pipe is not None  # noqa: S101
-            with contextlib.suppress(BrokenPipeError):  # a task that the process has not read
-                pipe.close()
-        return status
-
     def _watch(self, pid: int) -> None:
         """Kill the process at its time limit, and track the peak of the memory that the limit counts (``VmData``)."""
         end = time.monotonic() + (math.inf if self._item.seconds is None else self._item.seconds)
@@ -204,25 +184,25 @@ class ItemProcess:
                 self._peak_data = max(self._peak_data, pages * os.sysconf("SC_PAGE_SIZE"))
 
     def _explain(self, final: Outcome | None, status: int, errors: IO[bytes]) -> Outcome:
-        if final is not None and final.code != MEMORY_LIMIT:
+        if final is not None and final.code != runners.MEMORY_LIMIT:
             return final
         if self._killed:
             return Outcome("cancelled")
         if self._timed_out:
             message = f"the work took longer than its limit of {self._item.seconds:g} s"
-            return Outcome("error", code=TIME_LIMIT, message=message)
+            return Outcome("error", code=runners.TIME_LIMIT, message=message)
         errors.seek(max(0, errors.seek(0, os.SEEK_END) - LOG_BYTES))
         text = errors.read().decode(errors="replace")
         limit = self._item.memory_limit
         near_limit = limit is not None and self._peak_data >= NEAR_LIMIT * limit and status != -signal.SIGKILL
         if final is not None or near_limit or OUT_OF_MEMORY.search(text):
             of = "" if limit is None else f" than its limit of {limit / 1e9:.2g} GB"
-            return Outcome("error", code=MEMORY_LIMIT, message=f"the work needs more memory{of}", log=text)
+            return Outcome("error", code=runners.MEMORY_LIMIT, message=f"the work needs more memory{of}", log=text)
         if status < 0:
             name = signal.Signals(-status).name
-            return Outcome("crashed", code=CRASHED, message=f"the process was ended by {name}", log=text)
+            return Outcome("crashed", code=runners.CRASHED, message=f"the process was ended by {name}", log=text)
         message = "the work failed because of an error in kissgs; please report it"
-        return Outcome("error", code=INTERNAL, message=message, log=text)
+        return Outcome("error", code=runners.INTERNAL, message=message, log=text)
 
 
 def json_lines(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
@@ -246,69 +226,56 @@ def child_environment(secret: tuple[str, ...] = ("KISSGS_", "AWS_")) -> dict[str
 # ``LocalRunner``: work items as processes on this machine, which start at once: the caller limits their number.
 
 
-class LocalRunner:
-    """Runner on this machine, see :class:`kissgs.runners.Runner`."""
+class LocalRunner(Runner):
+    """Runner on this machine."""
 
     def __init__(self) -> None:
-        self._items: dict[str, tuple[ItemProcess, Future[Outcome]]] = {}
+        self._items: dict[Future[Outcome], ItemProcess] = {}
         self._closed = False
         self._lock = threading.Lock()
 
-    @property
-    def nodes(self) -> tuple[Resources, ...]:
-        """See :class:`kissgs.runners.Runner`."""
-        return ()
-
-    def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
-        """See :class:`kissgs.runners.Runner`."""
-        item_id, process, outcome = secrets.token_hex(8), ItemProcess(item), Future[Outcome]()
+    def submit(self, item: WorkItem, progress: Progress = silent) -> Future[Outcome]:
+        """See :class:`Runner`."""
+        process, outcome = ItemProcess(item), Future[Outcome]()
         with self._lock:
             if self._closed:
                 raise RuntimeError("the runner is closed")
-            self._items[item_id] = process, outcome
+            self._items[outcome] = process
 
         def run() -> None:
-            outcome.set_result(_run(process, progress))
+            result = Outcome("cancelled")
+            try:
+                for event in process.events():
+                    if isinstance(event, Outcome):
+                        result = event
+                    else:
+                        report(progress, *event)
+            except Exception as error:  # noqa: BLE001  a bug, of which whoever waits must hear
+                log.exception("an item could not be followed", exc_info=error)
+                message = "the work could not be followed; please report it"
+                result = Outcome("error", code=runners.INTERNAL, message=message)
+            outcome.set_result(result)
             with self._lock:
-                del self._items[item_id]
+                del self._items[outcome]
 
         threading.Thread(target=run, daemon=True).start()
-        return RunHandle(item_id, outcome)
+        return outcome
 
-    def cancel(self, item_id: str) -> None:
-        """See :class:`kissgs.runners.Runner`."""
+    def cancel(self, outcome: Future[Outcome]) -> None:
+        """See :class:`Runner`."""
         with self._lock:
-            if item_id in self._items:
-                self._items[item_id][0].kill()
-
-    def refusal(self, resources: Resources) -> str | None:
-        """See :class:`kissgs.runners.Runner`."""
-        return None
+            if outcome in self._items:
+                self._items[outcome].kill()
 
     def health_problem(self) -> str | None:
-        """See :class:`kissgs.runners.Runner`."""
+        """See :class:`Runner`."""
         return "the runner is closed" if self._closed else None
 
     def close(self) -> None:
-        """See :class:`kissgs.runners.Runner`."""
+        """See :class:`Runner`."""
         with self._lock:
             self._closed = True
-            items = list(self._items.values())
-        for process, _ in items:
+            items = dict(self._items)
+        for process in items.values():
             process.kill()
-        wait([outcome for _, outcome in items])
-
-
-def _run(process: ItemProcess, progress: Progress) -> Outcome:
-    """Report the events of a process and return its outcome."""
-    outcome = Outcome("cancelled")
-    try:
-        for event in process.events():
-            if isinstance(event, Outcome):
-                outcome = event
-            else:
-                report(progress, *event)
-    except Exception as error:  # noqa: BLE001  a bug, of which whoever waits must hear
-        log.exception("an item could not be followed", exc_info=error)
-        return Outcome("error", code=INTERNAL, message="the work could not be followed; please report it")
-    return outcome
+        wait(items)

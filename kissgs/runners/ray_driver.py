@@ -5,7 +5,6 @@ When standard input closes, it ends all items and exits."""
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import math
 import os
@@ -16,7 +15,6 @@ import socket
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,8 +24,7 @@ from ray.exceptions import RayError, RayTaskError, TaskCancelledError
 
 from kissgs._version import __version__
 from kissgs.core.errors import OutputError, RunnerError
-from kissgs.runners import ray_node
-from kissgs.runners.contract import INTERNAL, LOST, NODE_UNUSABLE, Outcome, WorkItem
+from kissgs.runners import INTERNAL, LOST, NODE_UNUSABLE, Outcome, Send, WorkItem, event_sender, ray_node
 
 CONNECT_SECONDS = 5.0  # maximum seconds for a connection to the head's port
 OBJECT_STORE_BYTES = 80 << 20  # of a cluster that is started here: nearly the smallest; nothing is kept there
@@ -37,34 +34,28 @@ FORCE_SECONDS = 5.0  # seconds after which a cancelled task that has not ended i
 EVENTS_AHEAD = 4  # events of a start that have not been read, beyond which its task waits: they may be blocks of files
 LOCAL = "local"  # argument instead of an address: start a cluster on this machine
 
-Send = Callable[[dict[str, Any]], None]
-
 
 def main() -> None:
     """Connect, run items until standard input closes, and disconnect."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    out = os.dup(1)
+    send = event_sender(out)
     os.dup2(2, 1)  # for what Ray prints
-
-    def send(event: dict[str, Any]) -> None:
-        with contextlib.suppress(BrokenPipeError):  # nobody listens any more, and standard input has closed, too
-            out.write(json.dumps(event) + "\n")
-            out.flush()
-
     address = sys.argv[1]
     folder = tempfile.mkdtemp(prefix="kissgs-ray-") if address == LOCAL else None
     try:
-        connect(address) if folder is None else start_here(folder)
+        if folder is not None:
+            start_here(folder)
+        elif not connect(address):
+            # Replace this process by one that starts a cluster on this machine, with a token of its own: without one,
+            # Ray would let everyone in who reaches its ports, or write one to the home folder. It reads its environment
+            # when it is imported, so that this process cannot set one.
+            os.dup2(out, 1)
+            protected = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+            os.execve(sys.executable, [sys.executable, "-P", "-m", f"{__package__}.ray_driver", LOCAL], protected)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # standard input closes when items shall end; Ray sets a handler
         send({"nodes": _nodes()})
         asyncio.run(Driver(send).run())
-    except NoCluster:
-        # Replace this process by one that starts a cluster on this machine, with a token of its own: without one, Ray
-        # would let everyone in who reaches its ports, or write one to the home folder. It reads its environment when it
-        # is imported, so that this process cannot set one.
-        os.dup2(out.fileno(), 1)
-        protected = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
-        os.execve(sys.executable, [sys.executable, "-P", "-m", f"{__package__}.ray_driver", LOCAL], protected)
     except RunnerError as error:
         send({"failed": str(error)})
     finally:
@@ -85,27 +76,33 @@ def _nodes() -> list[dict[str, Any]]:
 # Connection to a cluster that runs, or to one that this process starts.
 
 
-class NoCluster(Exception):
-    """The address is "auto", and there is no cluster on this machine."""
-
-
-def connect(address: str) -> None:
-    """Connect this process to a cluster."""
+def connect(address: str) -> bool:
+    """Connect this process to a cluster; return False if the address is "auto", and this machine has none."""
     given = address if address != "auto" else os.environ.get("RAY_ADDRESS", "")
     if "://" in given:
         raise RunnerError(
             f"{given} is an address for Ray's client; give HOST:PORT of the cluster's head, on a machine of the cluster"
         )
     if given:
-        _check_port(given)
+        host, colon, port = given.rpartition(":")
+        if not colon or not port.isdecimal():
+            raise RunnerError(f"{given} is no address of a Ray cluster; give HOST:PORT of its head, usually port 6379")
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise RunnerError(f"no Ray cluster answers at {given}: {reason}; is its head running there?") from error
     try:
         ray.init(address=given or "auto", log_to_driver=False, configure_logging=False)
-    except ConnectionError as error:
-        if given:
-            raise RunnerError(_refused(given, error)) from error
-        raise NoCluster from error
     except Exception as error:  # among them RuntimeError for another version of Ray or Python
-        raise RunnerError(_refused(given or "of this machine", error)) from error
+        if isinstance(error, ConnectionError) and not given:
+            return False
+        known = given or "of this machine"
+        raise RunnerError(
+            f"cannot join the Ray cluster {known}: {first_line(error)}; this machine must be one of its nodes "
+            f"(ray start --address={known} --num-cpus=0), and have its token if it has one (RAY_AUTH_MODE=token)"
+        ) from error
+    return True
 
 
 def start_here(folder: str) -> None:
@@ -121,24 +118,6 @@ def start_here(folder: str) -> None:
         )
     except Exception as error:
         raise RunnerError(f"Ray cannot be started on this machine: {first_line(error)}") from error
-
-
-def _check_port(address: str) -> None:
-    host, colon, port = address.rpartition(":")
-    if not colon or not port.isdecimal():
-        raise RunnerError(f"{address} is no address of a Ray cluster; give HOST:PORT of its head, usually port 6379")
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RunnerError(f"no Ray cluster answers at {address}: {reason}; is its head running there?") from error
-
-
-def _refused(address: str, error: Exception) -> str:
-    return (
-        f"cannot join the Ray cluster {address}: {first_line(error)}; this machine must be one of its nodes "
-        f"(ray start --address={address} --num-cpus=0), and have its token if it has one (RAY_AUTH_MODE=token)"
-    )
 
 
 def first_line(error: BaseException) -> str:
@@ -197,8 +176,16 @@ class Driver:
             await asyncio.sleep(NODES_SECONDS)
 
     async def _run(self, item_id: str, item: WorkItem) -> None:
+        outcome = Outcome("cancelled")
         try:
-            outcome = await self._start_until_kept(item_id, item)
+            for start in range(1, item.retries + 2):  # again as long as its node is lost
+                outcome = await self._start(item_id, item, start)
+                if outcome.kind != "lost":
+                    break
+                if item_id in self._cancelled:  # and its task killed, because it did not end
+                    outcome = Outcome("cancelled")
+                    break
+                await asyncio.sleep(RETRY_SECONDS)
         except Exception as error:  # noqa: BLE001  a request that Ray refuses, for example; the item must end
             message = f"Ray cannot run the work: {first_line(error)}"
             outcome = Outcome("error", code=INTERNAL, message=message, log=traceback.format_exc()[-4000:])
@@ -207,23 +194,16 @@ class Driver:
         self._cancelled.discard(item_id)
         self._send({"id": item_id, "outcome": asdict(outcome)})
 
-    async def _start_until_kept(self, item_id: str, item: WorkItem) -> Outcome:
-        """Start an item, and again as long as its node is lost and retries are left."""
-        outcome = Outcome("cancelled")
-        for start in range(1, item.retries + 2):
-            outcome = await self._start(item_id, item, start)
-            if outcome.kind != "lost":
-                return outcome
-            if item_id in self._cancelled:  # and its task killed, because it did not end
-                return Outcome("cancelled")
-            await asyncio.sleep(RETRY_SECONDS)
-        return outcome
-
     async def _start(self, item_id: str, item: WorkItem, start: int) -> Outcome:
         """Start an item, a second time with its files if the node does not see its folder; return the outcome."""
+        folder = Path(item.folder or "")
+
+        def stored() -> dict[str, list[Any]]:  # references to blocks in Ray's object store, by name
+            return {name: [ray.put(block) for block in ray_node.blocks_of(folder / name)] for name in item.files}
+
         for with_files in (self._sends_files, True):
             try:
-                files = await asyncio.to_thread(_stored_files, item) if with_files and item.files else None
+                files = await asyncio.to_thread(stored) if with_files and item.files else None
             except OSError as error:
                 return _unusable_files(error)
             if item_id in self._cancelled:
@@ -279,12 +259,6 @@ class Driver:
             ray.cancel(self._generators[item_id])
             return _unusable_files(error)
         return Outcome("lost", code=LOST, message="the work ended without an outcome", node=node)
-
-
-def _stored_files(item: WorkItem) -> dict[str, list[Any]]:
-    """Store an item's files as blocks in Ray's object store; return references to them by name."""
-    folder = Path(item.folder or "")
-    return {name: [ray.put(block) for block in ray_node.blocks_of(folder / name)] for name in item.files}
 
 
 def _unusable_files(error: OSError) -> Outcome:

@@ -13,7 +13,7 @@ from typing import Any
 import ray
 
 from kissgs._version import __version__
-from kissgs.runners.contract import NODE_UNUSABLE, Outcome, WorkItem
+from kissgs.runners import NODE_UNUSABLE, Outcome, WorkItem
 from kissgs.runners.process import ItemProcess, temporary_folder
 
 BLOCK_BYTES = 8 << 20  # bytes of a block; the object store of a small cluster has 80 MB

@@ -20,24 +20,22 @@ from typing import IO, Any
 
 from kissgs.core.context import Progress, silent
 from kissgs.core.errors import RunnerError
-from kissgs.runners.contract import UNREACHABLE, Outcome, Resources, RunHandle, WorkItem, log, refusal_of, report
+from kissgs.runners import UNREACHABLE, Outcome, Resources, Runner, WorkItem, log, refusal_of, report
 from kissgs.runners.process import child_environment, json_lines
 
 CONNECT_SECONDS = 60.0  # maximum seconds for the connection to a cluster, or the start of one on this machine
 RECONNECT_SECONDS = 5.0  # minimum seconds between two attempts to connect again
 CLOSE_SECONDS = 20.0  # for the end of all items and of the driver; then it is killed, and Ray ends the items
 
-NOT_INSTALLED = "Ray is not installed; install it on every machine with: pip install ray"
 
-
-class RayRunner:
-    """Runner on a Ray cluster, see :class:`kissgs.runners.Runner`. ``address`` is HOST:PORT, or "auto" for that of
+class RayRunner(Runner):
+    """Runner on a Ray cluster. ``address`` is HOST:PORT, or "auto" for that of
     ``RAY_ADDRESS`` or of a cluster on this machine, and if there is none, for a new one on this machine until the
     runner is closed. Raises RunnerError if it cannot be reached."""
 
     def __init__(self, address: str = "auto") -> None:
         if find_spec("ray") is None:
-            raise RunnerError(NOT_INSTALLED)
+            raise RunnerError("Ray is not installed; install it on every machine with: pip install ray")
         self._address = address
         self._items: dict[str, tuple[Progress, Future[Outcome]]] = {}
         self._nodes: tuple[Resources, ...] = ()
@@ -55,11 +53,11 @@ class RayRunner:
 
     @property
     def nodes(self) -> tuple[Resources, ...]:
-        """See :class:`kissgs.runners.Runner`."""
+        """See :class:`Runner`."""
         return self._nodes
 
-    def submit(self, item: WorkItem, progress: Progress = silent) -> RunHandle:
-        """See :class:`kissgs.runners.Runner`."""
+    def submit(self, item: WorkItem, progress: Progress = silent) -> Future[Outcome]:
+        """See :class:`Runner`."""
         item_id, outcome = secrets.token_hex(8), Future[Outcome]()
         with self._lock:
             if self._closed:
@@ -70,20 +68,21 @@ class RayRunner:
                 self._send({"submit": item_id, "item": asdict(item)})
         if problem is not None:
             outcome.set_result(Outcome("lost", code=UNREACHABLE, message=problem))
-        return RunHandle(item_id, outcome)
+        return outcome
 
-    def cancel(self, item_id: str) -> None:
-        """See :class:`kissgs.runners.Runner`."""
+    def cancel(self, outcome: Future[Outcome]) -> None:
+        """See :class:`Runner`."""
         with self._lock:
-            if item_id in self._items:
-                self._send({"cancel": item_id})
+            for item_id, (_, waiting) in self._items.items():
+                if waiting is outcome:
+                    self._send({"cancel": item_id})
 
     def refusal(self, resources: Resources) -> str | None:
-        """See :class:`kissgs.runners.Runner`."""
+        """See :class:`Runner`."""
         return self._problem or refusal_of(resources, self._nodes)
 
     def health_problem(self) -> str | None:
-        """See :class:`kissgs.runners.Runner`."""
+        """See :class:`Runner`."""
         with self._lock:
             ended = self._driver is None and not self._closed
             if ended and time.monotonic() > self._last_attempt + RECONNECT_SECONDS:
@@ -95,7 +94,7 @@ class RayRunner:
             return self._problem
 
     def close(self) -> None:
-        """See :class:`kissgs.runners.Runner`."""
+        """See :class:`Runner`."""
         with self._lock:
             self._closed = True
             driver, outcomes = self._driver, [outcome for _, outcome in self._items.values()]
@@ -150,8 +149,12 @@ class RayRunner:
                 self._nodes = tuple(Resources(**node) for node in event["nodes"])
                 self._problem = None
                 self._connected.set()
+            elif "progress" in event:
+                report(self._items[event["id"]][0], *event["progress"])
             else:
-                self._handle(event)
+                with self._lock:
+                    _, outcome = self._items.pop(event["id"])
+                outcome.set_result(Outcome(**event["outcome"]))
         status = driver.wait()
         with self._lock:
             self._driver, self._nodes, self._problem = None, (), failure
@@ -167,13 +170,3 @@ class RayRunner:
         for _, outcome in items.values():
             outcome.set_result(Outcome("lost", code=UNREACHABLE, message=failure))
         self._connected.set()
-
-    def _handle(self, event: dict[str, Any]) -> None:
-        item_id = event["id"]
-        progress, outcome = self._items[item_id]
-        if "progress" in event:
-            report(progress, *event["progress"])
-        else:
-            with self._lock:
-                del self._items[item_id]
-            outcome.set_result(Outcome(**event["outcome"]))

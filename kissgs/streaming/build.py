@@ -30,34 +30,9 @@ from kissgs.rendering.camera import Camera
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt import FORMAT_NAME
-from kissgs.streaming.layout import (
-    CAMERAS,
-    ENVIRONMENT,
-    OUT,
-    VIEW,
-    ContainerFile,
-    Layout,
-    chunk_file,
-    environment_file,
-    leaves_file,
-    level_file,
-    read_counts,
-    read_leaves,
-    rows_file,
-    write_json,
-)
-from kissgs.streaming.levels import (
-    Environment,
-    append_rows,
-    chunk_levels,
-    from_rows,
-    read_rows,
-    row_bytes,
-    sync,
-    times_to_halve,
-    to_rows,
-    write_rows,
-)
+from kissgs.streaming import work_folder as scratch
+from kissgs.streaming.levels import Environment, chunk_levels, times_to_halve
+from kissgs.streaming.work_folder import ContainerFile, Layout
 
 # Settings of the files of a level.
 
@@ -115,7 +90,8 @@ def measure_file(
     uncertainty = VIEW_UNCERTAINTY[False] if settings.view_uncertainty is None else settings.view_uncertainty
     whole, weighted = concatenate([splats, others]), WeightedCameras(seeing, [1.0] * len(seeing), black())
     found = measure_sensitivity(whole, weighted, view_uncertainty=uncertainty, threads=threads, progress=progress)
-    own = _rows(found, slice(len(splats)))
+    arrays = [field.name for field in fields(Sensitivity) if field.name != "view_uncertainty"]
+    own = replace(found, **{name: getattr(found, name)[: len(splats)] for name in arrays})
     share = np.float32(len(seeing) / len(cameras))  # the mean is over the images of all cameras
     for values in (own.position_hessian, own.shape_hessian, own.color_weight, own.prior):
         values *= share
@@ -130,11 +106,6 @@ def _shown(camera: Camera, splats: Splats) -> float:
     pixels = ahead[:, :2] / ahead[:, 2:] * camera.K[[0, 1], [0, 1]]
     inside = (np.abs(pixels) < REACH / 2 * np.array([camera.width, camera.height])).all(axis=1)
     return float(np.square(camera.K[0, 0] / ahead[inside, 2]).sum())
-
-
-def _rows(sensitivity: Sensitivity, rows: slice) -> Sensitivity:
-    arrays = [field.name for field in fields(Sensitivity) if field.name != "view_uncertainty"]
-    return replace(sensitivity, **{name: getattr(sensitivity, name)[rows] for name in arrays})
 
 
 # The steps. Every one reads and writes files of the work folder, and the last file that it writes marks it as done. So
@@ -185,8 +156,8 @@ def partition(
     cuts = Cuts.of(sample[:, :3], times_to_halve(count, CHUNK))
     if container == "sog":  # which has a range of each axis
         cuts = cuts_without_coarse(sample, cuts, count)
-    for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in range(cuts.chunks))):
-        path.unlink(missing_ok=True)
+    for part in (scratch.ENVIRONMENT, *range(cuts.chunks)):
+        scratch.gaussians_file(work, part).unlink(missing_ok=True)
     notes: tuple[str, ...] = ()
     far_count, counts, sh_degree, changed = 0, np.zeros(cuts.chunks, np.int64), 0, Counter[str]()
     antialiased = False
@@ -195,16 +166,17 @@ def partition(
         changed.update(removed)
         sh_degree, antialiased = splats.sh_degree, splats.antialiased
         far = environment.contains(splats.means)
-        append_rows(environment_file(work), to_rows(splats.select(far)))
+        scratch.append_rows(scratch.gaussians_file(work, scratch.ENVIRONMENT), scratch.to_rows(splats.select(far)))
         far_count, splats, origin = far_count + int(far.sum()), splats.select(~far), splats.origin
         chunks = cuts.chunk_of(splats.means)
-        rows = to_rows(splats)
+        rows = scratch.to_rows(splats)
         for chunk in np.unique(chunks):
             some = rows[chunks == chunk]
-            append_rows(chunk_file(work, int(chunk)), some)
+            scratch.append_rows(scratch.gaussians_file(work, int(chunk)), some)
             counts[chunk] += len(some)
     total = int(counts.sum())
     levels = 1 + times_to_halve(total, COARSEST)
+    parts = 1 << (max(1, MOST_ENTRIES // (levels * cuts.chunks)).bit_length() - 1)  # chunks are halved until it fits
     layout = Layout(
         container=container,
         source_count=count,
@@ -212,67 +184,68 @@ def partition(
         counts=tuple(map(int, counts)),
         depth=cuts.depth,
         levels=levels,
-        leaf=leaf_size(total, cuts.chunks, levels),
+        leaf=max(LEAF, math.ceil(UNEVEN * total / (cuts.chunks * parts))),
         environment=far_count,
         changed=dict(changed),
         notes=notes,
         origin=origin,
         antialiased=antialiased,
     )
-    for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in layout.filled)):
-        sync(path)
+    scratch.sync(scratch.gaussians_file(work, scratch.ENVIRONMENT))
+    for chunk in layout.filled:
+        scratch.sync(scratch.gaussians_file(work, chunk))
     return layout
-
-
-def leaf_size(total: int, chunks: int, levels: int) -> int:
-    """Return the largest number of Gaussians in a leaf; chunks are halved until their leaves are not larger."""
-    parts = 1 << (max(1, MOST_ENTRIES // (levels * chunks)).bit_length() - 1)
-    return max(LEAF, math.ceil(UNEVEN * total / (chunks * parts)))
 
 
 def make_levels(work: Path, layout: Layout, chunk: int, threads: int, progress: Progress = silent) -> None:
     """Merge a chunk into its levels, one file of rows each; ``progress`` receives "merge"."""
-    rows = read_rows(chunk_file(work, chunk), layout.sh_degree, layout.counts[chunk])
-    splats = from_rows(rows, antialiased=layout.antialiased)
-    levels, leaves = chunk_levels(splats, layout.levels, layout.leaf, threads, progress)
+    chunk_splats = scratch.read_gaussians(work, layout, [chunk])
+    levels, leaves = chunk_levels(chunk_splats, layout.levels, layout.leaf, threads, progress)
     for level, merged in enumerate(levels):
-        write_rows(level_file(work, chunk, level), to_rows(merged))
-    write_json(leaves_file(work, chunk), leaves)
-    chunk_file(work, chunk).unlink(missing_ok=True)
+        scratch.write_rows(scratch.gaussians_file(work, chunk, level), scratch.to_rows(merged))
+    scratch.write_json(scratch.leaves_file(work, chunk), leaves)
+    scratch.gaussians_file(work, chunk).unlink(missing_ok=True)
 
 
 def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: int) -> None:
     """Choose the cameras that sensitivity is measured with, and write them to a file."""
-    level = _read_level(work, layout, layout.levels - 1, layout.filled)
-    coarsest = concatenate([level, read_environment(work, layout)])
+    coarsest = concatenate(
+        [
+            scratch.read_gaussians(work, layout, layout.filled, layout.levels - 1),
+            scratch.read_gaussians(work, layout, [scratch.ENVIRONMENT]),
+        ]
+    )
     total = sum(layout.counts) + layout.environment
     least = min(MOST_VIEWS, VIEWS_PER_CHUNK * len(layout.filled))
     views = settings.sensitivity_views or max(default_view_count(total, captured=False), least)
     size = settings.sensitivity_view_size
     cameras, view = sensitivity_cameras(coarsest, None, Context(threads), count=views, size=size)
-    write_json(work / VIEW, view)  # before the cameras, which mark this step as done
-    write_json(work / CAMERAS, [camera_as_dict(camera) for camera in cameras.cameras])
+    scratch.write_json(work / scratch.VIEW, view)  # before the cameras, which mark this step as done
+    scratch.write_json(work / scratch.CAMERAS, [camera_as_dict(camera) for camera in cameras.cameras])
 
 
 def make_file(
     work: Path, layout: Layout, settings: EncodeSettings, file: ContainerFile, threads: int, progress: Progress = silent
 ) -> None:
     """Write a container; ``settings`` are those of the finest level, ``progress`` receives stages of the encoder."""
-    if file.name == ENVIRONMENT:
-        splats = read_environment(work, layout)
+    if file.name == scratch.ENVIRONMENT:
+        splats = scratch.read_gaussians(work, layout, [scratch.ENVIRONMENT])
         counts = [len(splats)]
     else:
-        splats = _read_level(work, layout, file.level, file.chunks)
-        counts = [count for chunk in file.chunks for count in read_leaves(work, chunk)["counts"][file.level]]
+        splats = scratch.read_gaussians(work, layout, file.chunks, file.level)
+        counts = [count for chunk in file.chunks for count in scratch.read_leaves(work, chunk)["counts"][file.level]]
     groups = np.repeat(np.arange(len(counts)), counts).astype(np.uint16)
     settings = file_settings(settings, file.level, layout.sh_degree)
     stored: dict[str, Any] = {"counts": [0] * len(counts), "note": ""}
     if len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
         sensitivity = None
         if settings.rate_distortion:
-            others = _others(work, layout, file)
-            cameras = [view.camera for view in read_cameras(work / CAMERAS)]
-            sensitivity = measure_file(splats, others, cameras, file.level, settings, threads, progress)
+            rest = [chunk for chunk in layout.filled if chunk not in file.chunks]
+            others = [scratch.read_gaussians(work, layout, rest, layout.context)]
+            if file.name != scratch.ENVIRONMENT:
+                others.append(scratch.read_gaussians(work, layout, [scratch.ENVIRONMENT]))
+            cameras = [view.camera for view in read_cameras(work / scratch.CAMERAS)]
+            sensitivity = measure_file(splats, concatenate(others), cameras, file.level, settings, threads, progress)
             del others
         context = Context(threads, progress=progress)
         plan = plan_encoding(
@@ -286,55 +259,31 @@ def make_file(
         )
         del sensitivity, splats
         encoded = write_files(layout.container, plan, settings, context)
-        write_container(encoded.files, work / OUT / layout.path(file.name), overwrite=True)
+        write_container(encoded.files, work / scratch.OUT / layout.path(file.name), overwrite=True)
         rows = np.bincount(groups[encoded.order], minlength=len(counts)).tolist()
         stored = {"counts": rows, "note": encoded.coarse}
-    write_json(rows_file(work, file.name), stored)
+    scratch.write_json(scratch.rows_file(work, file.name), stored)
     if file.level != layout.context:
         for chunk in file.chunks:
-            level_file(work, chunk, file.level).unlink(missing_ok=True)
-
-
-def _others(work: Path, layout: Layout, file: ContainerFile) -> Splats:
-    """Return what stands for the rest of the scene where the sensitivity of a file is measured."""
-    chunks = [chunk for chunk in layout.filled if chunk not in file.chunks]
-    others = [_read_level(work, layout, layout.context, chunks)]
-    if file.name != ENVIRONMENT:
-        others.append(read_environment(work, layout))
-    return concatenate(others)
+            scratch.gaussians_file(work, chunk, file.level).unlink(missing_ok=True)
 
 
 def coarse_note(work: Path, layout: Layout) -> str:
     """Return the note of the first file of the finest level whose positions are coarse; else an empty string."""
-    notes = (read_counts(work, file.name)["note"] for file in layout.files() if not file.level)
+    notes = (scratch.read_counts(work, file.name)["note"] for file in layout.files() if not file.level)
     note = next(filter(None, notes), "")
     return note.removesuffix(f": {STREAMED_REMEDY}") if layout.container == "sog" else note
-
-
-def read_environment(work: Path, layout: Layout) -> Splats:
-    """Return the Gaussians of the environment."""
-    rows = read_rows(environment_file(work), layout.sh_degree, layout.environment)
-    return from_rows(rows, antialiased=layout.antialiased)
-
-
-def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -> Splats:
-    rows = [
-        read_rows(level_file(work, chunk, level), layout.sh_degree, sum(read_leaves(work, chunk)["counts"][level]))
-        for chunk in chunks
-    ]
-    together = np.concatenate(rows) if rows else np.empty((0, row_bytes(layout.sh_degree) // 4), np.float32)
-    return from_rows(together, antialiased=layout.antialiased)
 
 
 def make_manifest(work: Path, layout: Layout) -> None:
     """Write the manifest: a tree over space, whose leaves name their rows in the files of each level."""
     lods: dict[tuple[int, int], dict[int, dict[str, int]]] = {}
     filenames, totals = list[str](), [0] * layout.levels
-    leaves_of = {chunk: read_leaves(work, chunk) for chunk in layout.filled}
+    leaves_of = {chunk: scratch.read_leaves(work, chunk) for chunk in layout.filled}
     for file in layout.files():
         offset = 0
         own = [(chunk, leaf) for chunk in file.chunks for leaf in range(len(leaves_of[chunk]["bounds"]))]
-        for leaf_of_chunk, count in zip(own, read_counts(work, file.name)["counts"], strict=True):
+        for leaf_of_chunk, count in zip(own, scratch.read_counts(work, file.name)["counts"], strict=True):
             if count:
                 rows = {"file": len(filenames), "offset": offset, "count": count}
                 lods.setdefault(leaf_of_chunk, {})[file.level] = rows
@@ -349,8 +298,8 @@ def make_manifest(work: Path, layout: Layout) -> None:
                 low, high = ([float(f"{value:.7g}") for value in corner] for corner in corners)
                 levels = {str(level): rows for level, rows in sorted(lods[chunk, leaf].items())}
                 leaves.append({"bound": {"min": low, "max": high}, "lods": levels, "errors": errors})
-    view = json.loads((work / VIEW).read_bytes()) if (work / VIEW).exists() else None
-    has_environment = (work / OUT / layout.path(ENVIRONMENT)).exists()
+    view = json.loads((work / scratch.VIEW).read_bytes()) if (work / scratch.VIEW).exists() else None
+    has_environment = (work / scratch.OUT / layout.path(scratch.ENVIRONMENT)).exists()
     document = {
         "version": 1,
         **({"format": FORMAT_NAME} if layout.container == "sogxt" else {}),
@@ -360,11 +309,11 @@ def make_manifest(work: Path, layout: Layout) -> None:
         "counts": totals,
         "lodLevels": layout.levels,
         "lodErrors": True,
-        **({"environment": layout.entry(ENVIRONMENT)} if has_environment else {}),
+        **({"environment": layout.entry(scratch.ENVIRONMENT)} if has_environment else {}),
         "filenames": filenames,
         "tree": _node(leaves),
     }
-    write_json(work / OUT / layout.manifest, document)
+    scratch.write_json(work / scratch.OUT / layout.manifest, document)
 
 
 def _node(leaves: list[dict[str, Any]]) -> dict[str, Any]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from kissgs._version import __version__
 from kissgs.core.context import Context, JobProgress, Progress, silent
@@ -21,26 +24,12 @@ from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.io.scene_format import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.limited_time import speed
 from kissgs.pipeline.scene_files import AnyPath, read_scene, recognise, refuse_level, scene_root, stored_bytes
-from kissgs.runners import Resources, Runner, WorkItem, error_of
+from kissgs.runners import PROCESS_BYTES, Resources, Runner, WorkItem, error_of
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.streaming import build
 from kissgs.streaming import work_folder as scratch
 from kissgs.streaming.build import Blocks
-from kissgs.streaming.layout import (
-    CAMERAS,
-    ENVIRONMENT,
-    OUT,
-    PARTITION,
-    Layout,
-    keep_layout,
-    leaves_file,
-    read_counts,
-    read_layout,
-    rows_file,
-    work_folder,
-    write_json,
-)
-from kissgs.streaming.levels import row_bytes
+from kissgs.streaming.work_folder import Layout
 
 SECONDS = {
     False: {"partition": (0.0, 1.0), "merge": (0.0, 6.4), "images": (0.0, 8.6)},
@@ -51,6 +40,7 @@ rate-distortion planning, that is, with the presets ``fast`` and ``balanced``.""
 
 
 REPORT = "report.json"  # file of the work folder: the report, once everything is made
+ENCODED_BYTES = 30  # upper estimate of the encoded bytes of a Gaussian with all its levels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,8 +118,15 @@ def compress_streamed(
         )
     if manifest.parent.name in ("", ".."):
         manifest = manifest.parent.resolve() / manifest.name
-    container, work = MANIFESTS[manifest.name], work_folder(manifest)
-    _check_settings(settings)
+    container, work = MANIFESTS[manifest.name], scratch.work_folder(manifest)
+    limited = settings.encode.has_goal or settings.time_limit is not None
+    if settings.compact.enabled or settings.finetune.enabled or limited:
+        raise UnsupportedError(
+            "levels of detail are made without goals, time limits, compaction and fine-tuning; leave these out, or "
+            "write a .sog"
+        )
+    if settings.encode.order == "plas":
+        raise UnsupportedError("levels of detail need order=hilbert or order=refined, not plas")
     if scratch.read_json(work / REPORT) is None:
         scratch.check_destination(manifest, source, overwrite=overwrite)
     with scratch.claimed(work, {"container": container, **_identity(source, settings, reading)}):
@@ -137,10 +134,10 @@ def compress_streamed(
         if (found := scratch.read_json(work / REPORT)) is None:
             layout = _partition(work, source, container, settings, reading, threads, job)
             found = asdict(_make(work, layout, settings, runner, threads, job))
-            write_json(work / REPORT, found)
+            scratch.write_json(work / REPORT, found)
         scratch.finish(work, manifest, source, overwrite=overwrite)
     job.stop()
-    return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
+    return TypeAdapter(StreamedReport).validate_python(found)
 
 
 def _make(
@@ -167,7 +164,7 @@ def _make(
             run_item(item, context.stage(stage).progress)
 
     run("merge", "chunk", layout.filled)
-    if encode.rate_distortion and not (work / CAMERAS).exists():
+    if encode.rate_distortion and not (work / scratch.CAMERAS).exists():
         progress("cameras", 0.0)
         build.make_cameras(work, layout, encode, threads)
     run("images", "file", [file.name for file in layout.all_files()])
@@ -179,28 +176,27 @@ def _make(
 # Work items: the levels of a chunk ("chunk"), or a container of the result ("file"). Those of a step do not depend on
 # each other. One that is run twice, because its node was given up, writes the same bytes again.
 
-PROCESS_BYTES = 500_000_000  # memory of an item for libraries, bytes
 MEMORY_RATIO = 5  # memory of an item for each byte of the Gaussians of its file as float32
 POLL_SECONDS = 0.5  # seconds between reports of progress, which may also stop the work
 
 
 def _is_made(item: dict[str, Any]) -> bool:
-    work = Path(item["work"])
-    return (leaves_file(work, item["chunk"]) if "chunk" in item else rows_file(work, item["file"])).exists()
+    file, of = (scratch.leaves_file, "chunk") if "chunk" in item else (scratch.rows_file, "file")
+    return file(Path(item["work"]), item[of]).exists()
 
 
 def run_item(item: dict[str, Any], progress: Progress) -> dict[str, Any]:
     """Run an item, here or on a node, unless it is made. A node that was given up may still be at work: what it
     completes meanwhile, it takes the input of."""
     work, threads = Path(item["work"]), item["threads"]
-    if scratch.read_json(work / PARTITION) is None:
+    if (layout := scratch.read_layout(work)) is None:
         raise UnsupportedError(
             f"the machine {socket.gethostname()} does not see {work}; "
             "--ray needs storage that all machines see at the same path"
         )
-    layout, settings = read_layout(work), EncodeSettings.model_validate(item["settings"])
     if _is_made(item):
         return {}
+    settings = EncodeSettings.model_validate(item["settings"])
     try:
         if "chunk" in item:
             build.make_levels(work, layout, item["chunk"], threads, progress)
@@ -215,12 +211,12 @@ def run_item(item: dict[str, Any], progress: Progress) -> dict[str, Any]:
 
 def _run_all(runner: Runner, items: list[dict[str, Any]], layout: Layout, report: Callable[[float], None]) -> None:
     """Run items and wait for them; if one fails, or the caller is stopped, the others are cancelled."""
-    memory = PROCESS_BYTES + MEMORY_RATIO * max(layout.counts) * row_bytes(layout.sh_degree)
+    memory = PROCESS_BYTES + MEMORY_RATIO * max(layout.counts) * scratch.row_bytes(layout.sh_degree)
     requested = Resources(cpus=items[0]["threads"], memory=memory)
     if refusal := runner.refusal(requested):
         raise UnsupportedError(f"{refusal}; choose another number with --threads")
-    handles = [runner.submit(WorkItem(f"{__name__}:run_item", item, requested)) for item in items]
-    waiting = {handle.outcome for handle in handles}
+    outcomes = [runner.submit(WorkItem(f"{__name__}:run_item", item, requested)) for item in items]
+    waiting = set(outcomes)
     try:
         while waiting:
             report(1 - len(waiting) / len(items))
@@ -229,22 +225,10 @@ def _run_all(runner: Runner, items: list[dict[str, Any]], layout: Layout, report
                 if each.result().kind != "done":
                     raise error_of(each.result())
     except BaseException:
-        for handle in handles:
-            runner.cancel(handle.id)
-        wait([handle.outcome for handle in handles])
+        for outcome in outcomes:
+            runner.cancel(outcome)
+        wait(outcomes)
         raise
-
-
-def _check_settings(settings: Settings) -> None:
-    """Refuse settings that do not fit, before any work."""
-    limited = settings.encode.has_goal or settings.time_limit is not None
-    if settings.compact.enabled or settings.finetune.enabled or limited:
-        raise UnsupportedError(
-            "levels of detail are made without goals, time limits, compaction and fine-tuning; leave these out, or "
-            "write a .sog"
-        )
-    if settings.encode.order == "plas":
-        raise UnsupportedError("levels of detail need order=hilbert or order=refined, not plas")
 
 
 def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, int, int]:
@@ -293,16 +277,20 @@ def _partition(
     job: JobProgress,
 ) -> Layout:
     """Partition the scene, unless that has been done, and set the steps of the job."""
-    if scratch.read_json(work / PARTITION) is not None:
-        layout = read_layout(work)
+    if (layout := scratch.read_layout(work)) is not None:
         _announce(job, work, layout.source_count, layout.sh_degree, settings, threads)
         return layout
     before = _identity(source, settings, reading)
     try:
-        (work / OUT).mkdir(exist_ok=True)
+        (work / scratch.OUT).mkdir(exist_ok=True)
         blocks, count, sh_degree = _reader(source, reading, threads)
-        # Later, files are deleted as others are written, so that the folder hardly grows.
-        scratch.check_space(work, scratch.needed_bytes(count, sh_degree))
+        needed, free = _needed_bytes(count, sh_degree), shutil.disk_usage(work).free
+        if needed - sum(path.stat().st_size for path in work.rglob("*") if path.is_file()) > free:
+            # Here only: later, files are deleted as others are written, so that the folder hardly grows.
+            raise OutputError(
+                f"{work} will take up to {megabytes(needed)}, but its disk has {megabytes(free)} free; "
+                "free some, or write to another disk"
+            )
         _announce(job, work, count, sh_degree, settings, threads)
         layout = build.partition(work, blocks, count, container, settings.encode, job)
         if not any(layout.counts):
@@ -312,7 +300,7 @@ def _partition(
     except BaseException:
         scratch.remove(work)  # a partition that is not complete is of no use
         raise
-    keep_layout(work, layout)
+    scratch.write_json(work / scratch.PARTITION, asdict(layout))  # which marks it as done
     return layout
 
 
@@ -320,20 +308,30 @@ def _announce(job: JobProgress, work: Path, count: int, sh_degree: int, settings
     """Set the steps of the job, and report the size of the work folder."""
     millions, stages = count / 1e6, SECONDS[settings.encode.rate_distortion]
     job.expect([(stage, (fixed + each * millions) / speed(threads)) for stage, (fixed, each) in stages.items()])
-    needed = scratch.megabytes(scratch.needed_bytes(count, sh_degree))
-    job("scratch", 1.0, f"{work} takes up to {needed} until the work is done")
+    needed = _needed_bytes(count, sh_degree)
+    job("scratch", 1.0, f"{work} takes up to {megabytes(needed)} until the work is done")
+
+
+def _needed_bytes(count: int, sh_degree: int) -> int:
+    """Return the most bytes that the work folder takes: all levels as float32, a chunk once more, and the result."""
+    return (2 * count + min(count, build.CHUNK)) * scratch.row_bytes(sh_degree) + count * ENCODED_BYTES
+
+
+def megabytes(count: float) -> str:
+    """Format bytes: "10,622 MB", and below one megabyte "34 kB"."""
+    return f"{count / 1e6:,.0f} MB" if count >= 1e6 else f"{count / 1e3:,.0f} kB"
 
 
 def _report(work: Path, layout: Layout) -> StreamedReport:
-    out = work / OUT
+    out = work / scratch.OUT
     document = json.loads((out / layout.manifest).read_bytes())
     sizes = [0] * layout.levels
     for file in layout.files():
         path = out / layout.path(file.name)
         if path.exists():  # files without a visible Gaussian are not written
             sizes[file.level] += stored_bytes(path)
-    environment = out / layout.path(ENVIRONMENT)
-    environment_count = sum(read_counts(work, ENVIRONMENT)["counts"]) if environment.exists() else 0
+    environment = out / layout.path(scratch.ENVIRONMENT)
+    environment_count = sum(scratch.read_counts(work, scratch.ENVIRONMENT)["counts"]) if environment.exists() else 0
     environment_bytes = stored_bytes(environment) if environment.exists() else 0
     pruned = sum(layout.counts) + layout.environment - document["counts"][0] - environment_count
     return StreamedReport(

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,69 +12,9 @@ import numpy as np
 from kissgs.compaction.merging import covariances_of, merged_levels
 from kissgs.core.array_types import Bool, Float32, Float64, Int64
 from kissgs.core.context import Progress, Workers, silent
-from kissgs.core.errors import OutputError
-from kissgs.core.splats import SH_REST_COUNTS, Splats, concatenate
-from kissgs.io.files import atomic_file, reason_of
+from kissgs.core.splats import Splats, concatenate
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.rasterizer import render
-
-# Gaussians as rows of float32 numbers in scratch files, which can be appended to and read back bit by bit.
-
-
-def row_bytes(sh_degree: int) -> int:
-    """Return the bytes of one Gaussian."""
-    return 4 * (14 + 3 * SH_REST_COUNTS[sh_degree])
-
-
-def to_rows(splats: Splats) -> Float32[np.ndarray, "N F"]:
-    """Return all numbers of each Gaussian in a row."""
-    rest, logits = splats.shN.reshape(len(splats), 3 * splats.shN.shape[1]), splats.opacities[:, None]
-    return np.concatenate([splats.means, splats.quats, splats.scales, logits, splats.sh0, rest], axis=1)
-
-
-def from_rows(rows: Float32[np.ndarray, "N F"], *, antialiased: bool) -> Splats:
-    """Return the Gaussians of rows, of a scene that is ``antialiased`` or not."""
-    parts = (np.ascontiguousarray(part) for part in np.split(rows, (3, 7, 10, 11, 14), axis=1))
-    means, quats, scales, opacities, sh0, rest = parts
-    shN = rest.reshape(len(rows), rest.shape[1] // 3, 3)
-    return Splats(
-        means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh0=sh0, shN=shN, antialiased=antialiased
-    )
-
-
-def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
-    """Append rows to a file."""
-    with _explained("write", path), path.open("ab") as file:
-        file.write(np.ascontiguousarray(rows).data)
-
-
-def write_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
-    """Write a file of rows, atomically; an existing file is replaced."""
-    with atomic_file(path, overwrite=True) as file:
-        file.write(np.ascontiguousarray(rows).data)
-
-
-def sync(path: Path) -> None:
-    """Wait until a file is on the disk."""
-    with _explained("write", path), path.open("ab") as file:
-        os.fsync(file.fileno())
-
-
-def read_rows(path: Path, sh_degree: int, count: int) -> Float32[np.ndarray, "N F"]:
-    """Read a file of ``count`` rows."""
-    with _explained("read", path):
-        values, size = np.fromfile(path, np.float32), path.stat().st_size
-    if size != count * row_bytes(sh_degree):
-        raise OutputError(f"{path} is not complete; delete {path.parent} and start again")
-    return values.reshape(count, row_bytes(sh_degree) // 4)
-
-
-@contextlib.contextmanager
-def _explained(what: str, path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"cannot {what} {path}: {reason_of(error)}") from error
 
 
 def times_to_halve(count: int, most: int) -> int:

@@ -1,4 +1,4 @@
-"""The work folder of a streamed scene: whose work it holds, its room on the disk, and the last step of the work."""
+"""The work folder of a streamed scene: sizes of the scene, files, whose work it holds, and its last step."""
 
 from __future__ import annotations
 
@@ -8,22 +8,219 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
+import numpy as np
+from pydantic import TypeAdapter
+
+from kissgs.core.array_types import Float32
 from kissgs.core.errors import OutputError
-from kissgs.formats import MANIFESTS
-from kissgs.io.files import move_into_place, path_state, reason_of
+from kissgs.core.positions import Origin
+from kissgs.core.splats import SH_REST_COUNTS, Splats
+from kissgs.formats import MANIFESTS, ContainerName
+from kissgs.io.containers import META_NAME
+from kissgs.io.files import atomic_file, move_into_place, path_state, reason_of
 from kissgs.io.streamed import MAX_TREE_BYTES
 from kissgs.sog import FILES
-from kissgs.streaming.build import CHUNK
-from kissgs.streaming.layout import OUT, continuation, write_json
-from kissgs.streaming.levels import row_bytes
+
+# ``Layout``: sizes of a streamed scene; and the files of its work folder.
+
+CONTEXT = 280_000  # largest number of Gaussians of the level that stands for other chunks where sensitivity is measured
+# The partition's marker; cameras; the first view; the result.
+PARTITION, CAMERAS, VIEW, OUT = "partition.json", "cameras.json", "view.json", "out"
+ENVIRONMENT = "environment"  # name of the environment's container
+
+
+@dataclass(frozen=True, slots=True)
+class ContainerFile:
+    """A container of the result: one level of some chunks, or the environment, which has no chunks."""
+
+    name: str
+    level: int = 0
+    chunks: tuple[int, ...] = ()  # those that have Gaussians
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Sizes of a streamed scene: numbers of Gaussians, but for ``depth`` and ``levels``."""
+
+    container: ContainerName
+    source_count: int  # before cleaning
+    sh_degree: int
+    counts: tuple[int, ...]  # in each chunk
+    depth: int  # number of cuts one after another; there are 2^depth chunks
+    levels: int
+    leaf: int  # at most, in a leaf
+    environment: int
+    changed: dict[str, int]  # by cleaning, by kind; and "invisible"
+    notes: tuple[str, ...]  # what reading the scene left out or changed, and where its positions are
+    origin: Origin
+    antialiased: bool = False
+
+    @property
+    def filled(self) -> list[int]:
+        """Chunks that have Gaussians."""
+        return [chunk for chunk, count in enumerate(self.counts) if count]
+
+    @property
+    def manifest(self) -> str:
+        """File name of the manifest."""
+        return next(name for name, container in MANIFESTS.items() if container == self.container)
+
+    @property
+    def context(self) -> int:
+        """Level that stands for other chunks where sensitivity is measured: the finest of few Gaussians."""
+        total = sum(self.counts)
+        return next((level for level in range(self.levels) if total >> level <= CONTEXT), self.levels - 1)
+
+    def path(self, name: str) -> str:
+        """Return the path of a container in the folder of the result: that of a folder for SOG, else of a zip."""
+        return name if self.container == "sog" else f"{name}.zip"
+
+    def entry(self, name: str) -> str:
+        """Return how the manifest names a container."""
+        return f"{name}/{META_NAME}" if self.container == "sog" else self.path(name)
+
+    def files(self) -> list[ContainerFile]:
+        """Return the containers of all levels, the coarsest first: each has twice the chunks of one a level finer."""
+        found = []
+        for level in reversed(range(self.levels)):
+            size = 1 << min(level, self.depth)
+            for number in range((1 << self.depth) // size):
+                chunks = [chunk for chunk in range(number * size, (number + 1) * size) if self.counts[chunk]]
+                if chunks:
+                    found.append(ContainerFile(f"{level}_{number}", level, tuple(chunks)))
+        return found
+
+    def all_files(self) -> list[ContainerFile]:
+        """Return all containers, the environment first if there is one."""
+        return [ContainerFile(ENVIRONMENT), *self.files()] if self.environment else self.files()
+
+
+def work_folder(manifest: Path) -> Path:
+    """Return the work folder of a streamed scene, given its manifest."""
+    folder = manifest.parent if manifest.parent.name not in ("", "..") else manifest.parent.resolve()
+    return folder.parent / f"{folder.name}.partial"
+
+
+def continuation(work: Path) -> str:
+    """Return what the same command does after the work has ended early: all that follows the partition is kept."""
+    return f"the same command {'goes on where it was' if (work / PARTITION).exists() else 'begins anew'}"
+
+
+def read_layout(work: Path) -> Layout | None:
+    """Return the layout of a scene; None if it is not partitioned yet."""
+    found = read_json(work / PARTITION)
+    return None if found is None else TypeAdapter(Layout).validate_python(found)
+
+
+def read_leaves(work: Path, chunk: int) -> dict[str, Any]:
+    """Return the bounds and errors of a chunk's leaves, and their counts by level."""
+    return json.loads(leaves_file(work, chunk).read_bytes())
+
+
+def gaussians_file(work: Path, part: int | str, level: int | None = None) -> Path:
+    """Return the file of the Gaussians of a level of a chunk; without ``level``, that of a chunk until its levels are
+    made, or of the :data:`ENVIRONMENT`."""
+    name = part if isinstance(part, str) else f"chunk_{part}"
+    return work / f"{name}{'' if level is None else f'_level_{level}'}.f32"
+
+
+def leaves_file(work: Path, chunk: int) -> Path:
+    """Return the file of a chunk's leaves, which marks its levels as done."""
+    return work / f"chunk_{chunk}.json"
+
+
+def rows_file(work: Path, name: str) -> Path:
+    """Return the file of the number of rows of each leaf in a container, which marks the container as done."""
+    return work / f"file_{name}.json"
+
+
+def read_counts(work: Path, name: str) -> dict[str, Any]:
+    """Return the number of rows of each leaf in a container, and the note of its encoding."""
+    return json.loads(rows_file(work, name).read_bytes())
+
+
+def write_json(path: Path, values: object) -> None:
+    """Write JSON atomically."""
+    with atomic_file(path, overwrite=True) as file:
+        file.write(json.dumps(values, separators=(",", ":")).encode())
+
+
+# Gaussians as rows of float32 numbers in scratch files, which can be appended to and read back bit by bit.
+
+
+def row_bytes(sh_degree: int) -> int:
+    """Return the bytes of one Gaussian."""
+    return 4 * (14 + 3 * SH_REST_COUNTS[sh_degree])
+
+
+def to_rows(splats: Splats) -> Float32[np.ndarray, "N F"]:
+    """Return all numbers of each Gaussian in a row."""
+    rest, logits = splats.shN.reshape(len(splats), 3 * splats.shN.shape[1]), splats.opacities[:, None]
+    return np.concatenate([splats.means, splats.quats, splats.scales, logits, splats.sh0, rest], axis=1)
+
+
+def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
+    """Append rows to a file."""
+    with _explained("write", path), path.open("ab") as file:
+        file.write(np.ascontiguousarray(rows).data)
+
+
+def write_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
+    """Write a file of rows, atomically; an existing file is replaced."""
+    with atomic_file(path, overwrite=True) as file:
+        file.write(np.ascontiguousarray(rows).data)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file is on the disk."""
+    with _explained("write", path), path.open("ab") as file:
+        os.fsync(file.fileno())
+
+
+def read_gaussians(work: Path, layout: Layout, parts: Sequence[int | str], level: int | None = None) -> Splats:
+    """Return the Gaussians of these chunks, or of the :data:`ENVIRONMENT`, from :func:`gaussians_file` of each."""
+    rows, width = [], row_bytes(layout.sh_degree) // 4
+    for part in parts:
+        if isinstance(part, str):
+            count = layout.environment
+        else:
+            count = layout.counts[part] if level is None else sum(read_leaves(work, part)["counts"][level])
+        path = gaussians_file(work, part, level)
+        with _explained("read", path):
+            values, size = np.fromfile(path, np.float32), path.stat().st_size
+        if size != 4 * width * count:
+            raise OutputError(f"{path} is not complete; delete {path.parent} and start again")
+        rows.append(values.reshape(count, width))
+    together = rows[0] if len(rows) == 1 else np.concatenate([np.empty((0, width), np.float32), *rows])
+    columns = [np.ascontiguousarray(column) for column in np.split(together, (3, 7, 10, 11, 14), axis=1)]
+    return Splats(
+        means=columns[0],
+        quats=columns[1],
+        scales=columns[2],
+        opacities=columns[3][:, 0],
+        sh0=columns[4],
+        shN=columns[5].reshape(len(together), SH_REST_COUNTS[layout.sh_degree], 3),
+        antialiased=layout.antialiased,
+    )
+
+
+@contextlib.contextmanager
+def _explained(what: str, path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"cannot {what} {path}: {reason_of(error)}") from error
+
+
+# Whose work the folder holds, and its result.
 
 WORK, LOCK = "work.json", "lock"  # files: which work the folder belongs to; locked by the process that works in it
 TEMPORARY = ".kissgs."  # beginning of the names of files that are being written
-ENCODED_BYTES = 30  # upper estimate of the encoded bytes of a Gaussian with all its levels
 
 
 def check_destination(manifest: Path, source: Path, *, overwrite: bool) -> None:
@@ -80,8 +277,12 @@ def claimed(work: Path, mine: dict[str, Any]) -> Iterator[None]:
     except OSError as error:
         raise OutputError(f"cannot make {work}: {reason_of(error)}") from error
     with lock:
-        if not _locked(lock):
-            raise OutputError(f"another process works in {work}; wait for it, or choose another name")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OutputError(f"another process works in {work}; wait for it, or choose another name") from error
+        except OSError:  # a network file system without locks
+            pass
         if (work / WORK).exists() and read_json(work / WORK) != mine:
             raise OutputError(f"{work} belongs to other or older work; delete it, or choose another name")
         for left in (*work.glob(f"{TEMPORARY}*"), *(work / OUT).glob(f"{TEMPORARY}*"), _discarded(work)):
@@ -94,38 +295,6 @@ def claimed(work: Path, mine: dict[str, Any]) -> Iterator[None]:
             if not any(os.strerror(number).lower() in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
                 raise
             raise OutputError(f"{error}; once there is room, {continuation(work)}") from error
-
-
-def _locked(lock: BinaryIO) -> bool:
-    """Lock a file until it is closed, or the process ends; return False if another process has locked it."""
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a network file system without locks
-        return True
-    return True
-
-
-def needed_bytes(count: int, sh_degree: int) -> int:
-    """Return the most bytes that the work folder takes: all levels as float32, a chunk once more, and the result."""
-    return (2 * count + min(count, CHUNK)) * row_bytes(sh_degree) + count * ENCODED_BYTES
-
-
-def megabytes(count: float) -> str:
-    """Format bytes: "10,622 MB", and below one megabyte "34 kB"."""
-    return f"{count / 1e6:,.0f} MB" if count >= 1e6 else f"{count / 1e3:,.0f} kB"
-
-
-def check_space(work: Path, needed: int) -> None:
-    """Check, before the partition, that the disk has room for the work folder; what is in it counts as free."""
-    present = sum(path.stat().st_size for path in work.rglob("*") if path.is_file())
-    free = shutil.disk_usage(work).free
-    if needed - present > free:
-        raise OutputError(
-            f"{work} will take up to {megabytes(needed)}, but its disk has {megabytes(free)} free; "
-            "free some, or write to another disk"
-        )
 
 
 def finish(work: Path, manifest: Path, source: Path, *, overwrite: bool) -> None:

@@ -7,6 +7,7 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from anyio.to_thread import run_sync
 
 import kissgs
 from kissgs import runners
-from kissgs.runners import Outcome, Resources, RunHandle, Runner, WorkItem
+from kissgs.runners import Outcome, Resources, Runner, WorkItem
+from kissgs.runners.process import LocalRunner
+from kissgs.runners.ray_runner import RayRunner
 
 from ..core.files import BYTES_PER_GAUSSIAN, container_file
 from ..core.models import Job, State
@@ -53,9 +56,9 @@ class JobRunners:
     def __init__(self, settings: ServiceSettings) -> None:
         """Open the runner that the settings name."""
         self.settings = settings
-        self.local: Runner = runners.LocalRunner()
+        self.local: Runner = LocalRunner()
         address = settings.ray_address
-        self.runner = self.local if address is None else runners.RayRunner(address)
+        self.runner = self.local if address is None else RayRunner(address)
 
     def health_problem(self) -> str | None:
         """Return why no job can run at the moment; None if jobs can."""
@@ -101,7 +104,7 @@ class JobProcess:
 
     def __init__(self, job_runners: JobRunners) -> None:
         self._runner = job_runners
-        self._handle: RunHandle | None = None
+        self._end: Callable[[], None] = lambda: None  # ends the process, once there is one
         self._used = job_runners.local
         self.killed = False
         self.work: Path | None = None
@@ -111,10 +114,6 @@ class JobProcess:
         """Kill the process now, or as soon as it has started."""
         self.killed = True
         self._end()
-
-    def _end(self) -> None:
-        if self._handle is not None:
-            self._used.cancel(self._handle.id)
 
     async def run(self, task: dict[str, Any], on_progress: OnProgress | None = None) -> Outcome:
         """Run a task (see :mod:`service.jobs.job_process`); if the caller is cancelled, the process is killed."""
@@ -128,8 +127,9 @@ class JobProcess:
         def receive(stage: str, fraction: float, note: str = "", seconds_left: float | None = None) -> None:
             loop.call_soon_threadsafe(events.put_nowait, (stage, fraction, note, seconds_left))
 
-        self._handle = self._used.submit(item, receive)
-        outcome = asyncio.wrap_future(self._handle.outcome)
+        running = self._used.submit(item, receive)
+        self._end = partial(self._used.cancel, running)
+        outcome = asyncio.wrap_future(running)
         outcome.add_done_callback(lambda _: events.put_nowait(None))
         try:
             while (event := await events.get()) is not None:

@@ -71,12 +71,12 @@ def interrupted(path, *arguments, **options):
 pathlib.Path.unlink = interrupted
 """,
     "after the partition": """
-import kissgs.streaming.compress as module
-keep = module.keep_layout
-def kept(*arguments):
-    keep(*arguments)
-    os.kill(os.getpid(), signal.SIGINT)
-module.keep_layout = kept
+import kissgs.streaming.work_folder as module
+write = module.write_json
+def written(path, values):
+    write(path, values)
+    if path.name == module.PARTITION: os.kill(os.getpid(), signal.SIGINT)
+module.write_json = written
 """,
     "in the next run while modules are imported": """
 class Finder:
@@ -85,7 +85,7 @@ class Finder:
 sys.meta_path.insert(0, Finder())
 """,
     "in the next run before it has read the layout": """
-import kissgs.streaming.compress as module
+import kissgs.streaming.work_folder as module
 module.read_layout = lambda work: os.kill(os.getpid(), signal.SIGINT)
 """,
 }

@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-from kissgs.runners.contract import Resources, WorkItem
+from kissgs.runners import Resources, WorkItem
 
 MB = 1_000_000
 ONE_PROCESSOR = Resources()
@@ -17,7 +17,7 @@ def item(function, resources=ONE_PROCESSOR, **values):
 
 
 def outcome_of(runner, work):
-    return runner.submit(work).outcome.result(120)
+    return runner.submit(work).result(120)
 
 
 def processors(runner):

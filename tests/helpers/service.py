@@ -25,7 +25,6 @@ import pytest
 from fastapi import FastAPI
 
 import kissgs
-import kissgs.runners
 from helpers.running import wait_until
 from helpers.thread_runner import HELD_SEED, ThreadRunner
 from kissgs.io.ply import write_ply
@@ -117,7 +116,7 @@ class Service:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(FastAPI, "openapi", _openapi)
             if not self.processes:
-                patch.setattr(kissgs.runners, "LocalRunner", ThreadRunner)
+                patch.setattr("service.jobs.process.LocalRunner", ThreadRunner)
             app = create_app(settings)
         listener = listen(settings)
         self._server = _Server(app, app.state.context)

@@ -2,16 +2,15 @@
 
 import importlib
 import json
-import secrets
 import threading
 from concurrent.futures import Future
 from pathlib import Path
 
 import kissgs
 from kissgs.core.context import silent
-from kissgs.runners import INTERNAL, LocalRunner, Outcome, RunHandle
-from kissgs.runners.contract import log, report
-from kissgs.runners.item_process import Throttle
+from kissgs.runners import INTERNAL, Outcome, log, report
+from kissgs.runners.item_process import throttled
+from kissgs.runners.process import LocalRunner
 
 HELD_SEED = 4_000_001
 """Seed of jobs that wait until they are cancelled."""
@@ -21,17 +20,17 @@ class ThreadRunner(LocalRunner):
     """``LocalRunner`` without processes and their limits, for jobs of a service."""
 
     def submit(self, item, progress=silent):
-        item_id, running, outcome = secrets.token_hex(8), _ItemThread(item), Future()
+        running, outcome = _ItemThread(item), Future()
         with self._lock:
-            self._items[item_id] = running, outcome
+            self._items[outcome] = running
 
         def run():
             outcome.set_result(running.outcome(progress))
             with self._lock:
-                del self._items[item_id]
+                del self._items[outcome]
 
         threading.Thread(target=run, daemon=True).start()
-        return RunHandle(item_id, outcome)
+        return outcome
 
 
 class _ItemThread:
@@ -43,7 +42,7 @@ class _ItemThread:
         self._killed.set()
 
     def outcome(self, progress):
-        send = Throttle(lambda event: report(progress, *event.values()))
+        send = throttled(lambda event: report(progress, *event.values()))
 
         def watched(stage, fraction, note="", seconds_left=None):
             if self._killed.is_set():

@@ -179,9 +179,9 @@ def test_ctrl_c_ends_a_search_with_its_best(tmp_path):
     kissgs.save(kissgs.sample_scene(20_000, sh_degree=2), scene)
     program = """
 import os, signal, sys
-from kissgs.cli import signals
+from kissgs.cli import files
 from kissgs.cli import compress_scenes as command
-original = signals.stoppable
+original = files.stoppable
 
 def stoppable(progress, searches):
     def receive(stage, fraction, note=""):

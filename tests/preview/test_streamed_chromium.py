@@ -33,14 +33,14 @@ def city(tmp_path_factory):
 @pytest.fixture
 def server(city, monkeypatch):
     """A server whose files of other levels than the coarsest wait for ``server.gate``."""
-    find = server_module._Handler._find
+    answer = server_module._Handler.do_GET
 
-    def held(handler, path):
-        if re.search(r"/[0-2]_\d/", path) and not handler.server.gate.wait(100):
-            raise TimeoutError(path)
-        return find(handler, path)
+    def held(handler):
+        if re.search(r"/[0-2]_\d/", handler.path) and not handler.server.gate.wait(100):
+            raise TimeoutError(handler.path)
+        answer(handler)
 
-    monkeypatch.setattr(server_module._Handler, "_find", held)
+    monkeypatch.setattr(server_module._Handler, "do_GET", held)
     with serving(streamed_folder(city)) as server:
         server.gate = threading.Event()
         yield server

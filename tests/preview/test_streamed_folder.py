@@ -14,7 +14,7 @@ from helpers.viewers import scattered
 import kissgs
 from kissgs import preview as module
 from kissgs.core.errors import InvalidContainerError
-from kissgs.preview import fitting_level, is_streamed_folder, streamed_folder
+from kissgs.preview import fitting_level, streamed_folder
 
 NAME = "two words % & ü"
 
@@ -130,11 +130,9 @@ def test_the_level_for_a_page_of_one_file(made, city, monkeypatch):
         assert fitting_level(made)[0] == level
     shutil.make_archive(str(city.parent / "zipped"), "zip", city)
     assert fitting_level(city.parent / "zipped.zip") == fitting_level(made)
-    assert not is_streamed_folder(city.parent / "zipped.zip")
-    assert is_streamed_folder(made)
-    assert is_streamed_folder(made / "lod-meta.json")
-    assert not is_streamed_folder(made / "0_0")
-    assert not is_streamed_folder(Path("none"))
+    assert streamed_folder(made) == streamed_folder(made / "lod-meta.json")
+    for other in (city.parent / "zipped.zip", made / "0_0", Path("none")):
+        assert streamed_folder(other) is None
 
 
 def test_the_level_for_a_page_counts_the_environment(tmp_path):

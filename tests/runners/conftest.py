@@ -6,7 +6,7 @@ import pytest
 from helpers.ray_cluster import PATHS, RayCluster
 from helpers.running import processors, wait_until
 
-from kissgs.runners import LocalRunner
+from kissgs.runners.process import LocalRunner
 
 
 @pytest.fixture(autouse=True, scope="package")
@@ -32,7 +32,7 @@ def ray_cluster():
 
 @pytest.fixture(scope="package")
 def ray_runner(ray_cluster):
-    from kissgs.runners import RayRunner
+    from kissgs.runners.ray_runner import RayRunner
 
     runner = RayRunner(ray_cluster.address)
     yield runner

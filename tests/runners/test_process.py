@@ -14,8 +14,7 @@ from helpers.running import MB, is_alive, item, outcome_of, pid_in, wait_until
 
 import kissgs
 from kissgs.cli.compress_scenes import with_memory
-from kissgs.runners import Resources, WorkItem, error_of
-from kissgs.runners.contract import refusal_of
+from kissgs.runners import Resources, WorkItem, error_of, refusal_of
 from kissgs.runners.process import ItemProcess, json_lines
 
 
@@ -122,7 +121,7 @@ def test_a_request_is_that_of_a_node_which_has_all_of_it():
 def test_an_item_gives_its_result_and_its_progress_in_order(runner, tmp_path):
     events = []
     handle = runner.submit(item("count", numbers=5, folder=str(tmp_path)), lambda *event: events.append(event))
-    outcome = handle.outcome.result(120)
+    outcome = handle.result(120)
     assert (outcome.kind, outcome.result) == ("done", {"numbers": 5, "folder": str(tmp_path)})
     assert events == [(f"stage {n}", n / 5, f"note {n}") for n in range(5)]
     assert runner.health_problem() is None
@@ -151,7 +150,7 @@ def test_a_crash_ends_that_item_alone(runner):
     assert "SIGSEGV" in outcome.message
     assert isinstance(error_of(outcome), kissgs.RunnerError)
     assert error_of(outcome).code == "crashed"
-    assert other.outcome.result(120).kind == "done"
+    assert other.result(120).kind == "done"
 
 
 def test_the_memory_limit_ends_that_item_alone(runner):
@@ -174,12 +173,12 @@ def test_a_running_item_is_cancelled_with_its_process(runner, tmp_path):
     work = item("count", numbers=1000, seconds_between=0.05, pid=str(tmp_path / "pid"))
     handle = runner.submit(work, lambda *event: events.append(event))
     wait_until(lambda: events)
-    runner.cancel(handle.id)
-    assert handle.outcome.result(30).kind == "cancelled"
+    runner.cancel(handle)
+    assert handle.result(30).kind == "cancelled"
     count = len(events)
     wait_until(lambda: not is_alive(pid_in(tmp_path / "pid")), seconds=5)
     assert len(events) == count
-    runner.cancel(handle.id)  # once more: nothing happens
+    runner.cancel(handle)  # once more: nothing happens
     assert outcome_of(runner, item("count", numbers=1)).kind == "done"
 
 

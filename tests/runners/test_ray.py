@@ -13,15 +13,16 @@ from helpers.ray_cluster import NODE_MEMORY
 from helpers.running import MB, is_alive, item, outcome_of, pid_in, processors, wait_until
 
 from kissgs.core.errors import RunnerError
-from kissgs.runners import RayRunner, Resources
+from kissgs.runners import Resources
 from kissgs.runners import ray_runner as ray_runner_module
+from kissgs.runners.ray_runner import RayRunner
 
 DRIVER = """
 import sys
 from helpers.running import item
-from kissgs.runners import RayRunner
+from kissgs.runners.ray_runner import RayRunner
 runner = RayRunner(sys.argv[1])
-runner.submit(item("write_slowly", starts=sys.argv[2], output=sys.argv[3], text="text")).outcome.result()
+runner.submit(item("write_slowly", starts=sys.argv[2], output=sys.argv[3], text="text")).result()
 """
 
 
@@ -31,7 +32,7 @@ def test_an_item_that_loses_all_of_its_nodes_is_lost(whole_cluster, ray_runner, 
     handle = ray_runner.submit(work)
     first = pid_in(tmp_path / "starts")
     whole_cluster.kill_node_of(first)
-    outcome = handle.outcome.result(120)
+    outcome = handle.result(120)
     assert (outcome.kind, outcome.code) == ("lost", "node-lost")
     assert "was lost" in outcome.message
 
@@ -42,7 +43,7 @@ def test_a_killed_worker_of_ray_takes_its_item_along(whole_cluster, ray_runner, 
     handle = ray_runner.submit(item("write_slowly", starts=str(starts), output=str(output), text="x"))
     first = pid_in(starts)
     os.kill(int(Path(f"/proc/{first}/stat").read_text().rpartition(")")[2].split()[1]), signal.SIGKILL)
-    outcome = handle.outcome.result(120)
+    outcome = handle.result(120)
     assert outcome.kind == "done"
     assert len(starts.read_text().splitlines()) == 2
     assert not is_alive(first)
@@ -69,7 +70,7 @@ def test_a_lost_connection_is_an_outcome_and_is_made_again_until_the_end(ray_clu
         handle = runner.submit(item("count", numbers=1, seconds_between=600, pid=str(tmp_path / "pid")))
         pid = pid_in(tmp_path / "pid")
         runner._driver.kill()
-        outcome = handle.outcome.result(30)
+        outcome = handle.result(30)
         assert (outcome.kind, outcome.code) == ("lost", "cluster-unreachable")
         wait_until(lambda: not is_alive(pid), seconds=30)
         wait_until(lambda: runner.health_problem() is None)
@@ -79,7 +80,7 @@ def test_a_lost_connection_is_an_outcome_and_is_made_again_until_the_end(ray_clu
         waiting = [runner.submit(item("count", numbers=1, seconds_between=600)) for _ in range(3)]
     finally:
         runner.close()
-    assert {handle.outcome.result(0).kind for handle in [running, *waiting]} == {"cancelled"}
+    assert {handle.result(0).kind for handle in [running, *waiting]} == {"cancelled"}
     wait_until(lambda: not is_alive(pid), seconds=5)
     assert runner.health_problem() == "the runner is closed"
 
@@ -91,8 +92,8 @@ def test_a_waiting_item_is_cancelled_before_it_starts(whole_cluster, ray_runner,
     wait_until(lambda: all(pid.exists() for pid in pids[:2]))
     handles.insert(0, ray_runner.submit(item("count", numbers=1, pid=str(pids[2]))))
     for handle in handles:
-        ray_runner.cancel(handle.id)
-        assert handle.outcome.result(30).kind == "cancelled"
+        ray_runner.cancel(handle)
+        assert handle.result(30).kind == "cancelled"
     assert outcome_of(ray_runner, item("count", numbers=1)).kind == "done"
     assert not pids[2].exists()
 
@@ -102,7 +103,7 @@ def test_a_waiting_item_is_cancelled_before_it_starts(whole_cluster, ray_runner,
 def test_no_more_items_run_than_their_requests_allow(whole_cluster, ray_runner, tmp_path, request_of_each):
     work = item("record", request_of_each, times=str(tmp_path), seconds_between=0.4)
     handles = [ray_runner.submit(work) for _ in range(5)]
-    assert [handle.outcome.result(120).kind for handle in handles] == ["done"] * 5
+    assert [handle.result(120).kind for handle in handles] == ["done"] * 5
     spans = [tuple(map(float, path.read_text().split())) for path in tmp_path.iterdir()]
     assert len(spans) == 5
     assert max(sum(start <= moment < end for start, end in spans) for moment, _ in spans) <= 2
@@ -115,9 +116,9 @@ def test_an_item_that_fits_nowhere_is_refused_beforehand_and_waits(whole_cluster
     handles = [ray_runner.submit(item("count", each, numbers=1)) for each in large]
     time.sleep(0.3)
     for handle in handles:
-        assert not handle.outcome.done()
-        ray_runner.cancel(handle.id)
-        assert handle.outcome.result(30).kind == "cancelled"
+        assert not handle.done()
+        ray_runner.cancel(handle)
+        assert handle.result(30).kind == "cancelled"
 
 
 @pytest.mark.quick(1)

@@ -79,7 +79,7 @@ def test_an_item_whose_node_is_killed_leaves_its_checkpoint(whole_cluster, ray_r
     assert {path.name for path in folder.iterdir()} == {"scene", "checkpoint"}
     (pid,) = whole_cluster.items()
     whole_cluster.kill_node_of(pid)
-    outcome = handle.outcome.result(120)
+    outcome = handle.result(120)
     assert outcome.kind == "done"
     assert stages[0][:2] == stages[-1][:2] == ("digest", 0.0)
     assert outcome.result["folder"].startswith(str(whole_cluster.folder))
@@ -92,6 +92,6 @@ def test_an_item_whose_node_is_killed_leaves_its_checkpoint(whole_cluster, ray_r
 def test_files_that_cannot_be_stored_end_the_item(ray_cluster, ray_runner, work):
     folder, submitted = work
     shutil.rmtree(folder)
-    outcome = ray_runner.submit(submitted).outcome.result(120)
+    outcome = ray_runner.submit(submitted).result(120)
     assert (outcome.kind, outcome.code) == ("error", "output")
     assert outcome.message == "the files of the work cannot be read or written: no such file or directory"

@@ -204,7 +204,7 @@ def test_expiry(start):
 
 def test_clock_jumps(tmp_path, monkeypatch):
     """A jump of the clock by a year neither expires jobs early nor makes durations negative."""
-    monkeypatch.setattr(kissgs.runners, "LocalRunner", ThreadRunner)
+    monkeypatch.setattr("service.jobs.process.LocalRunner", ThreadRunner)
     context = opened(tmp_path / "data")
     job_id = add_a_job(context, SMALL)
     real = time.time

@@ -8,7 +8,7 @@ import pytest
 from helpers.data_folders import add_a_job, service
 from sqlalchemy.exc import OperationalError
 
-from kissgs.runners import NOT_STARTED, Outcome, Resources, RunHandle
+from kissgs.runners import NOT_STARTED, Outcome, Resources
 from service.core.models import State
 from service.core.settings import ServiceSettings
 from service.jobs import worker as worker_module
@@ -35,7 +35,7 @@ class Cluster:
     def submit(self, item, progress):
         future = Future()
         future.set_result(self.outcome)
-        return RunHandle("1", future)
+        return future
 
     def cancel(self, item_id):
         pass

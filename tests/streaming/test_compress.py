@@ -229,7 +229,7 @@ def test_what_cannot_be_made_leaves_nothing(scene, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100_000))
     with pytest.raises(
-        OutputError, match=r"city\.partial will take up to 459 kB, but its disk has 100 kB free; free some"
+        OutputError, match=r"city\.partial will take up to 358 kB, but its disk has 100 kB free; free some"
     ):
         compress_streamed(scene, target, settings=FAST)
     assert [path.name for path in tmp_path.iterdir()] == ["cut.ply"]

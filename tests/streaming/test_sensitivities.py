@@ -15,7 +15,7 @@ from kissgs.core.splats import concatenate, sampled_rows
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import EncodeSettings
-from kissgs.streaming import layout
+from kissgs.streaming import work_folder
 from kissgs.streaming.build import measure_file
 from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.levels import SIZE, leaf_groups, level_errors, times_to_halve
@@ -59,7 +59,7 @@ def test_cameras_that_do_not_see_a_file_count_as_images_without_it():
 @pytest.mark.quick(0)
 def test_the_default_preset_spends_bits_by_sensitivity_and_goes_on_after_its_cameras(tmp_path, monkeypatch):
     small_sizes(monkeypatch, chunk=1600, leaf=400, coarsest=1000)
-    monkeypatch.setattr(layout, "CONTEXT", 1500)
+    monkeypatch.setattr(work_folder, "CONTEXT", 1500)
     kissgs.save(kissgs.sample_scene(3000, sh_degree=1, seed=3), tmp_path / "scene.ply")
     report = compress_streamed(tmp_path / "scene.ply", tmp_path / "whole" / "lod-meta.json", settings=BALANCED)
     assert len(report.counts) == 3
