@@ -19,12 +19,15 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from pydantic import ValidationError
+
 from bench.common import head, parser_with_views, row, run, signed, write
 from bench.curves import bytes_at
 from bench.external import FORMATS, Measured, measure_external
 from kissgs import KissgsError, Preset, Settings, Views, sample_scene, save
 from kissgs.cli.bench import measured
 from kissgs.cli.options import chosen
+from kissgs.settings import GOALS, EncodeSettings
 
 HEAD = "codec", "bytes", "per Gaussian", "wall s", "CPU s", "decode CPU s", "peak MB"
 IMAGES = "PSNR to photographs", "change, dB", "SSIM", "PSNR to the original", "SSIM", "worst view"
@@ -75,7 +78,7 @@ def codecs_of(given: argparse.Namespace) -> list[Codec]:
         settings = chosen(preset, given.set)
         found.append(Codec(preset, preset, partial(with_settings, settings=settings)))
         for offset in given.offsets if settings.encode.rate_distortion else ():
-            tuned = chosen(preset, [*given.set, f"quality_offset_db={offset}"])
+            tuned = at_quality_offset(settings, offset)
             found.append(Codec(f"{preset} at {offset:g}", preset, partial(with_settings, settings=tuned)))
         for change in dict.fromkeys(given.each):
             changed = chosen(preset, [*given.set, change])
@@ -84,6 +87,16 @@ def codecs_of(given: argparse.Namespace) -> list[Codec]:
     for ending in given.external:
         found.append(Codec(f".{ending}", "", partial(by_tool, ending=ending, sh_iterations=given.sog_iterations)))
     return found
+
+
+def at_quality_offset(settings: Settings, decibels: float) -> Settings:
+    """Return settings with rate-distortion planning at another quality offset, without a lambda or a goal."""
+    changes = {"quality_offset_db": decibels, "rd_lambda": None, **dict.fromkeys(GOALS)}
+    try:
+        encode = EncodeSettings(**{**settings.encode.model_dump(), **changes})
+    except ValidationError as error:
+        raise KissgsError(f"a quality offset of {decibels:g}: {error.errors()[0]['msg'].lower()}") from error
+    return settings.model_copy(update={"encode": encode})
 
 
 def measure_preset(scene: Path, *, settings: Settings, views: Views | None) -> Measured:

@@ -42,8 +42,9 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("container", nargs="?", type=Path)
     given = parser.parse_args().container
-    container = given.read_bytes() if given else kissgs.compress(kissgs.sample_scene(GAUSSIANS)).to_zip()
-    count = len(kissgs.decompress(container))
+    made = given or kissgs.compress(kissgs.sample_scene(GAUSSIANS)).to_zip()
+    count = len(kissgs.decompress(made))
+    container = made if isinstance(made, bytes) else made.read_bytes()
     write(f"{count:,} Gaussians, {len(container):,} bytes; milliseconds, medians of {PAGES} pages")
     runs: dict[str, list[list[float]]] = {way: [] for way in WAYS}
     site = Site()

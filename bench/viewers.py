@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -160,7 +161,8 @@ def sheet_of(files: Sequence[Drawn]) -> bytes:
                 difference = rms_difference(image.astype(np.float32), own[camera].astype(np.float32))
                 images += [as_bytes(image), heat_map(difference, FULL_ERROR)]
                 labels += [Label(f"{name}: {drawn.name}"), Label(f"error, 0 to {FULL_ERROR}")]
-    return png(contact_sheet([each[::2, ::2] for each in images], labels, columns=1 + 2 * len(files[2:])))
+    small = [np.asarray(Image.fromarray(each).reduce(2)) for each in images]
+    return png(contact_sheet(small, labels, columns=1 + 2 * len(files[2:])))
 
 
 def as_bytes(image: np.ndarray) -> np.ndarray:

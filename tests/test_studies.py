@@ -17,6 +17,7 @@ from PIL import Image
 
 import kissgs
 from bench import paper_parts
+from bench.codecs import at_quality_offset
 from bench.curves import bytes_at
 from bench.external import measure_external
 from bench.rendering import resampled
@@ -47,6 +48,11 @@ def test_bytes_are_interpolated_exponentially_and_not_extrapolated(growth):
         assert bytes_at([*curve, (math.inf, 5.0), (math.nan, 5.0)], quality) == pytest.approx(1e6 * growth**quality)
     assert [bytes_at(curve, quality) for quality in (29.99, 41.01, math.nan)] == [None] * 3
     assert bytes_at([], 30.0) is None
+
+
+def test_a_quality_offset_replaces_every_goal():
+    other = at_quality_offset(kissgs.Settings.from_preset("balanced", psnr=40.0), -3.5)
+    assert (other.encode.quality_offset_db, other.encode.psnr, other.preset) == (-3.5, None, "balanced")
 
 
 @pytest.mark.quick(0)
@@ -89,7 +95,9 @@ def test_viewers_are_compared_with_their_own_drawing_of_the_scene(tmp_path):
         assert float(table["scene.ply"][f"{renderer} PSNR"] or 60) > 20, "mirrored or shifted images have less"
     with Image.open(tmp_path / "table.png") as sheet:
         assert sheet.width == 5 * 32 + 6 * 4, "the scene, two files and their errors, with space between and around"
-        assert sheet.height > 2 * 3 * 24, "a row for each camera and renderer"
+        row, rest = divmod(sheet.height - 4, 2 * 3)
+        assert rest == 0, "a row for each camera and renderer"
+        assert 24 + 4 < row < 24 + 4 + 24, "an image, its label and a space"
 
 
 def test_parts_of_the_paper_that_only_save_bytes_change_nothing_else():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import glob
 import inspect
+import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass, replace
@@ -15,6 +17,7 @@ from typer import Argument, Option
 from kissgs.cli.files import is_folder
 from kissgs.core.context import Device
 from kissgs.core.errors import UnsupportedError
+from kissgs.formats import ENDINGS, SCENE_ENDINGS
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
@@ -393,8 +396,17 @@ def with_default_values(words: list[str]) -> list[str]:
         result.append(word)
         following = words[n + 1] if n + 1 < len(words) else ""
         if word in OPTIONAL_VALUES and not re.fullmatch(OPTIONAL_VALUES[word], following):
+            if words[0] == "compress" and word == "--ray" and _is_host(following):
+                raise UnsupportedError(f"--ray takes HOST:PORT, such as head:6379, not {following:.100}")
             result.append("auto")
     return result
+
+
+def _is_host(word: str) -> bool:
+    """Whether a word after ``--ray`` is rather meant as a machine without a port, or as a URL, than as a scene."""
+    if word.startswith("-") or not word or glob.has_magic(word) or os.path.lexists(word):
+        return False
+    return "://" in word or ("/" not in word and Path(word).suffix.lower() not in (*ENDINGS, *SCENE_ENDINGS, ".json"))
 
 
 def open_views(

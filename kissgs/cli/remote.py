@@ -129,7 +129,7 @@ def get(
     with _service(server) as remote, progress_bar(False) as bar:
         progress = announcing(bar, WAIT, False, f"{server}: ")
         known = remote.status(job)
-        kind = known["options"]["format"]
+        kind = known["options"].get("format") or named_container(None, output)  # a server may state none
         ending = f".{kind}" if kind in OUTPUT_FORMATS else ending_of(kind)
         target = output or Path(f"{known['name']}{ending}")
         if not target.name.lower().endswith(ending):

@@ -88,7 +88,7 @@ def report_table(report: Report, target: str) -> RenderableType:
         details += [Text(line), *_noted(tuned.note)]
     details += _noted(report.note)
     if report.evaluation is not None:
-        details.append(_evaluation(report.evaluation))
+        details.append(_evaluation(report.evaluation, report.note))
     names = ("invisible", "pruned_by_rd", "clipped_colors")
     changed = {**{name: getattr(report, name) for name in names}, **report.cleaned.as_dict()}
     return Group(head, *details, *_changes(changed), *_how_to_view(target))
@@ -106,9 +106,11 @@ def status_table(status: Mapping[str, Any], target: str) -> RenderableType:
         mean = ImageMetrics(
             psnr=float("inf" if psnr is None else psnr), ssim=evaluation["ssim"], ms_ssim=evaluation["ms_ssim"]
         )
-        # A failed rendering is the text "NaN".
-        detail = Detail(*(float(evaluation["detail"][name]) for name in ("worst", "worst_percent", "share_below")))
-        details.append(Text(f"{mean.summary} to the scene's own renderings; {detail_text(detail, 'renderings')}"))
+        text, patches = f"{mean.summary} to the scene's own renderings", evaluation.get("detail")
+        if patches is not None:  # a failed rendering is the text "NaN"
+            detail = Detail(*(float(patches[name]) for name in ("worst", "worst_percent", "share_below")))
+            text += f"; {detail_text(detail, 'renderings')}"
+        details.append(Text(text))
     changed = {"invisible": status.get("invisible") or 0, **(status.get("cleaned") or {})}
     return Group(head, *details, *_changes(changed), *_how_to_view(target))
 
@@ -189,14 +191,15 @@ def _search_table(report: Report) -> Table:
     return table
 
 
-def _evaluation(evaluation: Evaluation) -> Text:
+def _evaluation(evaluation: Evaluation, said: str) -> Text:
+    """Format an evaluation; ``said`` are notes of the report, which are not said again."""
     mean = evaluation.mean
     against = f"to the scene's own renderings from {evaluation.views_used}"
     if mean.reference is not None:
         own = "{PSNR} dB, {SSIM}, {MS-SSIM}".format_map(mean.reference.texts())
         against = f"to {evaluation.views_used}; the scene itself {own}"
     rest = "" if evaluation.surroundings is None else f"\n{_beyond(evaluation.surroundings)}"
-    note = f"; {evaluation.note}" if evaluation.note else ""
+    note = f"; {evaluation.note}" if evaluation.note not in ("", *said.split("; ")) else ""
     return Text.assemble(f"{mean.candidate.summary} {against}; {evaluation.extremes}", (note, "yellow"), rest)
 
 

@@ -31,11 +31,11 @@ from kissgs.pipeline.limited_time import Expected, choose, resolved
 from kissgs.pipeline.scene_files import (
     AnyPath,
     check_ply,
-    folder_with_cameras,
     open_scene,
     read_scene,
     reading_notes,
     save_ply,
+    unused_cameras_note,
 )
 from kissgs.settings import GOALS, EncodeSettings, Settings
 
@@ -216,7 +216,7 @@ def compact(
     clock = JobProgress(progress)
     context = Context(threads, device, clock)
     splats, cleaned, _ = open_scene(source, reading, threads, clock)
-    views, note = _fitting(splats, views, source, context, force=force_views)
+    views, note = _fitting(splats, views, context, force=force_views)
     clock.expect(Expected.of(splats, settings, views, threads).compaction())
     file = Path(checkpoint) if checkpoint is not None else None
     result = compact_scene(splats, settings.compact, views, context, evaluate=evaluate, checkpoint=file)
@@ -305,8 +305,10 @@ def compress(
     splats, cleaned, source_bytes = open_scene(source, reading, threads, clock)
     notes, source_count, sh_degree = reading_notes(splats), len(splats) + cleaned.removed, splats.sh_degree
     if evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled:
-        views, views_note = _fitting(splats, views, source, context, force=force_views)
+        views, views_note = _fitting(splats, views, context, force=force_views)
         notes.append(views_note)
+    if views is None and settings.encode.rate_distortion and not isinstance(source, Splats | bytes):
+        notes.append(unused_cameras_note(Path(source)))
     choice = choose(requested, views, len(splats), context, keep_all=keep_all)
     settings = choice.settings
     clock.expect(Expected.of(splats, settings, views, threads).steps(evaluate=evaluate), deadline)
@@ -386,13 +388,10 @@ def _loaded(views: Views | AnyPath | None, source: Splats | AnyPath | bytes) -> 
     return as_views(views, None if isinstance(source, Splats | bytes) else Path(source))
 
 
-def _fitting(
-    splats: Splats, views: Views | None, source: Splats | AnyPath | bytes, context: Context, *, force: bool
-) -> tuple[Views | None, str]:
+def _fitting(splats: Splats, views: Views | None, context: Context, *, force: bool) -> tuple[Views | None, str]:
     """Return the views in the coordinates of the scene and a note; raise InvalidViewsError if they do not show it."""
     if views is None:
-        folder = None if isinstance(source, Splats | bytes) else folder_with_cameras(Path(source))
-        return None, f"its cameras were not used: --views {folder} takes fewer bytes" if folder is not None else ""
+        return None, ""
     from kissgs.evaluation.evaluate import fitting_views
 
     return fitting_views(splats, views, context, force=force)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shlex
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
@@ -104,13 +105,15 @@ def scene_root(path: Path) -> Path:
     return next((scene for scene in reversed(in_order) if scene.is_file()), path)
 
 
-def folder_with_cameras(scene: Path) -> Path | None:
-    """Return the folder of INRIA's trainer that a scene is in, or is, if its cameras are there."""
+def unused_cameras_note(scene: Path) -> str:
+    """Return how the cameras of a scene are used that is a folder of INRIA's trainer, or in one; empty for others."""
+    above = scene.parents if len(scene.parents) > 2 else scene.absolute().parents
     with suppress(OSError, ValueError):
-        for folder in (scene, *scene.absolute().parents[2:3]):
-            if (folder / "cameras.json").is_file() and scene_root(folder) != folder:
-                return folder
-    return None
+        for folder in (scene, *above[2:3]):
+            files = folder / "cfg_args", folder / "cameras.json"
+            if all(file.is_file() for file in files) and scene_root(folder) != folder:
+                return f"its cameras were not used: with --views {shlex.quote(str(folder))} it takes fewer bytes"
+    return ""
 
 
 def _has_metadata(folder: Path) -> bool:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import OutputError
@@ -114,7 +114,10 @@ def continuation(work: Path) -> str:
 def read_layout(work: Path) -> Layout | None:
     """Return the layout of a scene; None if it is not partitioned yet."""
     found = read_json(work / PARTITION)
-    return None if found is None else TypeAdapter(Layout).validate_python(found)
+    try:
+        return None if found is None else TypeAdapter(Layout).validate_python(found)
+    except ValidationError as error:
+        raise OutputError(f"{work / PARTITION} is damaged; delete {work} and start again") from error
 
 
 def read_leaves(work: Path, chunk: int) -> dict[str, Any]:

@@ -41,6 +41,10 @@ STOPPING = "stopping"  # subscription that only the closing of the notifier wake
 MAX_OPTIONS_BYTES = 64 << 10
 MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)  # maximum bytes of a form in addition to the scene
 
+UNPACKED_RATIO, UNPACKED_BYTES = 4, 16 << 20
+"""Largest size of an unpacked capture, as a multiple of its archive and in addition: photographs are compressed, and
+camera files as text shrink to a third. This much disk space is reserved."""
+
 
 @dataclass
 class Submission:
@@ -261,11 +265,6 @@ def _scene_bytes(request: Request, kind: str, settings: ServiceSettings) -> int 
     length = int(text) if len(text) < 19 else 10**18
     limit, beside = settings.max_upload_bytes, settings.max_capture_bytes + MAX_FORM_BYTES
     return limit if kind == FORM_TYPE and limit < length <= limit + beside else length
-
-
-UNPACKED_RATIO, UNPACKED_BYTES = 4, 16 << 20
-"""Largest size of an unpacked capture, as a multiple of its archive and in addition: photographs are compressed, and
-camera files as text shrink to a third. This much disk space is reserved."""
 
 
 class CaptureUpload(Spool):

@@ -145,3 +145,16 @@ def test_values_that_may_be_left_out(tmp_path):
         (["--", "--ray"], ["--", "--ray"]),
     ):
         assert with_default_values(["compress", *words]) == ["compress", *meant]
+
+
+def test_an_address_without_a_port_is_not_taken_for_a_scene(scenes, tmp_path):
+    for address in ("127.0.0.1", "http://127.0.0.1:6379", "head", "head.example.com", "h:port"):
+        said = failure("compress", "--ray", address, scenes / "a.ply", "-o", tmp_path)
+        assert said == f"kissgs: --ray takes HOST:PORT, such as head:6379, not {address}"
+
+
+def test_an_address_is_not_asked_for_where_there_is_no_cluster(scenes):
+    """Regression: convert, which has no --ray, said what --ray takes."""
+    said = run("convert", scenes / "a.ply", "--ray", "head").stderr
+    assert b"No such option: --ray" in said
+    assert b"HOST:PORT" not in said

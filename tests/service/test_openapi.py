@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,14 @@ def test_the_document_equals_the_snapshot(service):
     found = service.http.get("/openapi.json").json()
     lines, wanted = (json.dumps(document, indent=1, sort_keys=True).splitlines() for document in (found, expected))
     assert lines == wanted
+
+
+def test_all_codes_of_problems_are_listed(service):
+    known = {problem["code"] for problem in service.http.get("/v1/problems").json()}
+    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "service").rglob("*.py"))
+    named = set(re.findall(r'(?:ProblemError|problem)\(\s*"([a-z-]+)"', sources))
+    assert len(named) > 15
+    assert named <= known
 
 
 def test_keys_are_documented(start):

@@ -312,7 +312,8 @@ RETRY_MILLISECONDS = 1000  # delay after which a browser reconnects, millisecond
 
 
 async def _events(context: ServiceContainer, job: Job, after: int) -> AsyncIterator[str]:
-    """Yield the events with a ``seq`` above ``after``, until the job ends or is deleted, or the service stops."""
+    """Yield the events with a ``seq`` above ``after``, until the job ends or is deleted, or the service stops. They are
+    framed here: FastAPI's own events have no ids without gaps, and no 204 for a finished stream."""
     yield f"retry: {RETRY_MILLISECONDS}\n\n"
     while True:
         changed = context.notifier.subscribe(job.id)  # before reading, so that no later event is missed

@@ -9,6 +9,7 @@ import pytest
 from helpers.reference_cameras import PINHOLE, assert_camera, frames, poses, write_json, write_photo, write_text
 from PIL import Image
 
+import kissgs
 from kissgs.cameras.captures.load import capture_of, is_capture, load_views, pack_capture
 from kissgs.core.errors import InvalidViewsError
 
@@ -331,6 +332,26 @@ def test_a_downloaded_model_has_the_cameras_it_was_trained_with(tmp_path):
     assert load_views(folder).source == here.source
     write_json(folder / "cameras.json", [{**entries[0], "fx": -1}])
     assert message(folder / "cameras.json") == f"{folder}/cameras.json, camera 0, fx: input should be greater than 0"
+
+
+def test_a_scene_says_that_its_cameras_are_not_used(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene, model = kissgs.sample_scene(300, sh_degree=0), Path("my model")
+    file = model / "point_cloud/iteration_7/point_cloud.ply"
+    file.parent.mkdir(parents=True)
+    kissgs.save(scene, file)
+    entries = []
+    for view in kissgs.virtual_views(scene, count=9, width=64, height=64).all:
+        (fx, fy), pose = view.camera.K[[0, 1], [0, 1]], np.linalg.inv(view.camera.viewmat)
+        entry = {"img_name": view.name, "width": 64, "height": 64, "rotation": pose[:3, :3].tolist()}
+        entries.append({**entry, "position": pose[:3, 3].tolist(), "fx": fx, "fy": fy})
+    write_json(model / "cameras.json", entries)
+    assert kissgs.compress(file).report.note == "", "no capture without cfg_args"
+    trained(model, source_path="/nowhere")
+    fast = kissgs.Settings.from_preset("fast")
+    for source, settings, views, said in ((file, None, None, 1), (file, fast, None, 0), (model, None, model, 0)):
+        note = kissgs.compress(source, settings=settings, views=views).report.note
+        assert note.count("its cameras were not used: with --views 'my model' it takes fewer bytes") == said
 
 
 def test_archives_from_elsewhere_name_no_capture_of_this_machine(tmp_path):
