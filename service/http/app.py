@@ -171,7 +171,7 @@ def _describe(app: FastAPI, *, keys_required: bool) -> None:
     for path in document["paths"].values():
         for operation in path.values():
             _complete(operation, keys_required)
-    app.openapi_schema = document  # which requests get
+    app.openapi = lambda: document  # type: ignore[method-assign]  # FastAPI would generate it again when routes change
 
 
 def _complete(operation: dict[str, Any], keys_required: bool) -> None:
