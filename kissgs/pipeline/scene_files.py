@@ -106,7 +106,7 @@ def scene_root(path: Path) -> Path:
 
 
 def unused_cameras_note(scene: Path) -> str:
-    """Return how the cameras of a scene are used that is a folder of INRIA's trainer, or in one; empty for others."""
+    """Return a note that the cameras beside a scene of INRIA's trainer were not used; empty where there are none."""
     above = scene.parents if len(scene.parents) > 2 else scene.absolute().parents
     with suppress(OSError, ValueError):
         for folder in (scene, *above[2:3]):

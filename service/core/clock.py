@@ -1,12 +1,9 @@
-"""A clock that never jumps, since setting the machine's clock must not make results expire; and notification of tasks
-that wait for a job: long polls, event streams and the worker."""
+"""A clock that never jumps: setting the machine's clock must not make results expire."""
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable
-from weakref import WeakValueDictionary
 
 MAX_CLOCK_LEAD_SECONDS = 2 * 86400.0  # of a recorded time over this clock; beyond it, its clock was wrong
 
@@ -33,53 +30,3 @@ class Clock:
     def __call__(self) -> float:
         """Return the current time in seconds since 1970."""
         return self._offset + self._steady()
-
-
-class JobNotifier:
-    """Wakes all current subscribers of a name. Call :meth:`subscribe` first, then read the job, then wait."""
-
-    def __init__(self) -> None:
-        self._waiting: WeakValueDictionary[str, asyncio.Event] = WeakValueDictionary()
-        self.closing = False
-
-    def subscribe(self, name: str) -> asyncio.Event:
-        """Return the event that the next :meth:`notify` for ``name`` sets."""
-        event = self._waiting.get(name)
-        if event is None:
-            event = asyncio.Event()
-            self._waiting[name] = event
-            if self.closing:
-                event.set()
-        return event
-
-    def notify(self, name: str) -> None:
-        """Wake all subscribers of ``name``."""
-        event = self._waiting.pop(name, None)
-        if event is not None:
-            event.set()
-
-    def notify_end(self, job_id: str) -> None:
-        """Wake all subscribers of a job, also those that wait for its end alone."""
-        self.notify(job_id)
-        self.notify(ended(job_id))
-
-    def close(self) -> None:
-        """Wake all subscribers, because the service is stopping."""
-        self.closing = True
-        for event in list(self._waiting.values()):
-            event.set()
-
-
-def ended(job_id: str) -> str:
-    """Return the name that is notified once a job has ended, for subscribers that do not need its progress."""
-    return f"end of {job_id}"
-
-
-async def wait(event: asyncio.Event, seconds: float) -> bool:
-    """Wait for a notification for at most ``seconds``; return whether there was one."""
-    try:
-        async with asyncio.timeout(seconds):
-            await event.wait()
-    except TimeoutError:
-        return False
-    return True

@@ -36,8 +36,6 @@ RAW_TYPES = ("", "application/octet-stream", "application/ply", "application/x-p
 FORM_TYPE, FIELDS = "multipart/form-data", ("file", "capture", "options")
 log = logging.getLogger("kissgs.service")
 
-STOPPING = "stopping"  # subscription that only the closing of the notifier wakes
-
 MAX_OPTIONS_BYTES = 64 << 10
 MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)  # maximum bytes of a form in addition to the scene
 
@@ -95,7 +93,8 @@ class Submission:
         return job
 
     def _body(self) -> AsyncIterator[bytes]:
-        return timed(self.request, self.context.settings, self.context.notifier.subscribe(STOPPING))
+        closing = self.context.notifier.subscribe("closing")  # which nothing else wakes
+        return timed(self.request, self.context.settings, closing)
 
     async def _form_bytes(self, scene: SceneUpload, capture: CaptureUpload) -> AsyncIterator[bytes]:
         """Yield the body of a form; raise an error if it exceeds the limit for bytes other than scene and capture."""

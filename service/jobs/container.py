@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
-from ..core.clock import Clock, JobNotifier
+from ..core.clock import Clock
 from ..core.files import container_file
 from ..core.metrics import Metrics
 from ..core.models import ENDED, Job, State
+from ..core.notifier import JobNotifier
 from ..core.schemas import Health
 from ..core.settings import ServiceSettings
 from ..storage.job_files import JobStorage

@@ -16,10 +16,10 @@ from sqlalchemy.exc import SQLAlchemyError
 import kissgs
 from kissgs.runners import Outcome
 
-from ..core.clock import JobNotifier, wait
 from ..core.files import container_file
 from ..core.metrics import Metrics
 from ..core.models import ACTIVE, Job, State
+from ..core.notifier import JobNotifier, wait
 from ..core.problems import problem
 from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings

@@ -17,6 +17,7 @@ from helpers.reference_sog import zip_of
 
 import kissgs
 from kissgs.core.errors import InvalidContainerError, OutputError, UnsupportedError
+from kissgs.formats import ENDINGS
 from kissgs.io import containers
 from kissgs.io.containers import (
     MAX_ZIP_ENTRIES,
@@ -161,6 +162,10 @@ def test_damaged_encrypted_and_exotic_entries_are_refused():
     offset = good.index(b"PK\x01\x02") + 42
     astray[offset : offset + 4] = (1 << 30).to_bytes(4, "little")  # far behind the end
     assert refusal(bytes(astray)) == sentence
+
+
+def test_endings_of_files_are_those_of_the_formats():
+    assert set(containers.PACKED) == set(ENDINGS)
 
 
 @pytest.mark.parametrize("name", ["new", "new.zip", "NEW.ZIP"])

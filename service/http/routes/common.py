@@ -12,9 +12,9 @@ from anyio.to_thread import run_sync
 from fastapi import Depends, Path, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from ...core.clock import ended
 from ...core.files import THUMBNAIL
 from ...core.models import ACTIVE, Job, State
+from ...core.notifier import ended
 from ...core.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemError
 from ...core.schemas import Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
 from ...jobs.admission import Queue

@@ -12,8 +12,8 @@ from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from ...core.clock import wait
 from ...core.models import ACTIVE, Job, State
+from ...core.notifier import wait
 from ...core.problems import ProblemError
 from ...core.schemas import JobPage, JobStatus
 from ...jobs.container import ServiceContainer
